@@ -106,7 +106,7 @@ def errors(name: str, seed: int) -> dict[str, list[float]]:
     for p, points in product(PROBABILITIES, ways):
         table = prb.exceedance(
             posterior, response, limit_of(name, p), *inputs,
-            model=model, points=points, n_draws=DRAWS, random_seed=seed,
+            model=model, n_points=points, n_draws=DRAWS, random_seed=seed,
         )  # fmt: skip
         row[f"{p:g}/{points} points"] = [p, float(table.probability), float(table.error)]
     return row

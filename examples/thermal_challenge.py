@@ -314,7 +314,7 @@ def study():
                 *inputs,
                 model=model,
                 requirement=ALLOWED,
-                points=points,
+                n_points=points,
                 random_seed=1,
             )
             row = {name: float(risk[name]) for name in ("probability", "lower", "upper", "error")}

@@ -1,9 +1,17 @@
-"""HTML of results in a notebook: a heading, a table, sentences."""
+"""HTML of results in a notebook: a heading, a table, sentences.
+
+Also the same as text, and numbers as a DataFrame.
+"""
 
 from __future__ import annotations
 
 import html
+import inspect
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import xarray as xr
 
 
 def view(
@@ -25,6 +33,120 @@ def view(
     parts = [f"<p><b>{html.escape(heading)}</b></p>"]
     if table:
         names = "".join(f'<th scope="col" style="{cell}">{html.escape(n)}</th>' for n in header)
-        parts.append(f"<table><thead><tr>{names}</tr></thead><tbody>{table}</tbody></table>")
+        head = f"<thead><tr>{names}</tr></thead>" if header else ""
+        parts.append(f"<table>{head}<tbody>{table}</tbody></table>")
     parts += [f"<p>{html.escape(sentence)}</p>" for sentence in sentences]
     return f'<div style="max-width: 60em">{"".join(parts)}</div>'
+
+
+@dataclass(frozen=True)
+class View:
+    """What a reader of a result sees: a sentence, a table and further sentences."""
+
+    heading: str
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    sentences: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        more = len(self.rows) - 40  # of a page
+        if more > 0:
+            object.__setattr__(self, "rows", self.rows[:40])
+            text = f"{more} more rows are in .to_dataframe()."
+            object.__setattr__(self, "sentences", (text, *self.sentences))
+
+    def __str__(self) -> str:
+        table = [row for row in (self.header, *self.rows) if row]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+            for row in table
+        ]
+        return "\n  ".join([self.heading, *lines, *self.sentences])
+
+
+def html_of(shown: View) -> str:
+    """Return the HTML of what a reader sees."""
+    return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
+
+
+class Shown:
+    """A result that prints as sentences, and that a notebook shows as a table."""
+
+    __slots__ = ()
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return str(self.to_view())
+
+    def _repr_html_(self) -> str:
+        return html_of(self.to_view())
+
+
+class ShownArray:
+    """A result of xarray with sentences; a selection without parts of it shows as xarray's own."""
+
+    __slots__ = ()
+    # Dimensions, variables, groups and attributes of a whole result.
+    _parts: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        raise NotImplementedError
+
+    @property
+    def _is_whole(self) -> bool:
+        """Whether no part was selected."""
+        array: Any = self
+        names = {*array.dims, *array.attrs, *getattr(array, "data_vars", ())}
+        return set(self._parts) <= names | set(getattr(array, "children", ()))
+
+    def __repr__(self) -> str:
+        """Return sentences; of a selection what xarray shows."""
+        return str(self.to_view()) if self._is_whole else super().__repr__()
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def _repr_html_(self) -> str:
+        """Show a table; of a selection what xarray shows."""
+        if self._is_whole:
+            return html_of(self.to_view())
+        return str(super()._repr_html_())  # type: ignore[misc]
+
+
+class Tree(ShownArray, xr.DataTree):  # type: ignore[misc]  # xarray gives __repr__ a level
+    """A DataTree with sentences."""
+
+    __slots__ = ()
+
+
+class Table(ShownArray, xr.Dataset):
+    """A dataset with sentences."""
+
+    __slots__ = ()
+    # Variables of the DataFrame, which has a row for each combination of their dimensions.
+    _columns: ClassVar[tuple[str, ...]] = ()
+
+    def to_dataframe(self, dim_order: Sequence[Any] | None = None) -> Any:
+        """Return the numbers of the table as a DataFrame; of a selection as xarray does."""
+        if not self._is_whole:
+            return super().to_dataframe(dim_order)
+        table = self[[name for name in self._columns if name in self]]
+        if table.dims:
+            return super(Table, table).to_dataframe(dim_order)
+        return super(Table, table.expand_dims("row")).to_dataframe().reset_index(drop=True)
+
+
+def without_constructor[T: type](cls: T) -> T:
+    """Hide the arguments of a constructor that users do not call, in `help` and on the site."""
+    initialise = vars(cls)["__init__"]
+    parameter = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    initialise.__signature__ = inspect.Signature([parameter])
+    return cls

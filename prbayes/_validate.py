@@ -251,7 +251,8 @@ def number(
         expected = "a positive finite number" if low == 0 else "a finite number"
     kinds = int | np.integer if whole else int | float | np.integer | np.floating
     if isinstance(value, bool) or not isinstance(value, kinds):
-        raise TypeError(f"{name}: got {called(value)}, expected {expected}")
+        advice = "; pass a model as model=" if hasattr(value, "free_RVs") else ""
+        raise TypeError(f"{name}: got {called(value)}, expected {expected}{advice}")
     is_inside = low <= value <= high if closed else low < value < high
     if not is_inside or not (whole or np.isfinite(value)):
         raise ValueError(f"{name}: got {value!r}, expected {expected}")

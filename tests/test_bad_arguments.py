@@ -484,10 +484,10 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         call=with_inputs(prb.exceedance, "result", "response", "limit"),
         input=NO_INPUT,
         n_draws=(1,),
-        points=(*ZERO_OR_MORE, 5, None),
+        n_points=(*ZERO_OR_MORE, 5, None),
         requirement=(0, 2.0),
         steps=(1,),
-        own="points",
+        own="n_points",
     ),
     "decision.p_box": Row(
         call=with_inputs(prb.decision.p_box, "result", "response"),

@@ -161,7 +161,7 @@ def decisions() -> dict[str, xr.Dataset]:
     quantity, condition = prb.decision.Mean(double, x), prb.decision.Condition(double, x)
     return {
         "above 7.nc": prb.exceedance(optimum, double, 7.0, x, requirement=0.5),
-        "mean.nc": prb.sensitivity(optimum, quantity, n_samples=64),
+        "mean.nc": prb.sensitivity(optimum, quantity, n_points=64),
         "more.nc": prb.plan(optimum, {"here": condition}, k=[5], quantity=quantity),
     }
 

@@ -69,7 +69,7 @@ def specimen(model: pm.Model) -> Any:
 
 def test_groups_share_a_design() -> None:
     before = calls
-    cost = prb.cost(build)
+    cost = prb.cost(build())
     assert cost.runs == 256
     assert [simulator.name for simulator in cost.simulators] == PARTS
     assert calls == before

@@ -21,7 +21,7 @@ import structure
 import prbayes
 
 PACKAGE = Path(prbayes.__file__).parent
-ROOT = PACKAGE.parent
+ROOT = Path(__file__).parents[1]
 FILES = sorted(PACKAGE.rglob("*.py"))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 README_OUTPUT, LIKELIHOOD_OUTPUT = re.findall(

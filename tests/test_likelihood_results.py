@@ -192,7 +192,7 @@ def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
     mean = prb.decision.Mean(problem.growth, problem.x)
-    shares = prb.sensitivity(posterior, mean, model=problem.model, n_samples=128)
+    shares = prb.sensitivity(posterior, mean, model=problem.model, n_points=128)
     assert float(shares["first"].sel(factor="mu")) > 0.5
     plan = prb.plan(
         posterior,
@@ -394,7 +394,7 @@ def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
     assert fresh.growth.runs == 0
     assert before.runs == 128
     assert "128 runs, 0 of them computed" in str(before)
-    assert prb.cost(lambda: build(data).model).runs == 128
+    assert prb.cost(build(data).model).runs == 128
     assert prb.cost(problem.model).runs == 0
 
 

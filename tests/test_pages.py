@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import prbayes
+
+PACKAGE = Path(prbayes.__file__).parent
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
@@ -79,7 +82,7 @@ def test_executed_pages_are_notebooks() -> None:
 
 def test_fractions_in_formulas_have_braces() -> None:
     """The writer of MathML takes 13 for one number in TeX's short form of a third."""
-    written = [*pages.PAGES, *(ROOT / "prbayes").rglob("*.py")]
+    written = [*pages.PAGES, *PACKAGE.rglob("*.py")]
     bare = re.compile(r"\\[dt]?frac(?!\{)")
     assert bare.search(r"\frac13 - \frac{x}{L}")
     assert not [path.name for path in written if bare.search(path.read_text(encoding="utf-8"))]
@@ -146,7 +149,7 @@ def test_notebooks_are_kept_without_results(path: Path) -> None:
 
 def pages_of_messages() -> list[str]:
     """Return all pages that findings name, each with a heading: constants such as `a.md#b`."""
-    paths = (ROOT / "prbayes").rglob("*.py")
+    paths = PACKAGE.rglob("*.py")
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
     constants = [n.value for t in trees for n in ast.walk(t) if isinstance(n, ast.Constant)]
     return sorted({c for c in constants if re.fullmatch(r"[\w-]+\.md#[\w-]+", str(c))})

@@ -1,9 +1,12 @@
 """The package loads a public name when it is used, and type checkers know all of them."""
 
 import ast
+import inspect
+import pydoc
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -45,3 +48,23 @@ def test_type_checkers_see_the_names_of_the_table() -> None:
     for name, module in imports.items():
         if module != "prbayes":
             assert getattr(prb, name).__module__ == module
+
+
+# Results, which no user constructs.
+RESULTS = {"Cost", "CrossValidation", "Diagnosis", "Optimum", "Surrogate", "ValidityTest"}
+
+
+def test_help_of_a_class_shows_the_arguments_of_users() -> None:
+    values = [getattr(prb, name) for name in prb.__all__]
+    modules = [value for value in values if isinstance(value, ModuleType)]
+    values += [getattr(module, name) for module in modules for name in module.__all__]
+    classes = {v for v in values if inspect.isclass(v) and not issubclass(v, Exception)}
+    assert {c.__name__ for c in classes} > RESULTS
+    for cls in classes:
+        parameters = inspect.signature(cls).parameters
+        if cls.__name__ in RESULTS:
+            assert not parameters, cls
+            assert "__init__(self, /)" in pydoc.render_doc(cls, renderer=pydoc.plaintext)
+        for name, parameter in parameters.items():
+            assert not name.startswith("_"), cls
+            assert "<factory>" not in str(parameter), cls

@@ -14,6 +14,8 @@ WORDS = {
     "decision": ["scatter", "probability of failure", "reliability", "quantile", "sensitivity"],
     "runs": ["table", "table of runs", "csv", "excel", "existing runs", "design of experiments"],
     "data_sheet": ["data sheet", "summary statistics", "published values"],
+    "my_data": ["csv", "excel", "units", "missing values", "ties", "decimal comma", "few data"],
+    "definitions": ["formula", "formulas", "equation", "probability residual", "wasserstein"],
     "several_outputs": ["time series", "curve", "curves", "functional output", "multivariate"],
     "virkler": ["correlation", "correlated inputs"],
     "distributions": ["bounded", "bounded inputs", "truncated", "uniform", "limits of an input"],

@@ -2,6 +2,7 @@
 
 from prbayes.decision.p_box import p_box
 from prbayes.decision.plan import Condition
+from prbayes.decision.populations import evaluate
 from prbayes.decision.quantities import (
     Exceedance,
     Interval,
@@ -19,5 +20,6 @@ __all__ = [
     "Quantile",
     "Quantity",
     "StandardDeviation",
+    "evaluate",
     "p_box",
 ]

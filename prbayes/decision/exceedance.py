@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,13 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr
 
-from prbayes._finding import Finding, as_json, report
+from prbayes._display import Table, View
+from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._stats import INTERVAL
 from prbayes._validate import (
     AT_ONCE,
     Floats,
     Seed,
-    executes,
     finite_number,
     flag,
     positive_integer,
@@ -44,6 +46,7 @@ from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.results.predict import call_settings
 
 
 @locked
@@ -55,19 +58,21 @@ def exceedance(
     model: pm.Model | None = None,
     output: Any = None,
     below: bool = False,
-    prob: float = 0.89,
+    prob: float = INTERVAL,
     requirement: float | None = None,
     n_draws: int = 2000,
-    points: int | None = None,
+    n_points: int | None = None,
     steps: int = 5,
     executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
     random_seed: Seed = 0,
-) -> xr.Dataset:
+) -> ExceedanceTable:
     """Return the probability that a response is above a limit, with its interval.
 
     Each draw of the posterior is a population with its probability; the mean over draws is the
     probability of a new specimen. By default it comes from stored responses, whose number limits
-    how small a probability they resolve. With ``points``, importance sampling computes that many
+    how small a probability they resolve. With ``n_points``, importance sampling computes that many
     responses near the limit, for all populations together: probabilities of one in a thousand to
     one in a million then have an error of some percent. Where stored responses cannot decide a
     ``requirement``, this is done without being asked, if it costs no more than the calibration.
@@ -98,7 +103,7 @@ def exceedance(
         decided. Errors of few events are asymmetric, as those of Poisson counts.
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
-    points : int, optional
+    n_points : int, optional
         Number of responses to compute near the limit, for each point of the intervals; 0, or at
         least 100. The inputs need inverse distribution functions, and no stored responses. By
         default 0; but 1000 if the error of stored responses is above .3 of the distance between
@@ -107,6 +112,10 @@ def exceedance(
         Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional
         Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
     random_seed : int, sequence of int, numpy.random.Generator or None
 
     Returns
@@ -121,15 +130,16 @@ def exceedance(
         ``probability``, ``error`` and ``by_draw`` have the dimension ``bound``, "lower" and
         "upper"; ``lower`` and ``upper`` are the extremes over all points of the intervals, and the
         attribute ``at`` has the points of the bounds.
-        Attributes: ``prob``, ``responses`` (number computed), ``source``, ``findings`` (as JSON),
-        ``identity``, and with a requirement ``requirement`` and ``verdict``: "met", "not met" or
-        "not decided".
+        It prints as sentences; a notebook shows a table. Attributes: ``prob``, ``limit``,
+        ``below``, ``response`` (its name), ``responses`` (number computed), ``source``,
+        ``findings`` (as JSON), ``identity``, and with a requirement ``requirement`` and
+        ``verdict``: "met", "not met" or "not decided".
 
     Raises
     ------
     TypeError, KeyError, ValueError
         If an argument is not as described, the result is another model's, or the inputs have no
-        stored responses and there are no ``points``.
+        stored responses and there are no ``n_points``.
     DesignError
         If the design does not support the populations, or too many responses are NaN.
     ResponseError
@@ -159,7 +169,7 @@ def exceedance(
     ...     y = prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=data)
     >>> optimum = prb.minimize(model)
     >>> often = prb.exceedance(optimum, np.sinh, 1.0, x)
-    >>> rarely = prb.exceedance(optimum, np.sinh, 50.0, x, points=1000)
+    >>> rarely = prb.exceedance(optimum, np.sinh, 50.0, x, n_points=1000)
     >>> bool(rarely.error < 0.15 * rarely.probability), rarely.attrs["responses"]
     (True, 1000)
     """
@@ -171,28 +181,26 @@ def exceedance(
     if requirement is not None:
         requirement = share(requirement, "requirement")
     positive_integer(n_draws, "n_draws", minimum=2)
-    if points is not None:
-        positive_integer(points, "points", minimum=0)
-    if 0 < (points or 0) < 100:  # a tenth of them is a step towards the limit
-        raise ValueError(f"points: got {points}, expected 0, or at least 100")
+    if n_points is not None:
+        positive_integer(n_points, "n_points", minimum=0)
+    if 0 < (n_points or 0) < 100:  # a tenth of them is a step towards the limit
+        raise ValueError(f"n_points: got {n_points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
-    executes(executor, "executor")
+    calling = call_settings(executor, store, version)
     seed = seed_number(random_seed)
-    populations = Populations.of(result, model, n_draws, caller)
-    question = _Question(populations, response, limit, below, output, executor, seed)
+    populations = Populations.of(result, model, n_draws, caller, calling)
+    question = _Question(populations, response, limit, below, output, seed)
     places = interval_grid(inputs, steps)
-    estimates = [question.estimate(place, points) for place in places]
+    estimates = [question.estimate(place, n_points) for place in places]
     n_searched = 0
     if len(places) > 1:
-        respond = CentralSpecimens(
-            populations, response, output, points or estimates[0].runs, executor
-        )
+        respond = CentralSpecimens(populations, response, output, n_points or estimates[0].runs)
         sign = -1.0 if below else 1.0
         extremes = extreme_places(inputs, places, lambda x: sign * respond(x), [sign * limit])
         places += extremes
-        estimates += [question.estimate(place, points) for place in extremes]
+        estimates += [question.estimate(place, n_points) for place in extremes]
         n_searched = respond.count
-    if points is None and requirement is not None:
+    if n_points is None and requirement is not None:
         estimates = [
             question.refined(estimate, place) if estimate.is_unsure(requirement, prob) else estimate
             for estimate, place in zip(estimates, places, strict=True)
@@ -208,7 +216,7 @@ def exceedance(
     is_rough[bounds] = errors[bounds] > 0.3 * means[bounds]
     if requirement is not None and verdict == "not decided":
         is_rough |= [estimate.is_unsure(requirement, prob, 0.5) for estimate in estimates]
-    table = xr.Dataset(
+    table = ExceedanceTable(
         {
             "probability": ("bound", means[bounds]),
             "error": ("bound", errors[bounds]),
@@ -221,6 +229,7 @@ def exceedance(
             "prob": prob,
             "limit": limit,
             "below": int(below),
+            "response": response_name(response),
             "responses": n_searched + sum(estimate.responses for estimate in estimates),
             "source": estimates[bounds[1]].source,
             "random_seed": str(seed),
@@ -235,6 +244,36 @@ def exceedance(
     if requirement is not None:
         table.attrs |= {"requirement": requirement, "verdict": verdict}
     return table
+
+
+class ExceedanceTable(Table):
+    """The probability of a response beyond a limit, with its interval."""
+
+    __slots__ = ()
+    _parts = ("probability", "error", "lower", "upper", "draw", "prob", "limit", "response")
+    _columns = ("probability", "error", "lower", "upper")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        attrs = self.attrs
+        sides = "below" if attrs["below"] else "above"
+        values = [f"{p:.2g}" for p in np.atleast_1d(self["probability"].values)]
+        errors = [f"{error:.1g}" for error in np.atleast_1d(self["error"].values)]
+        rows = [["standard error of the computation", *errors]]
+        if len(values) > 1:
+            rows.append(["intervals at", *map(str, attrs["at"])])
+        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        if "requirement" in attrs:
+            sentences.insert(
+                0, f"At most {attrs['requirement']:g} is required: {attrs['verdict']}."
+            )
+        sentences.append(f"From {attrs['source']}; {attrs['responses']} responses computed.")
+        heading = (
+            f"Probability that {attrs['response']} is {sides} {attrs['limit']:g}: "
+            f"{' to '.join(values)}, {attrs['prob']:.0%} interval {float(self['lower']):.2g} to "
+            f"{float(self['upper']):.2g}"
+        )
+        return View(heading, rows=rows, sentences=sentences)
 
 
 def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) -> str:
@@ -295,7 +334,6 @@ class _Question:
     limit: float
     below: bool
     output: Any
-    executor: Executor | None
     seed: int
 
     def estimate(self, inputs: Sequence[Any], points: int | None) -> _Estimate:
@@ -304,9 +342,9 @@ class _Question:
             self.response, *inputs, limit=self.limit, below=self.below, output=self.output
         )
         if points:
-            responses = self.populations.responses(self.response, inputs, executor=self.executor)
+            responses = self.populations.responses(self.response, inputs)
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
-        sample = self.populations.sample(self.response, inputs, self.output, executor=self.executor)
+        sample = self.populations.sample(self.response, inputs, self.output)
         return _stored_probability(sample, quantity)
 
     def refined(self, estimate: _Estimate, inputs: Sequence[Any], points: int = 1000) -> _Estimate:
@@ -383,9 +421,9 @@ def _rough_finding(
     if not rough:
         return []
     worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)
-    more = "points=1000, which computes as many"
+    more = "n_points=1000, which computes as many"
     if worst.points:
-        more = f"more than points={worst.points}"
+        more = f"more than n_points={worst.points}"
     text = (
         f"{response_name(response)}: a probability of {worst.mean:.2g} has a standard error "
         f"of {worst.error:.2g}; pass {more} responses where the limit is exceeded."

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._stats import ENVELOPED, distribution_function, envelope, quantile
+from prbayes._display import Table, View
+from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
 from prbayes._validate import Floats, positive_integer, share
 from prbayes.decision.populations import (
     CentralSpecimens,
@@ -19,8 +22,10 @@ from prbayes.decision.populations import (
 )
 from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.model.locking import locked
+from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
+from prbayes.results.predict import call_settings
 
 
 @locked
@@ -30,10 +35,13 @@ def p_box(
     *inputs: Any,
     model: pm.Model | None = None,
     output: Any = None,
-    prob: float = 0.89,
+    prob: float = INTERVAL,
     n_draws: int = ENVELOPED,
     steps: int = 5,
-) -> xr.Dataset:
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
+) -> ProbabilityBox:
     r"""Return bounds of the distribution function of a response over the population.
 
     Two bands from the same draws of the posterior. The *pointwise* band contains the share ``prob``
@@ -63,6 +71,12 @@ def p_box(
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     steps : int
         Number of values in each interval, its ends included; at least 2.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
 
     Returns
     -------
@@ -72,8 +86,9 @@ def p_box(
         with intervals between ``mean`` and ``mean_upper``; and ``error``, the largest standard
         error of ``mean`` from the points, the emulator and the draws, which the bands do not
         include: of smaller tails ask `exceedance`. Where no point is below y, or none above, the
-        bands have the bound of the effective number of points. Attributes: ``prob``, ``responses``
-        (number computed) and ``identity``.
+        bands have the bound of the effective number of points. It prints as quantiles; a notebook
+        shows a table. Attributes: ``prob``, ``response`` (its name), ``responses`` (number
+        computed) and ``identity``.
 
     Raises
     ------
@@ -107,7 +122,9 @@ def p_box(
     prob = share(prob, "prob")
     positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(steps, "steps", minimum=2)
-    populations = Populations.of(result, model, n_draws, caller)
+    populations = Populations.of(
+        result, model, n_draws, caller, call_settings(executor, store, version)
+    )
     places = interval_grid(inputs, steps)
     samples = [populations.sample(response, place, output) for place in places]
     y = _evaluation_points(samples)
@@ -147,15 +164,43 @@ def p_box(
     }
     if len(places) > 1:
         data["mean_upper"] = ("y", np.max(means, axis=0))
-    return xr.Dataset(
+    return ProbabilityBox(
         data,
         coords={"y": y, "band": ["pointwise", "simultaneous"]},
         attrs={
             "prob": prob,
+            "response": response_name(response),
             "responses": n_searched + sum(sample.responses.count for sample in samples),
             **populations.provenance(),
         },
     )
+
+
+class ProbabilityBox(Table):
+    """Bounds of a distribution function."""
+
+    __slots__ = ()
+    _parts = ("lower", "upper", "mean", "error", "y", "band", "prob", "response")
+    _columns = ("lower", "upper", "mean", "error")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        y, rows = self["y"].values, []
+        for p in (0.01, 0.05, 0.5, 0.95, 0.99):
+            row = [f"{p:.0%} quantile", f"{_place(self['mean'].values, y, p):.4g}"]
+            for band in ("pointwise", "simultaneous"):
+                bounds = self.sel(band=band)
+                low, high = (_place(bounds[key].values, y, p) for key in ("upper", "lower"))
+                row.append(f"{low:.4g} to {high:.4g}")
+            rows.append(row)
+        prob = f"{self.attrs['prob']:.0%}"
+        heading = f"Distribution of {self.attrs['response']}, with {prob} bands"
+        return View(heading, ["", "new specimen", "pointwise", "simultaneous"], rows)
+
+
+def _place(function: Floats, y: Floats, probability: float) -> float:
+    """Return where a distribution function (m,) reaches a probability; infinite beyond y."""
+    return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 
 def _evaluation_points(samples: list[ResponseSample]) -> Floats:

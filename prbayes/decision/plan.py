@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import Finding, as_json
+from prbayes._display import Table, View
+from prbayes._finding import Finding, as_json, from_json
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample
@@ -24,6 +27,7 @@ from prbayes.model.parameters import split_elements, table_elements
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
+from prbayes.results.predict import call_settings
 
 
 class Condition:
@@ -76,7 +80,10 @@ def plan(
     model: pm.Model | None = None,
     quantity: Quantity | None = None,
     target: Mapping[str, float] | None = None,
-) -> xr.Dataset:
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
+) -> PlanTable:
     r"""Predict standard deviations after k more specimens under each candidate condition.
 
     The posterior has the precision :math:`\Lambda` of its draws. One specimen under a condition
@@ -102,6 +109,12 @@ def plan(
     target : mapping of str to float, optional
         Standard deviations to reach, by names of the table, in the unit of each; that of the
         quantity by ``"quantity"``.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
 
     Returns
     -------
@@ -112,7 +125,8 @@ def plan(
         ``target``, ``specimens``: the smallest number that reaches it, inf if a million do not, NaN
         without a target. Attributes: ``responses`` (number computed), ``findings`` (as JSON),
         ``identity``, and with a quantity ``value_error``, the standard error of its value from
-        points and emulator, which more specimens do not reduce.
+        points and emulator, which more specimens do not reduce. It prints as sentences; a notebook
+        shows a table.
 
     Raises
     ------
@@ -157,7 +171,9 @@ def plan(
     if quantity is not None:
         refuse_quantity(quantity, caller)
     # 2000 draws: standard deviations are then known to two percent.
-    populations = Populations.of(result, model, 2000, caller)
+    populations = Populations.of(
+        result, model, 2000, caller, call_settings(executor, store, version)
+    )
     evaluator = populations.evaluator
     quantity_sample = None
     findings: tuple[Finding, ...] = ()
@@ -188,7 +204,7 @@ def plan(
         variables["specimens"] = (["candidate", "name"], specimens)
     count = sum(sample.responses.count for sample in samples.values())
     count += 0 if quantity_sample is None else quantity_sample.responses.count
-    return xr.Dataset(
+    return PlanTable(
         variables,
         coords={"candidate": list(candidates), "k": numbers, "name": list(now)},
         attrs={
@@ -198,6 +214,33 @@ def plan(
             **populations.provenance(),
         },
     )
+
+
+class PlanTable(Table):
+    """Expected standard deviations after more specimens."""
+
+    __slots__ = ()
+    _parts = ("sd", "now", "candidate", "k", "name", "findings")
+    _columns = ("sd", "now", "specimens")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        rows = []
+        for name in self["name"].values:
+            for candidate in self["candidate"].values:
+                row = self.sel(name=name, candidate=candidate)
+                cells = [f"{float(x):.4g}" for x in (row["now"], *row["sd"])]
+                if "specimens" in self:
+                    needed = float(row["specimens"])
+                    cells.append("" if np.isnan(needed) else f"{needed:.0f}")
+                rows.append([str(name), str(candidate), *cells])
+        header = ["", "condition", "now", *(f"{k} more" for k in self["k"].values)]
+        header += ["needed for the target"] if "specimens" in self else []
+        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        if "quantity" in self.attrs:
+            sentences.append(f"quantity: {self.attrs['quantity']}.")
+        heading = "Expected standard deviations after more specimens"
+        return View(heading, header, rows, sentences)
 
 
 @dataclass(frozen=True, eq=False)

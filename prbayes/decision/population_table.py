@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import view
+from prbayes._display import Table, View
 from prbayes._finding import as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, flag, positive_integer, share
@@ -19,7 +21,7 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import element_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.outputs import with_unit
-from prbayes.results.predict import width_of_epsilon
+from prbayes.results.predict import call_settings, width_of_epsilon
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
@@ -38,6 +40,9 @@ def population(
     upper: bool = False,
     at: Mapping[str, float] | None = None,
     n_draws: int = 4000,
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
 ) -> PopulationTable:
     r"""Return mean, spread, quantiles and tolerance bounds of inputs and responses, in units.
 
@@ -65,7 +70,13 @@ def population(
         The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
         depend on one.
     n_draws : int
-        Largest number of populations.
+        Largest number of populations, over all chains; the posterior's draws are thinned evenly.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
 
     Returns
     -------
@@ -124,7 +135,9 @@ def population(
         )
     probabilities = [share(p, f"{_CALLER}: quantiles") for p in quantiles]
     levels = {f"{100 * p:g}% quantile": p for p in probabilities}
-    populations = Populations.of(result, model, n_draws, _CALLER)
+    populations = Populations.of(
+        result, model, n_draws, _CALLER, call_settings(executor, store, version)
+    )
     simulators = populations.evaluator.simulators
     covariates = {str(v.name) for node in simulators for v in node.inputs.covariates}
     if at is not None and not (isinstance(at, Mapping) and set(at) <= covariates):
@@ -195,14 +208,12 @@ def _defined(row: Floats) -> Floats:
     return finite if finite.size > 0.5 * row.size else np.array([np.nan])
 
 
-class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
+class PopulationTable(Table):
     """A dataset that prints as sentences, and that notebooks show as a table."""
 
     __slots__ = ()
-
-    @property
-    def _is_whole(self) -> bool:
-        return {"name", "quantity"} <= set(self.dims) and set(_VARIABLES) <= set(self.data_vars)
+    _parts = (*_VARIABLES, "name", "quantity", "prob")
+    _columns = _VARIABLES
 
     def rows(self) -> Iterator[tuple[str, str, dict[str, tuple[str, str]]]]:
         """Yield name, unit, and texts of estimate and interval by quantity, of each population."""
@@ -246,15 +257,13 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
         )
 
     def __repr__(self) -> str:
-        """Return sentences; of a selection what xarray shows."""
+        """Return a sentence for each population; of a selection what xarray shows."""
         if not self._is_whole:
             return super().__repr__()
         return "\n  ".join([f"{self._heading()}:", *self.sentences()])
 
-    def _repr_html_(self) -> str:
-        """Show a table; of a selection what xarray shows."""
-        if not self._is_whole:
-            return super()._repr_html_()
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         quantities = self["quantity"].values.tolist()
         rows = []
         for name, unit, cells in self.rows():
@@ -263,7 +272,7 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
             rows.append([with_unit(name, unit), *shown])
         header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
         sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
-        return view(self._heading(), header=header, rows=rows, sentences=sentences)
+        return View(self._heading(), header, rows, sentences)
 
 
 def _texts(values: Sequence[float], factor: float) -> tuple[str, str]:

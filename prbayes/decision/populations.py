@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv, ndtr, ndtri
 
-from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Floats
-from prbayes.decision.quantities import Quantile, Quantity, weighted_quantiles
+from prbayes._display import Table, View
+from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._stats import INTERVAL
+from prbayes._validate import AT_ONCE, Floats, positive_integer, share
+from prbayes.decision.quantities import (
+    Quantile,
+    Quantity,
+    refuse_quantity,
+    weighted_quantiles,
+)
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import as_attributes, identity_of
+from prbayes.model.locking import locked
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import N_BLOCKS, DesignError
@@ -34,9 +44,11 @@ from prbayes.response.inputs import Inputs, read_inputs, refuse_several_populati
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
+    call_settings,
     known_outputs,
     known_scatter,
     model_of,
+    named_response,
     populations_of,
     refuse_unsupported,
     serving,
@@ -56,22 +68,32 @@ class Populations:
     center: Floats  # (d,): the median, or the optimum
     caller: str  # for messages
     are_draws: bool  # whether thetas are random draws, and not Sobol points
+    # Executor, store and version of responses that are not the model's own.
+    calling: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: Any, model: pm.Model | None, n_draws: int, caller: str) -> Populations:
+    def of(
+        cls,
+        result: Any,
+        model: pm.Model | None,
+        n_draws: int,
+        caller: str,
+        calling: Mapping[str, Any] | None = None,
+    ) -> Populations:
         """Read a result; raise if it is another model's, or an optimum without standard errors."""
         model = model_of(result, model, caller)
+        calling = calling or {}
         if isinstance(result, Optimum):
             thetas = _sobol_thetas(result, n_draws, caller)
             evaluator = result.evaluator if model is result.model else Evaluator.of(model)
-            return cls(result, evaluator, thetas, result.theta, caller, are_draws=False)
+            return cls(result, evaluator, thetas, result.theta, caller, False, calling)
         points, _ = populations_of(result, model, n_draws, caller)
         evaluator = Evaluator.of(model)
         thetas = evaluator.hyperparameters.thetas_of(
             [points[str(rv.name)] for rv in model.free_RVs]
         )
         center = np.median(thetas, axis=0)
-        return cls(result, evaluator, thetas, center, caller, are_draws=True)
+        return cls(result, evaluator, thetas, center, caller, True, calling)
 
     def provenance(self) -> dict[str, Any]:
         """Return the attributes of a table: the problem's fingerprint, and versions."""
@@ -82,11 +104,9 @@ class Populations:
         """Return about `N_CHECKED` thetas, evenly spaced in their order."""
         return self.thetas[:: max(1, len(self.thetas) // N_CHECKED)]
 
-    def responses(
-        self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
-    ) -> Responses:
+    def responses(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Responses:
         """Return a response with its inputs."""
-        name = str(getattr(response, "__name__", type(response).__name__))
+        name = named_response(response, self.calling, "write the response with def")
         sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
         refuse_several_populations(f"{self.caller}: {name}", sorted_inputs.parents)
         simulators = self.evaluator.simulators
@@ -99,7 +119,7 @@ class Populations:
             outputs=outputs,
             caller=self.caller,
             scatter=scatter,
-            **calling,
+            **self.calling,
         )
 
     @cached_property
@@ -107,21 +127,21 @@ class Populations:
         return {}
 
     def sample(
-        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
+        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any
     ) -> ResponseSample:
         """Return one output of a response at the design's specimens, computed where unknown."""
-        sample = self.sample_of_all_outputs(response, inputs, **calling)
+        sample = self.sample_of_all_outputs(response, inputs)
         return replace(sample, column=output_column(sample.responses, sample.outputs, output))
 
     def sample_of_all_outputs(
-        self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
+        self, response: Callable[..., Any], inputs: Sequence[Any]
     ) -> ResponseSample:
         """Return all outputs of a response at the design's specimens.
 
         Raises TypeError if no simulator has specimens of these inputs, and DesignError if the
         design does not support the populations, or too many responses are NaN.
         """
-        responses = self.responses(response, inputs, **calling)
+        responses = self.responses(response, inputs)
         simulators = self.evaluator.simulators
         simulator = serving(simulators, responses)
         if simulator is None:
@@ -376,18 +396,16 @@ class CentralSpecimens:
         response: Callable[..., Any],
         output: Any,
         n_runs: int,
-        executor: Executor | None = None,
     ) -> None:
         self.populations, self.response, self.output = populations, response, output
         # 64 calls at them cost about as much as four times the runs.
         self.size = min(max(n_runs // 16, 4), 32)
-        self.executor = executor
         self.count = 0  # responses computed
         self.inputs: tuple[list[Floats], list[Floats]] | None = None
 
     def __call__(self, inputs: Sequence[Any]) -> Floats:
         """Return the output at the specimens, (size,)."""
-        responses = self.populations.responses(self.response, inputs, executor=self.executor)
+        responses = self.populations.responses(self.response, inputs)
         outputs = responses(*self._specimens(responses))[0]
         self.count += responses.count
         column = output_column(responses, outputs, self.output)
@@ -492,3 +510,120 @@ def output_column(responses: Responses, values: Floats, output: Any) -> int | No
         if output in identifiers:
             return identifiers.index(output)
     raise KeyError(f"{responses.name}: output: got {output!r}, expected one of {labels[:9]}")
+
+
+@locked
+def evaluate(
+    result: Optimum | xr.DataTree,
+    quantity: Quantity,
+    *,
+    model: pm.Model | None = None,
+    prob: float = INTERVAL,
+    n_draws: int = 2000,
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
+) -> QuantityTable:
+    """Return a decision quantity with its interval.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`, with its sampling distribution; or with a ``posterior`` group, from any
+        sampler.
+    quantity : Quantity
+        Such as ``prb.decision.Quantile(response, x, probability=0.99)``. A response other than a
+        simulator's is computed once for each run of the design, unless `predict` has computed it.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default.
+    prob : float
+        Probability of the interval, which has equal tails.
+    n_draws : int
+        Largest number of populations, over all chains; the posterior's draws are thinned evenly.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
+
+    Returns
+    -------
+    xarray.Dataset
+        In the units of the quantity ``estimate`` (at the optimum, or the posterior mean), ``lower``
+        and ``upper``; ``error``, the standard error at the centre from the points and the emulator;
+        and ``by_draw``, with dimension ``draw``. It prints as sentences; a notebook shows a table.
+        Attributes: ``prob``, ``quantity``, ``responses`` (number computed), ``findings`` (as JSON)
+        and ``identity``.
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        If an argument is not as described, the result is another model's, or the inputs have no
+        stored responses.
+    DesignError
+        If the design does not support the populations.
+    ResponseError
+        If the response raises, or has the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     data = np.random.default_rng(1).normal(0, 1, 50)
+    ...     y = prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=data)
+    >>> median = prb.decision.Quantile(np.exp, x, probability=0.5)
+    >>> table = prb.decision.evaluate(prb.minimize(model), median)
+    >>> bool(table.lower < table.estimate < table.upper)
+    True
+    """
+    caller = "prb.decision.evaluate"
+    refuse_quantity(quantity, caller)
+    prob = share(prob, "prob")
+    positive_integer(n_draws, "n_draws", minimum=2)
+    calling = call_settings(executor, store, version)
+    populations = Populations.of(result, model, n_draws, caller, calling)
+    sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
+    findings, error = sample.checked_quantity(quantity)
+    by_draw = sample.evaluate(quantity, populations.thetas)
+    (center,) = sample.evaluate(quantity, populations.center[None])
+    lower, upper = np.nanquantile(by_draw, [(1 - prob) / 2, (1 + prob) / 2])
+    return QuantityTable(
+        {
+            "estimate": np.nanmean(by_draw) if populations.are_draws else center,
+            "lower": lower,
+            "upper": upper,
+            "error": error,
+            "by_draw": ("draw", by_draw),
+        },
+        attrs={
+            "prob": prob,
+            "quantity": repr(quantity),
+            "responses": sample.responses.count,
+            "findings": as_json(findings),
+            **populations.provenance(),
+        },
+    )
+
+
+class QuantityTable(Table):
+    """A decision quantity with its interval."""
+
+    __slots__ = ()
+    _parts = ("estimate", "lower", "upper", "error", "draw", "prob", "quantity")
+    _columns = ("estimate", "lower", "upper", "error")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        estimate, lower, upper = (float(self[key]) for key in self._columns[:3])
+        rows = [
+            ["standard error of the computation", f"{float(self['error']):.1g}"],
+            ["responses computed", str(self.attrs["responses"])],
+        ]
+        heading = (
+            f"{self.attrs['quantity']}: {estimate:.4g}, {self.attrs['prob']:.0%} interval "
+            f"{lower:.4g} to {upper:.4g}"
+        )
+        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        return View(heading, rows=rows, sentences=sentences)

@@ -6,8 +6,10 @@ Sobol points.
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 
 import numpy as np
 import pymc as pm
@@ -15,7 +17,8 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
-from prbayes._finding import Finding, as_json, report
+from prbayes._display import Table, View
+from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -23,12 +26,14 @@ from prbayes.model.locking import locked
 from prbayes.numerics.points import sobol
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
+from prbayes.results.predict import call_settings
 
 # Independently scrambled point sets: the standard error between them is itself known to 18%.
 REPLICATES = 16
 # Step of differences in standard normal numbers. Half or twice changes an index by less than a
 # hundredth (tests/decision/test_sensitivity.py).
 _STEP = 0.02
+_SHARES = ("first", "total", "derivative")
 
 
 @locked
@@ -37,10 +42,13 @@ def sensitivity(
     quantity: Quantity,
     *,
     model: pm.Model | None = None,
-    n_samples: int = 1024,
+    n_points: int = 1024,
     computed: bool = False,
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
     random_seed: Seed = 0,
-) -> xr.Dataset:
+) -> SensitivityTable:
     r"""Return Sobol' indices of a decision quantity, by hyperparameter and by input.
 
     The quantity Q is uncertain because the hyperparameters are. For each hyperparameter the table
@@ -66,13 +74,19 @@ def sensitivity(
         `predict` has computed it.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
-    n_samples : int
+    n_points : int
         Number of populations for the indices of hyperparameters, and a quarter of the number of
         specimens for those of inputs.
     computed : bool
         Whether the indices of inputs come from calls of the response at new specimens,
-        4 ``n_samples`` times (1 + 2 inputs + 2 numbers of a specimen) of them; by default from
+        4 ``n_points`` times (1 + 2 inputs + 2 numbers of a specimen) of them; by default from
         emulators, or with one input from the runs.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
     random_seed : int, sequence of int, numpy.random.Generator or None
 
     Returns
@@ -88,7 +102,7 @@ def sensitivity(
         deviation over the hyperparameters; ``scatter``, the aleatory share of
         the variance of a new specimen; ``responses``, the number computed; ``inputs``, the reason
         if indices of inputs are not known; ``findings`` (as JSON), such as that few responses
-        are beyond the quantity; and ``identity``.
+        are beyond the quantity; and ``identity``. It prints as sentences; a notebook shows a table.
 
     Raises
     ------
@@ -135,18 +149,20 @@ def sensitivity(
     """
     caller = "prb.sensitivity"
     refuse_quantity(quantity, caller)
-    n_samples = positive_integer(n_samples, "n_samples", minimum=2 * REPLICATES)
+    n_points = positive_integer(n_points, "n_points", minimum=2 * REPLICATES)
     flag(computed, "computed")
     seed = seed_number(random_seed)
     # 4000 draws: margins and correlations are then known to two percent.
-    populations = Populations.of(result, model, 4000, caller)
+    populations = Populations.of(
+        result, model, 4000, caller, call_settings(executor, store, version)
+    )
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
     findings, error = sample.checked_quantity(quantity)
-    hyperparameters = _hyperparameter_indices(sample, quantity, n_samples, seed)
-    inputs, obstacle = input_indices(sample, quantity, n_samples, seed, computed=computed)
+    hyperparameters = _hyperparameter_indices(sample, quantity, n_points, seed)
+    inputs, obstacle = input_indices(sample, quantity, n_points, seed, computed=computed)
     findings += report(*_constant_findings(hyperparameters, quantity))
     columns = {}
-    for row, name in enumerate(("first", "total", "derivative")):
+    for row, name in enumerate(_SHARES):
         values = [hyperparameters.values[row], inputs.values[row]]
         errors = [hyperparameters.errors[row], inputs.errors[row]]
         columns[name] = ("factor", np.concatenate(values))
@@ -155,7 +171,7 @@ def sensitivity(
     simulator = evaluator.simulators[sample.k]
     names = aleatory_names(simulator.inputs, simulator.responses.function)
     kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
-    return xr.Dataset(
+    return SensitivityTable(
         columns,
         coords={
             "factor": [*evaluator.hyperparameters.readable_names, *names],
@@ -175,6 +191,40 @@ def sensitivity(
             **populations.provenance(),
         },
     )
+
+
+class SensitivityTable(Table):
+    """Shares of a variance by factor."""
+
+    __slots__ = ()
+    _parts = ("first", "total", "factor", "quantity", "value", "value_error", "sd")
+    _columns = (
+        *("first", "first_error", "total", "total_error"),
+        *("derivative", "derivative_error"),
+    )
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        attrs, rows = self.attrs, []
+        for factor in self["factor"].values:
+            row = self.sel(factor=factor)
+            numbers = [(float(row[key]), float(row[f"{key}_error"])) for key in _SHARES]
+            cells = [f"{x:.2f} ± {error:.2f}" if np.isfinite(x) else "" for x, error in numbers]
+            rows.append([str(factor), str(row["kind"].item()), *cells])
+        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        if attrs["inputs"]:
+            sentences.append(f"Inputs: {attrs['inputs']}.")
+        sentences.append(
+            f"Shares of inputs are those in the variance of {attrs['of_inputs']}; "
+            f"{attrs['responses']} responses computed."
+        )
+        heading = (
+            f"{attrs['quantity']}: {attrs['value']:.4g} at the centre, with a standard deviation "
+            f"of {attrs['sd']:.2g} over the hyperparameters, and an error of the computation of "
+            f"{attrs['value_error']:.1g}"
+        )
+        header = ["", "", "first-order share", "total share", "derivative bound"]
+        return View(heading, header, rows, sentences)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +250,12 @@ def _paired_points(n: int, d: int, seed: int) -> tuple[Floats, Floats]:
 
 
 def _hyperparameter_indices(
-    sample: ResponseSample, quantity: Quantity, n_samples: int, seed: int
+    sample: ResponseSample, quantity: Quantity, n_points: int, seed: int
 ) -> Indices:
     """Return the indices of the elements of theta in the variance of the quantity."""
     copula = Copula.of(sample.populations.thetas)
     d = sample.populations.evaluator.hyperparameters.size
-    first, second = _paired_points(n_samples // REPLICATES, d, seed)
+    first, second = _paired_points(n_points // REPLICATES, d, seed)
     z = first @ copula.root.T
     independent = second @ copula.root.T
 
@@ -237,7 +287,7 @@ def _hyperparameter_indices(
 
 
 def input_indices(
-    sample: ResponseSample, quantity: Quantity, n_samples: int, seed: int, *, computed: bool
+    sample: ResponseSample, quantity: Quantity, n_points: int, seed: int, *, computed: bool
 ) -> tuple[Indices, str]:
     """Return the indices of the inputs at the central population, and why they are not known.
 
@@ -253,7 +303,7 @@ def input_indices(
         return unknown, str(error)
     d = transform.size
     # Four times as many as hyperparameters: an emulator is cheaper than weights of a design.
-    first, second = _paired_points(4 * n_samples // REPLICATES, d, seed)
+    first, second = _paired_points(4 * n_points // REPLICATES, d, seed)
     same_input, same_rest, neighbours = [], [], []
     for columns in transform.columns:
         is_input = np.isin(np.arange(d), np.arange(d)[columns])
@@ -281,7 +331,7 @@ def input_indices(
         reason = (
             f"{quantity.of_inputs} is the same for all {first.shape[1]} specimens of a replicate, "
             "so that there is no variance to share; ask for a less rare quantity, or pass a "
-            "larger n_samples"
+            "larger n_points"
         )
     return Indices(values, errors), reason
 
@@ -292,7 +342,7 @@ def _constant_findings(indices: Indices, quantity: Quantity) -> tuple[Finding, .
         return ()
     text = (
         f"{quantity!r} is the same in all populations of a replicate, so that there is no variance "
-        "to share between hyperparameters; ask for another quantity, or pass a larger n_samples."
+        "to share between hyperparameters; ask for another quantity, or pass a larger n_points."
     )
     return (Finding("constant-quantity", text),)
 

@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._display import view
+from prbayes._display import Shown, View
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate
 from prbayes.emulators.table import read_csv, read_table
+from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 
 
-class Runs:
+class Runs(Shown):
     """A table of runs that were computed before, in place of a function of the inputs.
 
     It is a `Surrogate` through the runs, whose error is cross-validated: the best one of two
@@ -147,19 +148,12 @@ class Runs:
 
     def to_dataframe(self) -> Any:
         """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
-        import pandas as pd
-
-        values = self.responses.reshape(len(self), -1)
-        columns = [*self.columns, *self.outputs]
-        return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
+        return self.surrogate.to_dataframe().set_axis([*self.columns, *self.outputs], axis=1)
 
     @property
     def columns(self) -> list[str]:
         """Name of each number of the inputs."""
-        names = []
-        for r in self.surrogate.domain.inputs:
-            names += [r.name] if not r.event else [f"{r.name}[{i}]" for i in range(r.size)]
-        return names
+        return list(column_names(self.inputs, [r.size for r in self.surrogate.domain.inputs]))
 
     def error_beside(self, observed: Floats) -> float:
         """Return the largest left-out error of an output beside data (N,) or (N, m).
@@ -212,36 +206,9 @@ class Runs:
                     f"to {np.max(r.high):.6g}, the range of the runs"
                 )
 
-    def __repr__(self) -> str:
-        heading, header, rows = self._described()
-        table = [header, *rows]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
-            for row in table
-        ]
-        return "\n  ".join([heading, *lines])
-
-    def _repr_html_(self) -> str:
-        heading, header, rows = self._described()
-        return view(heading, header=header, rows=rows)
-
-    def _described(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return a sentence, and a table of ranges and errors."""
-        values = self.responses.reshape(len(self), -1)
-        failed = int((~np.isfinite(values).all(axis=1)).sum())
-        heading = f"Runs: {len(self)} runs, {failed} of them without response"
-        domain, error = self.surrogate.domain, self.error
-        rows = [
-            [name, f"{low:.6g}", f"{high:.6g}", "", ""]
-            for name, low, high in zip(self.columns, domain.low, domain.high, strict=True)
-        ]
-        numbers = zip(
-            self.outputs, values.T, np.atleast_1d(error.rms), np.atleast_1d(error.relative),
-            strict=True,
-        )  # fmt: skip
-        for name, column, rms, relative in numbers:
-            finite = column[np.isfinite(column)]
-            ends = [f"{finite.min():.6g}", f"{finite.max():.6g}"]
-            rows.append([name, *ends, f"{rms:.3g}", f"{relative:.2g} sd"])
-        return heading, ["", "lowest", "highest", "left-out error", "relative"], rows
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        shown = self.surrogate.to_view()
+        names = [*self.columns, *self.outputs]
+        rows = [[name, *row[1:]] for name, row in zip(names, shown.rows, strict=False)]
+        return replace(shown, heading=f"Runs: {shown.heading.partition(' through ')[2]}", rows=rows)

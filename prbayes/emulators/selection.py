@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from prbayes._display import without_constructor
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
 from prbayes.emulators.surfaces import (
@@ -25,6 +26,7 @@ from prbayes.emulators.surfaces import (
 FOLDS = 10
 
 
+@without_constructor
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
     """The error of a surrogate by cross-validation.

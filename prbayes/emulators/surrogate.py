@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from prbayes._display import Shown, View, without_constructor
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import (
@@ -140,8 +141,9 @@ class FittedSurface:
         return np.asarray(usable[nearest])
 
 
-@dataclass(frozen=True, eq=False)
-class Surrogate:
+@without_constructor
+@dataclass(frozen=True, eq=False, repr=False)
+class Surrogate(Shown):
     """A surface through runs of an expensive response, to be called in its place.
 
     ``fit`` and ``load`` construct it. Like the response it takes arrays of any leading shape;
@@ -436,6 +438,39 @@ class Surrogate:
     def ranges(self) -> dict[str, tuple[Any, Any]]:
         """Lowest and highest value of each input."""
         return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
+
+    def to_dataframe(self) -> Any:
+        """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
+        import pandas as pd
+
+        values = self.responses.reshape(len(self.points), -1)
+        m = values.shape[1]
+        labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
+        columns = [
+            *column_names(self.names, [r.size for r in self.domain.inputs]),
+            *(labels if self._named is None else self._named.names),
+        ]
+        return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        values = self.responses.reshape(len(self.points), -1)
+        n_failed = int((~np.isfinite(values).all(axis=1)).sum())
+        ends = [*zip(self.domain.low, self.domain.high, strict=True)]
+        finite = [column[np.isfinite(column)] for column in values.T]
+        ends += [(column.min(), column.max()) for column in finite]
+        errors = [("", "")] * len(self.domain.low)
+        pairs = zip(np.atleast_1d(self.error.rms), np.atleast_1d(self.error.relative), strict=True)
+        errors += [(f"{rms:.3g}", f"{relative:.2g} sd") for rms, relative in pairs]
+        rows = [
+            [name, f"{low:.6g}", f"{high:.6g}", *error]
+            for name, (low, high), error in zip(self.to_dataframe(), ends, errors, strict=True)
+        ]
+        heading = (
+            f"Surrogate: {self.model!r:.60} through {len(values)} runs, {n_failed} of them without "
+            "response"
+        )
+        return View(heading, ["", "lowest", "highest", "left-out error", "relative"], rows)
 
     def __call__(self, *inputs: ArrayLike) -> Any:
         """Return predictions of the response, (...) or (..., m), or a mapping of them.

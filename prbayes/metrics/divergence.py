@@ -56,7 +56,7 @@ class ProbabilityResidual(Metric):
     True
     """
 
-    density: DensityEstimator = field(default_factory=GaussianKDE)
+    density: DensityEstimator = field(default=GaussianKDE())
     _: KW_ONLY
     scale_base: float = 100.0
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
@@ -141,7 +141,7 @@ class KullbackLeibler(Metric):
     0.0
     """
 
-    density: DensityEstimator = field(default_factory=GaussianKDE)
+    density: DensityEstimator = field(default=GaussianKDE())
     _: KW_ONLY
     reverse: bool = False
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC

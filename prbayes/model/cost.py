@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pymc as pm
 
-from prbayes._validate import called
 from prbayes.model.description import without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import computed_node, simulators
@@ -22,26 +21,25 @@ from prbayes.response.budget import BudgetError, Cost, SimulatorCost
 from prbayes.response.inputs import model_on_context
 
 
-def cost(model: pm.Model | Callable[[], pm.Model] | None = None) -> Cost:
+def cost(model: pm.Model | None = None) -> Cost:
     """Return how many runs a model's simulators need; no run is made.
 
     Parameters
     ----------
-    model : pymc.Model or callable, optional
-        The model, by default the one on the context; or a function without arguments that returns
-        it.
+    model : pymc.Model, optional
+        By default the one on the context.
 
     Returns
     -------
     Cost
-        It prints as sentences, and has numbers: ``runs`` to compute at the first use of the model
-        and ``runs_each`` for each value of the hyperparameters, for all and for each of its
-        ``simulators``.
+        It prints as sentences; a notebook shows a table. Numbers are ``runs`` to compute at the
+        first use of the model, and ``runs_each`` for each value of the hyperparameters, for all and
+        for each of its ``simulators``.
 
     Raises
     ------
     TypeError
-        If ``model`` is neither, or there is none.
+        If there is no model.
     ValueError
         If it has no simulator.
 
@@ -71,14 +69,6 @@ def cost(model: pm.Model | Callable[[], pm.Model] | None = None) -> Cost:
       for each value of the hyperparameters: 64 runs
       more: each value that the optimiser or sampler asks for; max_runs= and max_seconds= end it
     """
-    if model is not None and not isinstance(model, pm.Model):
-        built = model() if callable(model) else model
-        if not isinstance(built, pm.Model):
-            got = f"a function that returns {called(built)}" if callable(model) else called(model)
-            raise TypeError(
-                f"cost: model: got {got}, expected a PyMC model, or a function that returns one"
-            )
-        model = built
     model = model_on_context(model, "prb.cost()")
     require_simulator(model)
     costs = []

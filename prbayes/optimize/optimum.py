@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import view
+from prbayes._display import view, without_constructor
 from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
@@ -186,6 +186,7 @@ def _html(optimum: Optimum) -> str:
     )
 
 
+@without_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Optimum:
     """The result of `minimize`; numerical failure is a value in it, not an exception.
@@ -293,6 +294,20 @@ class Optimum:
         require_minimiser(self, "sampling")
         scales = np.array(list(self.scales.values()))
         return SamplingDistribution.of(self.evaluator, self.theta, scales)
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each number: its estimate and standard error."""
+        import pandas as pd
+
+        point = labelled(self.evaluator, self.point, {}).data_vars
+        stderr = labelled(self.evaluator, self.stderr, {}).data_vars
+        values, errors = single_elements(point), single_elements(stderr)
+        names = optimum_elements(point, stderr)
+        columns = {
+            "estimate": [values[name] for name in names],
+            "standard error": [errors[name] for name in names],
+        }
+        return pd.DataFrame(columns, index=pd.Index(names, name="hyperparameter"))
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.

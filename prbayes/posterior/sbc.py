@@ -12,6 +12,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._display import Tree, View
 from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
@@ -45,7 +46,7 @@ def simulation_based_calibration(
     executor: Executor | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
-) -> xr.DataTree:
+) -> Ranks:
     """Calibrate many data sets with known hyperparameters, and rank these among the draws.
 
     Hyperparameters are drawn from the prior, and specimens from their populations. The response is
@@ -166,7 +167,44 @@ def simulation_based_calibration(
             **versions(),
         }
     )
-    return xr.DataTree.from_dict(groups)
+    return Ranks.from_dict(groups)
+
+
+class Ranks(Tree):
+    """Ranks of true hyperparameters among posterior draws."""
+
+    __slots__ = ()
+    _parts = ("prior_sbc", "envelope", "truth", "posterior_sd")
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each variable: the mean and sd of its ranks, and the envelope's word."""
+        import pandas as pd
+
+        ranks = self["prior_sbc"].to_dataset()
+        values = {name: variable[0] for name, variable in ranks.data_vars.items()}
+        elements = split_elements(values)
+        outside = ranks.attrs["outside"].split(", ")
+        columns = {
+            "mean rank": [x.mean() for x in elements.values()],
+            "sd of ranks": [x.std() for x in elements.values()],
+            "outside the envelope": [name in outside for name in elements],
+        }
+        return pd.DataFrame(columns, index=pd.Index(elements, name="variable"))
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        attrs, table = self["prior_sbc"].attrs, self.to_dataframe()
+        rows = [
+            [str(name), f"{mean:.3f}", f"{sd:.3f}", "outside" if is_outside else "inside"]
+            for name, mean, sd, is_outside in table.itertuples(name=None)
+        ]
+        verdict = f"those of {attrs['outside']} are not uniform" if attrs["outside"] else "uniform"
+        n = self["prior_sbc"].sizes["draw"]
+        heading = f"Ranks of true hyperparameters in {n} data sets: {verdict}"
+        sentences = ["Of uniform ranks the mean is .5 and the standard deviation .289."]
+        if attrs["failed"]:
+            sentences.append(f"{attrs['failed']} data sets could not be analysed.")
+        return View(heading, ["", "mean rank", "sd of ranks", "95% envelope"], rows, sentences)
 
 
 def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:

@@ -264,7 +264,7 @@ class Propagation(ABC):
     executor: Executor | None = field(default=None, repr=False)
     store: str | PathLike[str] | None = field(default=None, repr=False)
     version: str | None = field(default=None, repr=False)
-    on_failure: OnFailure = field(default_factory=Abort, repr=False)
+    on_failure: OnFailure = field(default=Abort(), repr=False)
     retry_failed: bool = field(default=False, repr=False)
     timeout: float | None = field(default=None, repr=False)
     # Whether every evaluation draws specimens: the discrepancy is then random.

@@ -12,7 +12,9 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
+from prbayes._display import Shown, View, without_constructor
 from prbayes._validate import positive_integer, positive_number
 
 
@@ -111,8 +113,9 @@ class SimulatorCost:
         )
 
 
-@dataclass(frozen=True)
-class Cost:
+@without_constructor
+@dataclass(frozen=True, repr=False)
+class Cost(Shown):
     """Runs that the simulators of a model need; see `cost`.
 
     Attributes
@@ -137,6 +140,27 @@ class Cost:
     def __repr__(self) -> str:
         """Return the costs of the simulators, one after the other."""
         return "\n".join(map(str, self.simulators))
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each simulator."""
+        import pandas as pd
+
+        columns = ["simulator", "first", "computed", "per theta", "most", "workers"]
+        rows = [
+            (c.name, c.needed.first, c.computed, c.needed.per_theta, c.needed.most, c.workers)
+            for c in self.simulators
+        ]
+        return pd.DataFrame(rows, columns=columns).set_index("simulator")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        rows = [
+            [str(name), *("no limit" if x is None else str(x) for x in numbers)]
+            for name, *numbers in self.to_dataframe().astype(object).itertuples(name=None)
+        ]
+        header = ["", "runs at first", "computed", "for each theta", "at most", "workers"]
+        sentences = [f"{c.name}: {c.propagation}; more: {c.needed.growth}" for c in self.simulators]
+        return View(f"Cost: {self.runs} runs to compute at first", header, rows, sentences)
 
 
 def duration(seconds: float) -> str:

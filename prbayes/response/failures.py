@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -115,7 +115,7 @@ class Retry(OnFailure):
 
     times: int = 1
     _: KW_ONLY
-    then: OnFailure = field(default_factory=Replace)
+    then: OnFailure = Replace()
 
     def __post_init__(self) -> None:
         positive_integer(self.times, "Retry: times")

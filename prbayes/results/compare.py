@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 from scipy.special import ndtri
 
-from prbayes._display import view
+from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called
@@ -61,7 +61,7 @@ def compare(
     *,
     model: pm.Model | None = None,
     metrics: Sequence[Metric] | None = None,
-) -> xr.Dataset:
+) -> Comparison:
     """Compare optima and posteriors, one row per result and hyperparameter.
 
     Parameters
@@ -89,7 +89,7 @@ def compare(
         several. Scores are NaN where stored responses do not support the population. With the
         log-likelihood by specimen populations are emulated, and ``LogLikelihood by specimen`` is
         minus its mean over the specimens. The attribute ``findings`` names draws that are as wide
-        as epsilon makes them. A notebook shows a table.
+        as epsilon makes them. It prints as sentences; a notebook shows a table.
 
     Raises
     ------
@@ -184,16 +184,15 @@ def compare(
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
-    """A dataset that notebooks show as a table."""
+class Comparison(Table):
+    """Estimates by result and hyperparameter, and scores by result."""
 
     __slots__ = ()
+    _parts = (*_ESTIMATE, "result", "hyperparameter")
+    _columns = (*_ESTIMATE, "shift")
 
-    def _repr_html_(self) -> str:
-        """Show estimates as a table, and scores as sentences; a selection as xarray does."""
-        is_whole = set(self.dims) == {"result", "hyperparameter"}
-        if not (is_whole and set(_ESTIMATE) <= set(self.data_vars)):
-            return super()._repr_html_()
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         rows = []
         for name in self["hyperparameter"].values:
             for label in self["result"].values:
@@ -207,7 +206,7 @@ class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
                 listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
                 sentences.append(f"Discrepancy by {key}: {listed}.")
         header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval"]
-        return view("Comparison", header=header, rows=rows, sentences=sentences)
+        return View("Comparison", header, rows, sentences)
 
 
 def _estimates(

@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import view
+from prbayes._display import view, without_constructor
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
@@ -64,7 +64,8 @@ _NOISE = 11.0
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
 
-@dataclass(frozen=True, eq=False)
+@without_constructor
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """The result of `diagnose`.
 
@@ -109,8 +110,16 @@ class Diagnosis:
             return "No problem was found by the tests that were run."
         return "No problem was found."
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join([*(self.messages or [self.all_clear]), *self.notes, *self.untested])
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each finding and remark: its code, kind and text."""
+        import pandas as pd
+
+        rows = [("finding", f.code, f.text) for f in self.findings]
+        rows += [("remark", f.code, f.text) for f in self.remarks]
+        return pd.DataFrame(rows, columns=["kind", "code", "text"])
 
     def _repr_html_(self) -> str:
         """Show the sentences in a notebook, findings first."""

@@ -8,9 +8,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._display import Tree, View
+from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
+from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_inputs, draw_readings, specimen_likelihoods
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
@@ -28,7 +31,7 @@ def individuals(
     model: pm.Model | None = None,
     n_draws: int = 400,
     random_seed: Seed = 0,
-) -> xr.DataTree:
+) -> Individuals:
     r"""Draw the inputs of each measured specimen, given its readings and the population.
 
     Readings of a specimen that say little about an input leave it near the population's mean. The
@@ -133,7 +136,52 @@ def individuals(
             observed = array.isel(chain=0, draw=0, drop=True).copy(data=m.observed)
             groups["observed_data"][m.name] = observed
     datasets = {name: xr.Dataset(arrays) for name, arrays in groups.items() if arrays}
-    return xr.DataTree.from_dict(datasets)
+    return Individuals.from_dict(datasets)
+
+
+class Individuals(Tree):
+    """Draws of the inputs of each measured specimen."""
+
+    __slots__ = ()
+    _parts = ("posterior", "posterior_predictive", "observed_data")
+
+    def to_dataframe(self) -> Any:
+        """Return mean, sd and 89 % interval of each input of each specimen, a row for each."""
+        import pandas as pd
+
+        tables = []
+        for name, draws in self["posterior"].data_vars.items():
+            over = ("chain", "draw")
+            quantiles = draws.quantile([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], over)
+            columns = {"mean": draws.mean(over), "sd": draws.std(over)}
+            columns |= {
+                key: quantiles.isel(quantile=i, drop=True)
+                for i, key in enumerate(("lower", "upper"))
+            }
+            table = xr.Dataset(columns).to_dataframe().reset_index()
+            table.insert(0, "input", str(name))
+            tables.append(table)
+        return pd.concat(tables, ignore_index=True)
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        numbers = ["mean", "sd", "lower", "upper"]
+        table = self.to_dataframe()
+        indices = table.drop(columns=[*numbers, "input"]).itertuples(index=False, name=None)
+        rows = []
+        for name, index, values in zip(
+            table["input"], indices, table[numbers].to_numpy(), strict=True
+        ):
+            labels = [str(i) for i in index if i == i]  # NaN of a dimension that it has not
+            mean, sd, lower, upper = (f"{x:.4g}" for x in values)
+            rows.append([element_name(name, labels), mean, sd, f"{lower} to {upper}"])
+        sentences = [
+            f"{name}: shrinkage {np.array2string(np.asarray(x.attrs['shrinkage']), precision=2)}."
+            for name, x in self["posterior"].data_vars.items()
+            if "shrinkage" in x.attrs
+        ]
+        header = ["", "mean", "sd", f"{INTERVAL:.0%} interval"]
+        return View("Inputs of the measured specimens", header, rows, sentences)
 
 
 def _columns(likelihood: SpecimenLikelihood) -> list[Floats]:

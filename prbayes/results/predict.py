@@ -15,7 +15,8 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding, as_json, report
+from prbayes._display import ShownArray, View
+from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import (
@@ -43,7 +44,7 @@ from prbayes.model.fingerprint import (
     require_same_responses,
 )
 from prbayes.model.locking import locked
-from prbayes.model.parameters import finite_draws
+from prbayes.model.parameters import element_name, finite_draws
 from prbayes.model.random_variable import Node, has_default_epsilon, simulators
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
@@ -75,7 +76,7 @@ def predict(
     version: str | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
-) -> xr.DataArray:
+) -> Prediction:
     """Draw responses of the calibrated population.
 
     Also of another response, or under another condition: a number in place of
@@ -120,7 +121,7 @@ def predict(
     executor : concurrent.futures.Executor, optional
         Where the response is computed.
     store : path-like, optional
-        A folder that keeps every computed response, by ``name``.
+        A folder that keeps every computed response, by its name.
     version : str, optional
         Of the response, for the store; as for `Reweighted`.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -140,7 +141,8 @@ def predict(
         such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
         ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
-        which `area_test` compares), ``identity`` (of the problem that was calibrated).
+        which `area_test` compares), ``identity`` (of the problem that was calibrated). It prints
+        as sentences; a notebook shows a table.
 
     Raises
     ------
@@ -161,7 +163,7 @@ def predict(
     ``stored=False``.
 
     Quantiles of the result are no better known than the few samples beyond them. Probabilities of
-    far tails, with their errors, are those of `exceedance` with ``points=1000``.
+    far tails, with their errors, are those of `exceedance` with ``n_points=1000``.
 
     Examples
     --------
@@ -182,13 +184,8 @@ def predict(
         refuse_max_lost(max_lost, "prb.predict")
     if name is not None:
         plain_text(name, "name")
-    check_call_settings(executor, store, version, Abort())
-    label = name or str(getattr(response, "__name__", type(response).__name__))
-    if store is not None and name is None and not label.isidentifier():
-        raise ValueError(
-            f"name: got a store for a function called {label}, expected a name to keep its "
-            "responses by"
-        )
+    calling = call_settings(executor, store, version)
+    label = name or named_response(response, calling, "pass name=")
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, n_draws, "prb.predict")
     sources = population_simulators(model)
@@ -203,9 +200,7 @@ def predict(
         label,
         response,
         inputs_read,
-        executor=executor,
-        store=store,
-        version=version,
+        **calling,
         outputs=known_outputs(sources, response, inputs_read),
         caller="prb.predict",
         scatter=known_scatter(sources, response),
@@ -245,7 +240,42 @@ def predict(
     result_values = _labelled(drawn.values, responses, coords, n_samples)
     if conditions is not None:
         result_values = result_values.rename(sample="specimen")
-    return result_values.rename(label).assign_attrs(attrs)
+    return Prediction(result_values.rename(label).assign_attrs(attrs))
+
+
+class Prediction(ShownArray, xr.DataArray):
+    """Predicted responses of the specimens of each population."""
+
+    __slots__ = ()
+    _parts = ("chain", "draw", "source", "responses")
+
+    @property
+    def _is_whole(self) -> bool:
+        return super()._is_whole and bool({"sample", "specimen"} & set(self.dims))
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        drawn = [d for d in self.dims if d in ("chain", "draw", "sample", "specimen")]
+        rows_of = [d for d in self.dims if d not in drawn]
+        values = self.transpose(*rows_of, *drawn).values
+        shape = [self.sizes[d] for d in rows_of]
+        rows = []
+        for index in np.ndindex(*shape):
+            x = values[index][~np.isnan(values[index])]
+            labels = [self[d].values[i] for d, i in zip(rows_of, index, strict=True)]
+            with np.errstate(invalid="ignore"):  # of failures, +inf
+                numbers = [x.mean(), x.std(), *np.quantile(x, [0.05, 0.5, 0.95])]
+            rows.append([element_name(str(self.name), labels), *(f"{n:.4g}" for n in numbers)])
+        size = self.sizes[drawn[-1]]
+        n_populations = self.sizes["chain"] * self.sizes["draw"]
+        heading = (
+            f"Predicted {self.name}: {size} specimens of each of {n_populations} population(s), "
+            f"from {self.attrs['source']}"
+        )
+        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences.append(f"{self.attrs['responses']} responses computed.")
+        header = ["", "mean", "sd", "5% quantile", "median", "95% quantile"]
+        return View(heading, header, rows, sentences)
 
 
 def _labelled(
@@ -307,6 +337,25 @@ def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
     """Return the values of conditions that are inputs, (N, C), by name."""
     names = [str(inputs.aleatory[place].name) for place in inputs.conditions]
     return dict(zip(names, conditions.T, strict=True))
+
+
+def call_settings(executor: Any, store: Any, version: Any) -> dict[str, Any]:
+    """Return where a response is computed and kept, as arguments of `Responses`; or raise."""
+    check_call_settings(executor, store, version, Abort())
+    return {"executor": executor, "store": store, "version": version}
+
+
+def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> str:
+    """Return the name of a response; raise if a store needs one, and it has none."""
+    inner = getattr(response, "function", response)  # of `scalar`
+    name = str(getattr(inner, "__name__", type(inner).__name__))
+    is_named = hasattr(inner, "__name__") and name != "<lambda>"
+    if calling.get("store") is not None and not is_named:
+        raise ValueError(
+            f"store: got a function called {name}, expected a name to keep its responses by; "
+            f"{advice}"
+        )
+    return name
 
 
 # -- populations -----------------------------------------------------------------------------------

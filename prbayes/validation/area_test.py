@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._display import view
+from prbayes._display import Shown, View, without_constructor
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
 from prbayes.model.description import versions
@@ -20,8 +21,9 @@ from prbayes.validation.conditions import DIRECTION, Case, Predicted, read_case
 from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
 
 
+@without_constructor
 @dataclass(frozen=True, eq=False, repr=False)
-class ValidityTest:
+class ValidityTest(Shown):
     """The result of `area_test`.
 
     Attributes
@@ -70,7 +72,8 @@ class ValidityTest:
         names = [name.split(DIRECTION)[0] for name in self.conditions.tolist()]
         return list(dict.fromkeys(names))
 
-    def __repr__(self) -> str:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         verdict = "rejected" if self.rejected else "not rejected"
         area = "area of |2u - 1|" if self.folded else "area"
         n_specimens = np.unique(self.specimens).size
@@ -78,18 +81,25 @@ class ValidityTest:
         conditions = "1 condition" if n_conditions == 1 else f"{n_conditions} conditions"
         n_directions = np.unique(self.conditions).size
         directions = f", seen in {n_directions} directions" if n_directions > n_conditions else ""
-        return (
-            f"ValidityTest: {verdict} at level {self.alpha:g}\n"
-            f"  {area} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
-            f"p-value {self.p_value:.3g}\n"
-            f"  {self.u_values.size} values of {n_specimens} specimens, {conditions}{directions}\n"
-            f"  null: {self.null}"
-        )
+        rows = [
+            [area, f"{self.statistic:.4f}"],
+            ["critical value", f"{self.critical_value:.4f}"],
+            ["p-value", f"{self.p_value:.3g}"],
+        ]
+        sentences = [
+            f"{self.u_values.size} values of {n_specimens} specimens, {conditions}{directions}",
+            f"null: {self.null}",
+        ]
+        return View(f"ValidityTest: {verdict} at level {self.alpha:g}", (), rows, sentences)
 
-    def _repr_html_(self) -> str:
-        """Show the verdict in a notebook."""
-        heading, *sentences = repr(self).splitlines()
-        return view(heading, sentences=sentences)
+    def __repr__(self) -> str:
+        shown = self.to_view()
+        numbers = ", ".join(" ".join(row) for row in shown.rows)
+        return "\n  ".join([shown.heading, numbers, *shown.sentences])
+
+    def to_dataframe(self) -> Any:
+        """Return the u-value of each measured response, with its condition and specimen."""
+        return self.to_dataset()["u"].to_dataframe().set_index(["condition", "specimen"])
 
     def to_dataset(self) -> xr.Dataset:
         """Return the result as a Dataset; its dimension ``rank`` is that of the envelope."""

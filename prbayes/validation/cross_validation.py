@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from prbayes._display import Table, View
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
@@ -35,7 +36,7 @@ def cross_validate(
     folds: int | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
-) -> xr.Dataset:
+) -> CrossValidationTable:
     """Calibrate on parts of the specimens, and return the discrepancy of the held-out ones.
 
     LOO and WAIC do not apply to a discrepancy, which is one value for all specimens together. The
@@ -115,7 +116,7 @@ def cross_validate(
     losses = _mean_log_losses if by_specimen else _discrepancies
     scores, weights = _scores(evaluator, thetas, held_out)
     dims = ["fold", "simulator"]
-    return xr.Dataset(
+    return CrossValidationTable(
         {
             "discrepancy": (dims, losses(evaluator, thetas, held_out)),
             "calibrated": (dims, losses(evaluator, thetas, kept)),
@@ -131,6 +132,50 @@ def cross_validate(
         },
         attrs={"random_seed": str(seed), **versions()},
     )
+
+
+class CrossValidationTable(Table):
+    """Discrepancies of held-out specimens by fold and simulator."""
+
+    __slots__ = ()
+    _parts = ("discrepancy", "calibrated", "score", "converged", "fold", "simulator", "specimen")
+    _columns = ("discrepancy", "calibrated", "n_held_out", "converged")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        means = self[["discrepancy", "calibrated"]].mean("fold")
+        rows = [
+            [str(name), *(f"{float(means[key].sel(simulator=name)):.4g}" for key in means)]
+            for name in self["simulator"].values
+        ]
+        score = float(self["score"].mean())
+        sentences = [f"Mean log density of a held-out specimen: {score:.4g}."]
+        n_failed = int((~self["converged"]).sum())
+        if n_failed:
+            sentences.append(f"The minimisations of {n_failed} folds did not converge.")
+        n_folds, n = self.sizes["fold"], self.sizes["specimen"]
+        heading = f"Cross-validation of {n} specimens in {n_folds} folds, mean discrepancies"
+        return View(heading, ["", "held out", "calibrated"], rows, sentences)
+
+
+class Ranking(Table):
+    """Candidate models by the scores of specimens, the best first."""
+
+    __slots__ = ()
+    _parts = ("score", "difference", "stderr", "verdict", "candidate", "n_specimens", "folds")
+    _columns = ("score", "difference", "stderr", "significant", "converged")
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        table = self.to_dataframe()
+        rows = [
+            [str(label), *(f"{x:.4g}" for x in numbers[:3]), "yes" if numbers[3] else "no"]
+            for label, *numbers in table.itertuples(name=None)
+        ]
+        n, folds = self.attrs["n_specimens"], self.attrs["folds"]
+        heading = f"Models by the log score of {n} specimens, {folds} folds"
+        header = ["", "score of a specimen", "behind by", "standard error", "beyond chance"]
+        return View(heading, header, rows, [f"{v}." for v in self["verdict"].values[1:]])
 
 
 def most_folds(optimum: Optimum, limit: int) -> int:
@@ -243,7 +288,7 @@ def rank(
     folds: int | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
-) -> xr.Dataset:
+) -> Ranking:
     """Compare how well several models of the same data predict new specimens.
 
     Models may differ in the family of an input, in its parameters, in the response or in the
@@ -390,7 +435,7 @@ def _require_same(table: xr.Dataset, reference: xr.Dataset, label: str, first: s
         )
 
 
-def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
+def _comparison(tables: Mapping[str, xr.Dataset]) -> Ranking:
     """Return the candidates compared with the best one, in order."""
     labels = sorted(tables, key=lambda label: -float(tables[label]["score"].sum()))
     scores = np.array([tables[label]["score"].values for label in labels])
@@ -419,7 +464,7 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
                 f"the data do not separate {best} from {label}: {best} is ahead by {by}"
             )
     converged = [float(tables[label]["converged"].mean()) for label in labels]
-    return xr.Dataset(
+    return Ranking(
         {
             "score": ("candidate", scores.mean(axis=-1)),
             "difference": ("candidate", differences),

@@ -12,6 +12,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from prbayes._display import Tree, View
 from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._stats import reached
@@ -31,6 +32,7 @@ from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
@@ -54,7 +56,7 @@ def calibrate_each(
     executor: Executor | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
-) -> xr.DataTree:
+) -> Products:
     """Calibrate many products with one model, one set of runs and one compilation.
 
     Each product has a population and a posterior of its own. The runs, the emulator and the points
@@ -413,7 +415,7 @@ def _tree(
     rows: Sequence[Calibration],
     draws: int,
     attrs: Mapping[str, Any],
-) -> xr.DataTree:
+) -> Products:
     """Return the posteriors and the table of products."""
     sizes = {"chain": 1, "draw": draws}
     first = next(row for row in rows if row.values)
@@ -435,6 +437,56 @@ def _tree(
         columns["rejected"] = tests[:, 2] <= attrs["alpha"]
     products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
     attrs = {**attrs, **versions()}
-    return xr.DataTree.from_dict(
+    return Products.from_dict(
         {"posterior": posterior.assign_attrs(attrs), "products": products.assign_attrs(attrs)}
     )
+
+
+class Products(Tree):
+    """Posteriors and validity tests by product."""
+
+    __slots__ = ()
+    _parts = ("posterior", "products")
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each product: mean and sd of each hyperparameter, and its test."""
+        posterior = self["posterior"].to_dataset()
+        columns: dict[str, Any] = {}
+        for name, draws in posterior.data_vars.items():
+            values = draws.values  # (chain, draw, product, *shape)
+            for index in np.ndindex(values.shape[3:]):
+                element = element_name(str(name), index)
+                of_products = values[:, :, :, *index]
+                columns[element] = of_products.mean(axis=(0, 1))
+                columns[f"sd of {element}"] = of_products.std(axis=(0, 1))
+        table = xr.Dataset(
+            {name: ("product", values) for name, values in columns.items()},
+            {"product": posterior["product"]},
+        )
+        numbers = self["products"].to_dataset().drop_vars("finding")
+        return table.merge(numbers).to_dataframe()
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        products = self["products"].to_dataset()
+        table = self.to_dataframe()
+        columns = [name for name in table.columns if not name.startswith("sd of ")]
+        rows = []
+        for product, row in table.iterrows():
+            cells = []
+            for name in columns:
+                sd = f" ± {row[f'sd of {name}']:.2g}" if f"sd of {name}" in table else ""
+                number = row[name]
+                is_flag = isinstance(number, bool | np.bool_)
+                cells.append(str(bool(number)) if is_flag else f"{number:.4g}{sd}")
+            rows.append([str(product), *cells])
+        pairs = zip(products["product"].values, products["finding"].values, strict=True)
+        sentences = [f"{product}: {finding}" for product, finding in pairs if finding]
+        heading = f"{len(rows)} products"
+        if "rejected" in products:
+            is_tested = np.isfinite(products["p_value"].values)
+            heading += (
+                f", {int(products['rejected'].sum())} of {int(is_tested.sum())} rejected at level "
+                f"{products.attrs['alpha']:g}"
+            )
+        return View(heading, ["", *columns], rows, sentences[:10])

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from importlib.resources import files
+from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,7 +31,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
-from prbayes.results.predict import data_digest, in_order, serving, specimen_names
+from prbayes.results.predict import call_settings, data_digest, in_order, serving, specimen_names
 from prbayes.validation.conditions import Case, Condition, Predictive, between
 
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.
@@ -311,6 +313,12 @@ class JointNull(Null):
         as passed to `predict`. Conditions without one are the model's simulators, by name; a single
         condition is the only simulator.
     replicates : int
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by its name.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
     random_seed : int
 
     Raises
@@ -347,9 +355,13 @@ class JointNull(Null):
         default=None, repr=False
     )
     replicates: int = 999
+    executor: Executor | None = field(default=None, repr=False)
+    store: str | PathLike[str] | None = field(default=None, repr=False)
+    version: str | None = field(default=None, repr=False)
     random_seed: int = 0
 
     def __post_init__(self) -> None:
+        call_settings(self.executor, self.store, self.version)
         advice = "; the model cannot be recalibrated: use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
         if self.responses is not None:
@@ -458,7 +470,12 @@ class JointNull(Null):
         refuse_uncallable(condition.name, response)
         read = read_inputs(condition.name, inputs, self.optimum.model)
         responses = Responses(
-            condition.name, response, read, outputs=None, caller="prb.validation.JointNull"
+            condition.name,
+            response,
+            read,
+            **call_settings(self.executor, self.store, self.version),
+            outputs=None,
+            caller="prb.validation.JointNull",
         )
         labels = set(condition.labels or ())
         # Simulators that measured these specimens come first.

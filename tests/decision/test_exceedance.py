@@ -51,7 +51,7 @@ def test_from_stored_responses() -> None:
 
 
 def test_from_points_near_the_limit() -> None:
-    table = ask(2.8, points=2000, n_draws=2000)
+    table = ask(2.8, n_points=2000, n_draws=2000)
     expected, interval = exact(2.8)
     assert expected < 2e-4
     assert abs(float(table.probability) - expected) < 4 * float(table.error)
@@ -59,7 +59,7 @@ def test_from_points_near_the_limit() -> None:
     np.testing.assert_allclose([table.lower, table.upper], interval, rtol=0.2)
     assert (table.attrs["responses"], table.attrs["source"]) == (2000, "importance points")
     # The error includes that draws are few.
-    few = ask(2.8, points=2000, n_draws=50)
+    few = ask(2.8, n_points=2000, n_draws=50)
     scatter = float(few.by_draw.std(ddof=1)) / np.sqrt(50)
     assert float(few.error) > scatter > 2 * float(table.error)
     assert abs(float(few.probability) - expected) < 3 * float(few.error)
@@ -75,7 +75,7 @@ def test_a_requirement_is_met_or_not_or_not_decided() -> None:
         (high + 1.5 * error, "not decided"),
         (high - error, "not decided"),
     ):
-        attributes = ask(2.0, requirement=requirement, points=0).attrs
+        attributes = ask(2.0, requirement=requirement, n_points=0).attrs
         assert (attributes["requirement"], attributes["verdict"]) == (requirement, verdict)
     with pytest.raises(ValueError, match="requirement"):
         ask(2.0, requirement=1.5)
@@ -83,8 +83,8 @@ def test_a_requirement_is_met_or_not_or_not_decided() -> None:
 
 @pytest.mark.parametrize("points", [0, 500])
 def test_below_is_above_of_the_opposite_and_of_one_of_several_outputs(points: int) -> None:
-    below = ask(0.2, below=True, points=points)
-    above = ask(-0.2, lambda x: np.stack([-x, x], axis=-1), output=0, points=points)
+    below = ask(0.2, below=True, n_points=points)
+    above = ask(-0.2, lambda x: np.stack([-x, x], axis=-1), output=0, n_points=points)
     np.testing.assert_allclose(below.by_draw, above.by_draw, rtol=1e-9)
 
 
@@ -115,7 +115,7 @@ def test_an_interval_gives_bounds_and_no_distribution() -> None:
     np.testing.assert_allclose(table.probability, ends)
     assert table.attrs["at"] == ["-0.5", "0.5"]
     assert (float(table.lower), float(table.upper)) == (float(low.lower), float(high.upper))
-    by_points = ask(1.5, shifted, interval, points=1000, steps=2)
+    by_points = ask(1.5, shifted, interval, n_points=1000, steps=2)
     np.testing.assert_allclose(by_points.probability, ends, rtol=0.2)
     assert by_points.attrs["at"] == ["-0.5", "0.5"]
 
@@ -165,12 +165,12 @@ def test_a_population_without_stored_responses_takes_points() -> None:
         prb.Simulator(
             "y", same, x, metric=prb.AreaMetric(), observed=observed, propagation=propagation
         )
-    table = prb.exceedance(posterior(), same, 2.5, x, model=model, points=1000)
+    table = prb.exceedance(posterior(), same, 2.5, x, model=model, n_points=1000)
     assert float(table.probability) == pytest.approx(exact(2.5)[0], rel=0.3)
     with pytest.raises(TypeError, match="without stored responses"):
         prb.exceedance(posterior(), same, 2.5, x, model=model)
     with pytest.raises(TypeError, match="got a model variable as an input"):
-        prb.exceedance(posterior(), shifted, 2.5, x, model["mu"], model=model, points=100)
+        prb.exceedance(posterior(), shifted, 2.5, x, model["mu"], model=model, n_points=100)
 
 
 def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) -> None:
@@ -178,14 +178,14 @@ def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) 
         table = ask(9.0, lambda x: np.minimum(x, 5.0))
     assert float(table.probability) == 0
     assert float(table.error) > 0
-    assert "pass points=1000" in caplog.text
+    assert "pass n_points=1000" in caplog.text
     with pytest.raises(prb.propagation.DesignError, match="lost mass"):
-        ask(2.0, lambda x: np.where(x < 1, np.nan, x), points=200)
+        ask(2.0, lambda x: np.where(x < 1, np.nan, x), n_points=200)
 
 
 def test_probabilities_stay_between_zero_and_one() -> None:
     for limit, probability in ((-50.0, 1.0), (50.0, 0.0)):
-        for options in ({}, {"points": 200}, {"points": 200, "below": True}, {"below": True}):
+        for options in ({}, {"n_points": 200}, {"n_points": 200, "below": True}, {"below": True}):
             table = ask(limit, **options)
             expected = 1 - probability if options.get("below") else probability
             assert (table.by_draw == expected).all()
@@ -198,7 +198,7 @@ def test_probabilities_stay_between_zero_and_one() -> None:
 
 def test_a_requirement_takes_points_near_the_limit_where_the_error_matters() -> None:
     # No stored response is above 12: the requirement is not decided by them.
-    stored = ask(12.0, requirement=1e-3, points=0)
+    stored = ask(12.0, requirement=1e-3, n_points=0)
     assert (float(stored.probability), stored.attrs["verdict"]) == (0.0, "not decided")
     assert stored.upper > 1e-3
     (finding,) = from_json(stored.attrs["findings"])
@@ -207,9 +207,9 @@ def test_a_requirement_takes_points_near_the_limit_where_the_error_matters() -> 
     assert (decided.attrs["verdict"], decided.attrs["source"]) == ("met", "importance points")
     assert exact(12.0)[1][1] < float(decided.upper) < 1e-6
     # Nor is one within two errors of the interval, and one far from it costs no response.
-    table = ask(3.2, points=0)
+    table = ask(3.2, n_points=0)
     near, far = float(table.upper + table.error), float(100 * table.upper)
-    assert ask(3.2, requirement=near, points=0).attrs["verdict"] == "not decided"
+    assert ask(3.2, requirement=near, n_points=0).attrs["verdict"] == "not decided"
     assert ask(3.2, requirement=near).attrs["source"] == "importance points"
     enough = ask(3.2, requirement=far)
     assert (enough.attrs["verdict"], enough.attrs["responses"]) == ("met", 0)

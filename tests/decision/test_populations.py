@@ -1,11 +1,16 @@
 """Stored responses as populations of a result."""
 
+import inspect
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
-from decisions import doubled, normal, optimum, posterior, same
+from decisions import OBSERVED, doubled, normal, optimum, posterior, same
 
 import prbayes as prb
 from prbayes.decision.populations import InverseTransform, Populations, output_column
@@ -141,3 +146,96 @@ def test_normal_numbers_become_inputs_by_their_distribution_functions() -> None:
     np.testing.assert_allclose(transform.responses(responses, z), a - c)
     with pytest.raises(TypeError, match="discrete"):
         InverseTransform("f", read_inputs("f", [count], model), [np.ones(1)])
+
+
+def calling_functions() -> dict[str, Callable[..., Any]]:
+    """Return calls that compute a response of the user, by the name of the function."""
+    _, x = normal()
+    condition = prb.decision.Condition
+
+    def tested(f: Any, **options: Any) -> Any:
+        predicted = prb.predict(optimum(), np.positive, x, name="own")
+        null = prb.validation.JointNull(optimum(), responses=(f, x), replicates=19, **options)
+        return prb.area_test(OBSERVED, predicted, null=null)
+
+    return {
+        "predict": lambda f, **o: prb.predict(optimum(), f, x, n_samples=50, **o),
+        "exceedance": lambda f, **o: prb.exceedance(optimum(), f, 1.0, x, **o),
+        "decision.p_box": lambda f, **o: prb.decision.p_box(optimum(), f, x, n_draws=20, **o),
+        "decision.evaluate": lambda f, **o: prb.decision.evaluate(
+            optimum(), prb.decision.Mean(f, x), n_draws=20, **o
+        ),
+        "sensitivity": lambda f, **o: prb.sensitivity(
+            optimum(), prb.decision.Mean(f, x), n_points=64, **o
+        ),
+        "plan": lambda f, **o: prb.plan(optimum(), {"a": condition(f, x)}, k=5, **o),
+        "population": lambda f, **o: prb.population(optimum(), condition(f, x), n_draws=20, **o),
+        "validation.JointNull": tested,
+        "Surrogate.fit": lambda f, **o: prb.Surrogate.fit(f, {"x": (0, 1)}, 16, name="own", **o),
+    }
+
+
+CALLING = calling_functions()
+
+
+def public(name: str) -> Any:
+    return reduce(getattr, name.split("."), prb)
+
+
+@pytest.mark.parametrize("name", CALLING)
+def test_a_store_and_an_executor_are_taken_wherever_a_response_is_computed(
+    name: str, tmp_path: Path
+) -> None:
+    def own(x: Any) -> Any:
+        return np.positive(x)
+
+    with ThreadPoolExecutor(1) as executor:
+        CALLING[name](own, executor=executor, store=tmp_path, version="1")
+    assert len(prb.response.Store(tmp_path, "own", columns=1, version="1", outputs=1)) > 0
+    with pytest.raises(TypeError, match=r"executor: got int 3"):
+        CALLING[name](own, executor=3)
+    if name not in ("Surrogate.fit", "validation.JointNull"):  # they have names of their own
+        with pytest.raises(ValueError, match="store: got a function called <lambda>, expected a"):
+            CALLING[name](lambda x: x, store=tmp_path)
+
+
+def test_where_a_response_is_computed_is_documented_alike() -> None:
+    sentences = []
+    for name in CALLING:
+        names = list(inspect.signature(public(name)).parameters)
+        first = names.index("executor")
+        assert names[first : first + 3] == ["executor", "store", "version"], name
+        if name == "Surrogate.fit":  # all settings of a propagation
+            continue
+        text = str(public(name).__doc__)
+        sentences.append(text[text.index("executor : ") : text.index("as for `Reweighted`.")])
+    assert len({" ".join(s.split()) for s in sentences}) == 1
+
+
+def test_a_function_inside_scalar_has_its_name(tmp_path: Path) -> None:
+    _, x = normal()
+
+    def cube(x: Any) -> Any:
+        return x**3
+
+    predicted = prb.predict(optimum(), prb.scalar(cube), x, n_samples=50, store=tmp_path)
+    assert predicted.name == "cube"
+
+
+def test_a_quantity_has_the_value_and_interval_of_its_draws() -> None:
+    model, x = normal()
+    quantity = prb.decision.Quantile(doubled, x, probability=0.8)
+    table = prb.decision.evaluate(posterior(), quantity, model=model, prob=0.9, n_draws=500)
+    found = populations(posterior(), 500)
+    exact = 2 * (found.thetas[:, 0] + 0.8416 * np.exp(found.thetas[:, 1]))
+    assert float(table.estimate) == pytest.approx(exact.mean(), abs=0.02)
+    np.testing.assert_allclose(
+        [table.lower, table.upper], np.quantile(exact, [0.05, 0.95]), atol=0.02
+    )
+    assert str(table).startswith(f"80% quantile of doubled: {float(table.estimate):.4g}, 90% int")
+    at_optimum = prb.decision.evaluate(optimum(), quantity)
+    shares = prb.sensitivity(optimum(), quantity, n_points=64)
+    assert float(at_optimum.estimate) == pytest.approx(shares.attrs["value"])
+    assert float(at_optimum.error) == pytest.approx(shares.attrs["value_error"], rel=1e-3)
+    with pytest.raises(TypeError, match=r"prb.decision.evaluate: quantity: got"):
+        prb.decision.evaluate(posterior(), doubled, model=model)  # type: ignore[arg-type]

@@ -80,7 +80,7 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
     model, x = normal()
     quantity = prb.decision.Exceedance(same, x, limit=2.0)
     few, again, many = [
-        prb.sensitivity(posterior(), quantity, model=model, n_samples=n, random_seed=seed)
+        prb.sensitivity(posterior(), quantity, model=model, n_points=n, random_seed=seed)
         for n, seed in ((64, 1), (64, 1), (512, 2))
     ]
     xr.testing.assert_identical(few, again)
@@ -226,7 +226,7 @@ def test_ishigami_emulated_from_few_runs_and_called() -> None:
 def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
     optimum, inputs = problem(None, 4096)
     quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
-    table = prb.sensitivity(optimum, quantity, n_samples=64)
+    table = prb.sensitivity(optimum, quantity, n_points=64)
     assert np.isnan(table["first"].sel(factor="a"))
     assert "computed=True" in table.attrs["inputs"]
 
@@ -242,12 +242,12 @@ def test_where_the_nearest_run_failed_a_line_ends() -> None:
 def test_shares_of_no_variance_have_a_reason() -> None:
     model, x = normal()
     at_limit = prb.decision.Quantile(lambda x: np.minimum(x, 1), x, probability=0.9)
-    table = prb.sensitivity(posterior(), at_limit, model=model, n_samples=64)
+    table = prb.sensitivity(posterior(), at_limit, model=model, n_points=64)
     assert table.attrs["sd"] == 0
     assert np.isnan(table["first"].sel(factor="mu"))
     assert "constant-quantity" in table.attrs["findings"]
     rare = prb.decision.Quantile(same, x, probability=1 - 1e-6)
-    table = prb.sensitivity(posterior(), rare, model=model, n_samples=64)
+    table = prb.sensitivity(posterior(), rare, model=model, n_points=64)
     assert np.isnan(table["first"].sel(factor="x"))
     assert "beyond the quantile is the same for all 16 specimens" in table.attrs["inputs"]
     assert table.attrs["value_error"] > 0
@@ -262,8 +262,8 @@ def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch
     second = prb.decision.Mean(ishigami_and_linear, *inputs)
 
     def derivatives() -> tuple[Any, Any]:
-        one = prb.sensitivity(posterior(), first, model=model, n_samples=256)
-        two = prb.sensitivity(of_inputs, second, n_samples=64, computed=True)
+        one = prb.sensitivity(posterior(), first, model=model, n_points=256)
+        two = prb.sensitivity(of_inputs, second, n_points=64, computed=True)
         return one.derivative.sel(factor=["mu", "sigma"]), two.derivative[1:]
 
     before = derivatives()

@@ -47,7 +47,7 @@ def test_the_cost_is_the_number_of_runs(propagation: Any, first: int, per_theta:
     again = 0 if propagation.is_random else 3  # are computed again, and not counted
     response = Counted()
     function = prb.scalar(response)
-    cost = prb.cost(lambda: model_of(function, propagation, "y"))
+    cost = prb.cost(model_of(function, propagation, "y"))
     model = model_of(function, propagation, "y")
     assert str(prb.cost(model)) == str(cost)
     assert (cost.runs, cost.runs_each, response.calls) == (first, per_theta, 0)
@@ -73,11 +73,8 @@ def test_shared_runs_count_once() -> None:
 
 
 def test_other_objects_than_models_are_refused() -> None:
-    message = r"cost: model: got a function that returns NoneType None, expected a"
-    with pytest.raises(TypeError, match=message):
-        prb.cost(lambda: None)  # type: ignore[arg-type, return-value]
-    with pytest.raises(ZeroDivisionError):
-        prb.cost(lambda: 1 / 0)  # type: ignore[arg-type, return-value]
+    with pytest.raises(TypeError, match=r"prb.cost\(\): got function, expected a pm.Model"):
+        prb.cost(lambda: None)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"prb.cost\(\): got no model on the context"):
         prb.cost()
 

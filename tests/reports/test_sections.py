@@ -336,7 +336,7 @@ def questions() -> dict[str, xr.Dataset]:
     return {
         "risk": prb.exceedance(optimum(), same, 2.0, x, requirement=0.1),
         "bounds": prb.exceedance(optimum(), lambda x, by: x + by, 2.0, x, interval, steps=2),
-        "influence": prb.sensitivity(optimum(), prb.decision.Mean(same, x), n_samples=64),
+        "influence": prb.sensitivity(optimum(), prb.decision.Mean(same, x), n_points=64),
         "plan": prb.plan(optimum(), {"same": prb.decision.Condition(same, x)}, k=[5, 20]),
     }
 

@@ -264,7 +264,7 @@ def test_specimens_and_data_of_the_calibration_are_saved(tmp_path: Path) -> None
     assert y.attrs["calibration_specimens"][:3] == ["0", "1", "2"]
     y.to_netcdf(tmp_path / "predicted.nc")
     loaded = xr.load_dataarray(tmp_path / "predicted.nc")
-    xr.testing.assert_equal(loaded, y)
+    assert loaded.equals(y)
     with pytest.raises(ValueError, match="2 specimens of the calibration, such as '3'"):
         prb.area_test([0.1, 0.2, 0.3], loaded, specimens=[3, 7, 90])
 
