@@ -83,17 +83,18 @@ LONG = [
 
 @pytest.mark.parametrize("build", [lognormal, vector, *LONG])
 def test_numbers_are_those_of_plain_variables(build: Callable[[Any], Any]) -> None:
+    # Sums may have another order, and so another rounding.
     plain, named = numbers(build, pm), numbers(build, pmd)
     assert list(plain) == list(named)
     for name, value in plain.items():
-        np.testing.assert_array_equal(named[name], value, err_msg=name)
+        np.testing.assert_allclose(named[name], value, rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.long
 def test_numbers_of_a_metric_are_those_of_plain_variables() -> None:
     plain, named = [numbers(lognormal, p, prb.AreaMetric()) for p in (pm, pmd)]
     for name, value in plain.items():
-        np.testing.assert_array_equal(named[name], value, err_msg=name)
+        np.testing.assert_allclose(named[name], value, rtol=1e-4, err_msg=name)
 
 
 def test_elements_have_the_names_of_coordinates() -> None:
