@@ -56,6 +56,7 @@ html_title = "prbayes"
 html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["prbayes.css"]
+html_js_files = ["keyboard.js"]
 html_copy_source = html_show_sourcelink = False
 copybutton_selector = "div.highlight:not(.cell_output *) pre"
 copybutton_exclude = ".linenos, .gp, .go"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from prbayes import response as response
     from prbayes import surrogate as surrogate
     from prbayes import validation as validation
+    from prbayes._finding import help as help
     from prbayes.decision.exceedance import exceedance as exceedance
     from prbayes.decision.plan import plan as plan
     from prbayes.decision.population_table import population as population
@@ -67,6 +68,7 @@ __version__ = version("prbayes")
 
 # Public names by module; a module is imported when one of its names is used.
 _NAMES = {
+    "_finding": ("help",),
     "decision.exceedance": ("exceedance",),
     "decision.plan": ("plan",),
     "decision.population_table": ("population",),

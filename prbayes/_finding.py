@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from prbayes._validate import plain_text
 
 _log = logging.getLogger("prbayes")
 
@@ -18,19 +23,19 @@ class Finding:
     ----------
     code : str
         Stable identifier, such as ``"rounded-data"``, by which findings are filtered;
-        ``docs/findings.md`` lists all.
+        ``prb.help()`` lists all.
     text : str
         One or two sentences for the reader: got, expected, what to do.
     page : str, optional
         Documentation page with details and the heading, such as ``"likelihood.md#rounded-data"``.
-        A constant: tests check that page and heading exist.
+        A constant: tests check that page and heading exist, and that `help` shows the section.
 
     Examples
     --------
     >>> from prbayes._finding import Finding
     >>> finding = Finding("rounded-data", "The data are rounded.", "likelihood.md#rounded-data")
     >>> print(finding)
-    The data are rounded; see docs/likelihood.md#rounded-data.
+    The data are rounded; see prb.help("rounded-data").
     """
 
     code: str
@@ -38,13 +43,12 @@ class Finding:
     page: str = ""
 
     def __str__(self) -> str:
-        """Return the text, with the page before its final period."""
+        """Return the text, with the call that shows its page before the final period."""
         if not self.page:
             return self.text
         sentence = self.text.removesuffix(".")
         period = self.text[len(sentence) :]
-        # The pages are in the repository and in the source distribution.
-        return f"{sentence}; see docs/{self.page}{period}"
+        return f'{sentence}; see prb.help("{self.code}"){period}'
 
 
 def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
@@ -72,3 +76,91 @@ def from_json(text: str) -> tuple[Finding, ...]:
             f"findings: got {text[:80]!r}, expected a JSON list of records of code, text and page; "
             "the file was changed, or is of another version"
         ) from None
+
+
+class Help(str):
+    """Text that a console shows as it is, and a notebook as Markdown."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
+
+    def _repr_markdown_(self) -> str:
+        return str(self)
+
+
+def help(code: str | None = None) -> Help:
+    """Explain the code of a finding, or list all codes.
+
+    Parameters
+    ----------
+    code : str, optional
+        Code of a finding, such as ``"rounded-data"``. Without a code, all are listed.
+
+    Returns
+    -------
+    str
+        Markdown: the meaning of the code, what to do, and the sections of the documentation about
+        it. A console shows the text without quotes, a notebook shows it formatted.
+
+    Raises
+    ------
+    TypeError
+        If ``code`` is no text.
+    ValueError
+        If no finding has this code. The message has the nearest codes.
+
+    Examples
+    --------
+    >>> import prbayes as prb
+    >>> prb.help("prior-misfit")
+    `prior-misfit`: The data do not fit the population at an optimum with the prior. Look at \
+`prb.minimize` without the prior.
+    >>> print(prb.help("rounded-data").splitlines()[2])
+    ### Rounded data
+    """
+    rows = dict(re.findall(r"^\| `([\w-]+)` \| (.*) \|$", _page("findings.md"), re.MULTILINE))
+    if code is None:
+        first = {key: _plain(text).split(". ")[0].rstrip(".") for key, text in rows.items()}
+        listed = "".join(f"- `{key}`: {sentence}.\n" for key, sentence in first.items())
+        return Help(f'Codes of findings. `prb.help("rounded-data")` explains one.\n\n{listed}')
+    if plain_text(code, "code") not in rows:
+        near = ", ".join(map(repr, get_close_matches(code, rows, cutoff=0.4)))
+        raise ValueError(
+            f"code: got {code!r}, expected the code of a finding{near and f', such as {near}'}; "
+            "prb.help() lists all"
+        )
+    text, _, links = rows[code].partition(" See [")
+    sections = [_section(link) for link in re.findall(r"\]\((.*?)\)", links)]
+    return Help("\n\n".join([f"`{code}`: {_plain(text)}", *sections]))
+
+
+def _page(name: str) -> str:
+    """Return a page of the documentation, from the installed package or from the repository."""
+    package = Path(__file__).parent
+    folder = package / "docs" if (package / "docs").is_dir() else package.parent / "docs"
+    return (folder / name).read_text(encoding="utf-8")
+
+
+def _section(link: str) -> str:
+    """Return the section of a page that a link such as ``"likelihood.md#rounded-data"`` names."""
+    name, _, anchor = link.partition("#")
+    text = _page(name)
+    headings = list(re.finditer(r"^(##+) (.+)$", text, re.MULTILINE))
+    # Anchors as GitHub and the site make them of headings.
+    anchors = [re.sub(r"[^\w -]", "", h[2]).lower().replace(" ", "-") for h in headings]
+    start = anchors.index(anchor)
+    later = (h.start() for h in headings[start + 1 :] if len(h[1]) <= len(headings[start][1]))
+    return _plain(text[headings[start].start() : next(later, len(text))])
+
+
+def _plain(text: str) -> str:
+    """Return a part of a page as Markdown: without hidden code, directives and relative links."""
+    for pattern, replacement in (
+        (r"^```\{code-cell\} ipython3\n:tags: \[[^\n]*remove-(?:cell|input).*?^```\n+", ""),
+        (r"^```\{code-cell\} ipython3\n(?::tags: [^\n]*\n)?\n*", "```python\n"),
+        (r"\{[\w:-]+\}`([^`<]*[^`< ])(?: *<[^`]*>)?`", r"`\1`"),
+        (r"(?<!!)\[([^\]]+)\]\((?!http)[^)]*\)", r"\1"),
+        (r"^<!--.*?-->\n", ""),
+    ):
+        text = re.sub(pattern, replacement, text, flags=re.MULTILINE | re.DOTALL)
+    return text.strip()

@@ -132,9 +132,11 @@ NO_LIMIT = (np.nan, np.inf, [1.0])
 BY_NAME: dict[str, tuple[Any, ...]] = {
     "alpha": SHARE,
     "checkpoint": (b"a", "/dev/null/run.nc", "/"),
+    "coords": (3, {"no such dim": 1}),
     "density": (prb.GaussianKDE,),
     "executor": (map, object()),
     "figsize": (3, "wide", (3,), (0, 4), (np.inf, 4), ("a", 4)),
+    "filter_vars": (3, "glob"),
     "folds": (1, 29),
     "idata_kwargs": ({"model": 1}, {"dims": 1}, {"log_prior": 1}),
     "labels": ({"mu": 3}, {"no such name": "mean"}),
@@ -608,19 +610,15 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         own="result",
     ),
     "plots.plot_landscape": Row(
-        pair=(("mu", "zz"), ("mu", "mu"), (), {3}),
         responses=(*ZERO_OR_MORE, None),
         own="responses",
     ),
     "plots.plot_outputs": Row(
         {"result": Later(of_two_outputs), "model": two_outputs},
         result=(None, 3, "result", xr.DataTree(), []),
-        simulator=("zz", ["y"]),
-        outputs=("zz", [], [3], ["zz", "y"]),
         before=BEFORE,
         own="result",
     ),
-    "plots.plot_population": Row(inputs=("zz", [], [3], ["zz"])),
     "plots.plot_posterior": Row(
         posterior=BY_NAME["result"],
         optimum=(3, "a", posterior),

@@ -13,12 +13,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from arviz_plots.plot_collection import PlotCollection
 from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.backends.base import MultiTrace
 from pymc.backends.ndarray import NDArray
@@ -57,6 +59,12 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 from pytensor.xtensor.basic import xtensor_from_tensor
 from pytensor.xtensor.vectorization import XRV
+
+
+def test_the_collection_of_arviz_is_that_of_its_plots() -> None:
+    assert az.PlotCollection is PlotCollection
+    assert {"viz", "add_legend", "savefig"} <= set(dir(PlotCollection))
+
 
 PLAIN = Mode(linker="py", optimizer="fast_run")
 

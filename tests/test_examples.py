@@ -57,11 +57,12 @@ def test_gallery(tmp_path: Path) -> None:
     assert len(cells) > 10
     script = tmp_path / "gallery.py"
     saved = "\nimport matplotlib.pyplot as plt\nprint(len(plt.get_fignums()))"
-    script.write_text("\n".join(cells) + saved, encoding="utf-8")
+    code = re.sub(r"^:tags: .*\n", "", "\n".join(cells) + saved, flags=re.MULTILINE)
+    script.write_text(code, encoding="utf-8")
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     command = [sys.executable, "-W", "error::UserWarning", str(script)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.split()[-1] == str(page.count("prb.plot_"))
+    assert done.stdout.split()[-1] == str(page.count("prb.plots.plot_"))
 
 
 @pytest.mark.slow

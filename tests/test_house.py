@@ -516,6 +516,7 @@ INNER = {
         "pytensor.xtensor.basic.xtensor_from_tensor",
         "pytensor.xtensor.vectorization.XRV",
     },
+    "plots.posterior": {"arviz_plots.plot_collection.PlotCollection"},
     "posterior.results": {
         "pymc.backends.base.MultiTrace",
         "pymc.backends.ndarray.NDArray",

@@ -163,3 +163,5 @@ def test_what_a_message_names_is_there(named: str) -> None:
     # As GitHub and the site make them of headings
     anchors = [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings]
     assert anchor in anchors
+    # `prb.help` shows the section
+    assert f"({named})" in (pages.DOCS / "findings.md").read_text(encoding="utf-8")

@@ -89,9 +89,12 @@ def test_results_of_benchmarks_are_marked_as_the_repository_s() -> None:
 
 def test_words_of_the_search_have_pages() -> None:
     text = (DOCS / "_extensions" / "search_words.py").read_text(encoding="utf-8")
-    pages = re.findall(r'^    "(\w+)": \[', text, re.M)
-    assert len(pages) > 15
-    assert not [page for page in pages if not (DOCS / f"{page}.md").exists()]
+    places = re.findall(r'^    "([\w#-]+)": \[', text, re.M)
+    assert len(places) > 15
+    for page, _, anchor in (place.partition("#") for place in places):
+        headings = re.findall(r"^## (.+)$", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M)
+        anchors = [re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings]
+        assert anchor in ["", *anchors]
 
 
 def test_every_page_is_in_the_sidebar() -> None:

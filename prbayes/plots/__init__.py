@@ -1,4 +1,4 @@
-"""Pictures of results, drawn by Matplotlib in panels of ArviZ."""
+"""Pictures of results: figures of Matplotlib, and of posteriors a collection of ArviZ."""
 
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.convergence import plot_optimizer, plot_stages

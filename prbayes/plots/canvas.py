@@ -1,47 +1,49 @@
-"""Panels of an ArviZ `PlotCollection`, drawn by Matplotlib, with one legend below them; labels.
+"""Figures with named panels and one legend below them; colours, ticks and labels.
 
-Plotting libraries are imported when a canvas is made.
+Plotting libraries are imported when a figure is made.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib import import_module
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
-from prbayes._validate import Floats, called, texts
+from prbayes._validate import Floats, called, positive_integer, texts
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Colours that colour-blind readers distinguish (Okabe and Ito, Color Universal Design, 2008); line
 # styles distinguish curves in grey.
 BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
 VERMILION, PURPLE = "#D55E00", "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
-# Codes of ArviZ for colours against the background, line styles and markers.
-INK, GREY, PALE = "B1", "B2", "B3"
-SOLID, DASHED, DOTTED, DASHDOT = "C0", "C1", "C2", "C3"
-CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
+# Grey is legible on a light and on a dark background.
+GREY, PALE = "#707070", "#949494"
 
 Limits = tuple[float, float]
-Ticks = tuple[list[float], list[str]]  # positions and labels
 
 
-def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
-    """Raise if labels are not texts by name, or the size is wrong, before anything is computed."""
+def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: bool = False) -> None:
+    """Raise if labels are not texts by name, or an option of the figure is wrong."""
     if labels is not None:
         texts(labels, "labels")
-    if "backend" in pc_kwargs:
+    unknown = set(pc_kwargs) - {"figsize", "col_wrap", "figure_kwargs"}
+    if unknown and not by_arviz:
         raise TypeError(
-            f"backend: got {called(pc_kwargs['backend'])}, expected none: pictures are drawn by "
-            "Matplotlib"
+            f"{min(unknown)}: got {called(pc_kwargs[min(unknown)])}, expected figsize, col_wrap or "
+            "figure_kwargs: Matplotlib draws this picture"
         )
+    if "col_wrap" in pc_kwargs:
+        positive_integer(pc_kwargs["col_wrap"], "col_wrap")
     figsize = pc_kwargs.get("figsize")
     try:
         width, height = (1.0, 1.0) if figsize is None else map(float, figsize)
@@ -54,52 +56,63 @@ def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
         )
 
 
-class Canvas:
-    """A figure with named panels, in order, of a size in inches each."""
-
-    def __init__(
-        self, names: Sequence[str], *, size: tuple[float, float], pc_kwargs: dict[str, Any]
-    ) -> None:
-        # Three panels a row; four make a square.
-        n = len(names)
-        settings = {"cols": ["__variable__"], "col_wrap": 2 if n == 4 else 3, **pc_kwargs}
-        columns = min(n, settings["col_wrap"])
-        rows = -(-n // columns)
-        figure = {
-            "figsize": settings.pop("figsize", None) or (size[0] * columns, size[1] * rows),
-            "figsize_units": "inches",
-            "layout": "constrained",  # makes room for the legend
-        }
-        settings["figure_kwargs"] = figure | settings.get("figure_kwargs", {})
-        arviz: Any = import_module("arviz")
-        data = xr.Dataset({name: (f"{name} point", np.zeros(2)) for name in names})
-        self._collection = arviz.PlotCollection.wrap(data, backend="matplotlib", **settings)
-        library = import_module("arviz_plots.backend.matplotlib")
-        targets = {name: self._collection.get_target(name, {}) for name in names}
-        self.panels = {name: Panel(library, target) for name, target in targets.items()}
-
-    def finish(self) -> Any:
-        """Return the `PlotCollection`, with a legend, and the artists by visual and panel."""
-        by_visual: dict[str, dict[str, Any]] = {}
-        for name, panel in self.panels.items():
-            for visual, artist in panel.artists.items():
-                by_visual.setdefault(visual, {})[name] = ((), np.array(artist, dtype=object))
-        for visual, artists in by_visual.items():
-            self._collection.viz[visual] = xr.DataTree(xr.Dataset(artists))
-        figure = self._collection.viz["figure"].item()
-        draw_legend(figure, [panel.target for panel in self.panels.values()])
-        return self._collection
+def layout(
+    n: int, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
+) -> tuple[int, dict[str, Any]]:
+    """Return the columns of n panels, and options of a figure with this size for each of them."""
+    # Three panels a row; four make a square.
+    columns = min(n, pc_kwargs.get("col_wrap", 2 if n == 4 else 3))
+    figsize = pc_kwargs.get("figsize") or (size[0] * columns, size[1] * -(-n // columns))
+    options = {"figsize": figsize, "layout": "constrained"}  # which makes room for the legend
+    return columns, options | pc_kwargs.get("figure_kwargs", {})
 
 
-def draw_legend(figure: Any, targets: list[Any]) -> None:
+def panels(
+    names: Sequence[str], *, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
+) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure of pyplot, and panels of a size in inches that have their name as label."""
+    from matplotlib import pyplot as plt  # heavy, and only needed for pictures
+
+    columns, options = layout(len(names), size, pc_kwargs)
+    figure = plt.figure(**options)
+    vars(figure)["_ipython_display_"] = partial(shown_once, figure)
+    rows = -(-len(names) // columns)
+    axes = {
+        name: figure.add_subplot(rows, columns, i + 1, label=name) for i, name in enumerate(names)
+    }
+    return figure, axes
+
+
+def shown_once(figure: Figure) -> None:
+    """Close a figure that a notebook displays, so that pyplot does not display it again.
+
+    A notebook displays the last value of a cell, and then pyplot its open figures. By a
+    NotImplementedError IPython displays the figure in its usual way.
+    """
+    import matplotlib as mpl
+    from matplotlib import pyplot as plt
+
+    if "inline" in mpl.get_backend():
+        plt.close(figure)
+    raise NotImplementedError
+
+
+def ink() -> str:
+    """Return the colour of text, which is strong on any background."""
+    import matplotlib as mpl
+
+    return str(mpl.rcParams["text.color"])
+
+
+def finish(figure: Figure) -> Figure:
     """Draw one legend below all panels, with as many columns as fit and rows of equal length."""
     handles: dict[str, Any] = {}
-    for target in targets:
-        for handle, text in zip(*target.get_legend_handles_labels(), strict=True):
+    for axis in figure.axes:
+        for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)
     n = len(handles)
     if not n:
-        return
+        return figure
     # An inch takes 11.5 characters of the default font; a mark with its gaps is as wide as eight.
     characters = sum(len(text) + 8 for text in handles)
     fitting = max(1, min(n, int(n * 11.5 * figure.get_figwidth() / characters)))
@@ -108,87 +121,13 @@ def draw_legend(figure: Any, targets: list[Any]) -> None:
     figure.legend(
         handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One panel of a canvas; each visual is drawn once on it."""
-
-    library: Any  # ArviZ's drawing functions
-    target: Any  # axes of Matplotlib
-    artists: dict[str, Any] = field(default_factory=dict)  # by visual
-
-    def line(
-        self,
-        visual: str,
-        xy: Any,
-        color: str,
-        *,
-        style: str = SOLID,
-        width: float | None = 1.8,
-        legend: str = "",
-    ) -> None:
-        """Draw a line through places x and y; without a width, that of Matplotlib's settings."""
-        look: dict[str, Any] = {"color": color, "linestyle": style, "label": legend}
-        if width is not None:
-            look["width"] = width
-        self.artists[visual] = self.library.line(*map(np.asarray, xy), self.target, **look)
-
-    def band(
-        self,
-        visual: str,
-        x: Floats,
-        sides: tuple[Floats, Floats],
-        color: str,
-        *,
-        alpha: float = 0.25,
-        legend: str = "",
-    ) -> None:
-        """Shade the area between two curves, the lower one first."""
-        self.artists[visual] = self.library.fill_between_y(
-            x, *sides, self.target, color=color, alpha=alpha, label=legend
-        )
-
-    def points(
-        self,
-        visual: str,
-        xy: Any,
-        color: str,
-        *,
-        marker: str = CIRCLE,
-        size: float = 30,
-        legend: str = "",
-    ) -> None:
-        """Draw markers of an area, in square points, at places x and y."""
-        places = np.broadcast_arrays(*map(np.atleast_1d, xy))
-        self.artists[visual] = self.library.scatter(
-            *places, self.target, color=color, marker=marker, size=size, label=legend
-        )
-
-    def axes(
-        self,
-        *,
-        x: str = "",
-        y: str = "",
-        title: str = "",
-        xlim: Limits | None = None,
-        ylim: Limits | None = None,
-        xticks: Ticks | None = None,
-        yticks: Ticks | None = None,
-    ) -> None:
-        """Set labels, limits and ticks of the axes; the rest is left to Matplotlib."""
-        settings = {"title": title, "xlabel": x, "ylabel": y, "xlim": xlim, "ylim": ylim}
-        self.target.set(**{key: value for key, value in settings.items() if value})
-        if xticks is not None:
-            self.target.set_xticks(*xticks)
-        if yticks is not None:
-            self.target.set_yticks(*yticks)
+    return figure
 
 
 # -- ticks -----------------------------------------------------------------------------------
 
 
-def round_ticks(low: float, high: float) -> Ticks:
+def round_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
     """Return up to five round numbers within a range, and their labels."""
     from matplotlib.ticker import MaxNLocator  # heavy, and only needed for pictures
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -11,26 +11,33 @@ import xarray as xr
 from prbayes._validate import flag
 from prbayes.plots.canvas import (
     BLUE,
-    DOTTED,
     GREY,
-    INK,
     METRIC_LABELS,
-    Canvas,
+    check_options,
+    finish,
+    ink,
     named,
+    panels,
     refuse_labels,
-    refuse_look,
     round_ticks,
 )
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
 from prbayes.results.compare import COSTS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_comparison(
     comparison: xr.Dataset,
     *,
     scores: bool = False,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the estimate and interval of each result, a row per result, a panel per hyperparameter.
 
     Parameters
@@ -40,16 +47,22 @@ def plot_comparison(
     scores : bool
         Draw instead the discrepancy of each result's population under each metric, a panel per
         metric; smaller is better, each metric in its own units.
+    var_names : str or sequence of str, optional
+        Hyperparameters, or elements of them; or metrics. All by default, otherwise in this order.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Such as ``{"result": ["optimum", "posterior"]}``.
     labels : mapping, optional
         Labels of hyperparameters, results or scores by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``estimate`` and ``interval_0``, ``interval_1`` and so on by
-        result; or ``score``.
+    matplotlib.figure.Figure
+        Its panels have the labels of the hyperparameters or metrics.
 
     Raises
     ------
@@ -65,15 +78,17 @@ def plot_comparison(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
     >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
-    >>> list(prb.plots.plot_comparison(table).viz["estimate"])
+    >>> figure = prb.plots.plot_comparison(table)
+    >>> [axis.get_label() for axis in figure.axes]
     ['mu']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     flag(scores, "scores")
     variables = {"estimate", "lower", "upper"}
     if not isinstance(comparison, xr.Dataset) or not variables <= set(comparison.data_vars):
         got = type(comparison).__name__
         raise TypeError(f"plot_comparison: got {got}, expected the Dataset of prb.compare")
+    comparison = subset(comparison, coords)
     if scores:
         names = [
             str(name)
@@ -87,42 +102,40 @@ def plot_comparison(
             )
     else:
         names = list(map(str, comparison.hyperparameter.values))
+    names = select_variables(names, var_names, filter_vars)
     results = list(map(str, comparison.result.values))
     refuse_labels(labels, [*names, *results])
     texts = [named(result, labels) for result in results]
     n = len(results)
     rows = np.arange(n - 1.0, -1.0, -1.0)  # the first on top
     limits = (-0.6, n - 0.4)
-    interval = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
 
-    canvas = Canvas(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
-    for name in names:
-        panel = canvas.panels[name]
+    figure, axes = panels(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
+    for name, axis in axes.items():
         if scores:
             values = comparison[name].values
             finite = np.isfinite(values)
-            panel.points("score", (values[finite], rows[finite]), BLUE, size=45)
+            axis.scatter(values[finite], rows[finite], 45, color=BLUE, gid="score")
         else:
             row = comparison.sel(hyperparameter=name)
-            values = np.concatenate([row.lower, row.upper, row.estimate])
+            lower, upper, estimate = row.lower.values, row.upper.values, row.estimate.values
+            values = np.concatenate([lower, upper, estimate])
             if n > 1:  # a line through the first result, for comparison
-                first = np.repeat(row.estimate.values[:1], 2)
                 text = f"estimate of {texts[0]}"
-                panel.line("first", (first, limits), GREY, style=DOTTED, width=1.2, legend=text)
-            for i, ends in enumerate(np.column_stack([row.lower, row.upper])):
-                if np.isfinite(ends).all():
-                    y = np.repeat(rows[i], 2)
-                    panel.line(f"interval_{i}", (ends, y), BLUE, width=3, legend=interval)
-            panel.points("estimate", (row.estimate.values, rows), INK, size=45, legend="estimate")
+                axis.axvline(estimate[0], color=GREY, linestyle=":", label=text, gid="first")
+            text = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
+            has_ends = np.isfinite(lower) & np.isfinite(upper)
+            ends = rows[has_ends], lower[has_ends], upper[has_ends]
+            axis.hlines(*ends, color=BLUE, linewidth=3, label=text, gid="interval")
+            axis.scatter(
+                estimate, rows, 45, color=ink(), label="estimate", gid="estimate", zorder=3
+            )
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # for markers
         xlim = float(low - margin), float(high + margin)
-        panel.axes(
-            x=named(name, METRIC_LABELS | dict(labels or {})),
-            xlim=xlim,
-            ylim=limits,
-            xticks=round_ticks(*xlim),
-            yticks=(rows.tolist(), texts),
-        )
-    return canvas.finish()
+        label = named(name, METRIC_LABELS | dict(labels or {}))
+        axis.set(xlabel=label, xlim=xlim, ylim=limits)
+        axis.set_xticks(*round_ticks(*xlim))
+        axis.set_yticks(rows, texts)
+    return finish(figure)

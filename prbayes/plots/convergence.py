@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -12,34 +12,38 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
     CYCLE,
-    DASHDOT,
-    DASHED,
-    DOTTED,
     GREY,
-    SOLID,
     STATISTIC_LABELS,
     VERMILION,
-    Canvas,
+    check_options,
+    finish,
     named,
+    panels,
     refuse_labels,
-    refuse_look,
     scale_by_decades,
 )
 from prbayes.plots.landscape import (
     check_optimum,
     free_elements,
-    free_names,
     objective,
     objective_label,
+    select_free,
 )
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_optimizer(
     optimum: Optimum,
     *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the objective and the hyperparameters of an optimiser's evaluations.
 
     The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far,
@@ -53,16 +57,22 @@ def plot_optimizer(
     ----------
     optimum : Optimum
         From `minimize`.
+    var_names : str or sequence of str, optional
+        Hyperparameters, or elements of them, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of the hyperparameters by dimension, such as ``{"supplier": ["Adler"]}``.
     labels : mapping, optional
         Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum``
-        (other panels).
+    matplotlib.figure.Figure
+        Its panels have the labels ``discrepancy`` and those of the hyperparameters.
 
     Raises
     ------
@@ -77,16 +87,18 @@ def plot_optimizer(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plots.plot_optimizer(prb.minimize(model)).viz["asked"])
+    >>> figure = prb.plots.plot_optimizer(prb.minimize(model))
+    >>> [axis.get_label() for axis in figure.axes]
     ['discrepancy', 'mu']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.search.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
-    hyperparameters = free_names(optimum)
+    hyperparameters = select_free(optimum, var_names, filter_vars, coords)
     refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
-    canvas = Canvas(["discrepancy", *hyperparameters], size=(4.6, 3.4), pc_kwargs=pc_kwargs)
+    names = ["discrepancy", *hyperparameters]
+    figure, axes = panels(names, size=(4.6, 3.4), pc_kwargs=pc_kwargs)
     evaluations = optimum.search.trace["evaluations"].astype(np.float64)
 
     # The objective, recomputed with the final design and scales where that costs no response
@@ -96,31 +108,35 @@ def plot_optimizer(
         values = objective(optimum, optimum.evaluator, optimum.search.trace["theta"])
     finite = np.isfinite(values)
     x, values = evaluations[finite], values[finite]
-    panel = canvas.panels["discrepancy"]
-    panel.points("asked", (x, values), GREY, size=16, legend="evaluated")
+    axis = axes["discrepancy"]
+    axis.scatter(x, values, 16, color=GREY, label="evaluated", gid="evaluated")
     # Values of different scales cannot be compared
     if is_free or len(optimum.scales) == 1:
-        panel.line("best", (x, np.minimum.accumulate(values)), BLUE, legend="lowest so far")
-    panel.axes(x="evaluations", y=objective_label(optimum))
-    scale_by_decades(panel.target, values)
+        lowest = np.minimum.accumulate(values)
+        axis.plot(x, lowest, color=BLUE, label="lowest so far", gid="lowest")
+    axis.set(xlabel="evaluations", ylabel=objective_label(optimum))
+    scale_by_decades(axis, values)
 
     for name in hyperparameters:
-        panel = canvas.panels[name]
-        panel.line("path", (evaluations, path[name]), GREY, width=0.8)
-        panel.points("asked", (evaluations, path[name]), GREY, size=16, legend="evaluated")
-        level = np.repeat(final[name], 2)
-        ends = evaluations[[0, -1]]
-        panel.line("optimum", (ends, level), VERMILION, style=DASHED, legend="optimum")
-        panel.axes(x="evaluations", y=named(name, labels))
-    return canvas.finish()
+        axis = axes[name]
+        axis.plot(evaluations, path[name], color=GREY, linewidth=0.8, gid="path")
+        axis.scatter(evaluations, path[name], 16, color=GREY, label="evaluated", gid="evaluated")
+        axis.axhline(
+            final[name][0], color=VERMILION, linestyle="--", label="optimum", gid="optimum"
+        )
+        axis.set(xlabel="evaluations", ylabel=named(name, labels))
+    return finish(figure)
 
 
 def plot_stages(
     posterior: xr.DataTree,
     *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.
 
     A statistic of the last stage alone, such as the log marginal likelihood, is drawn by chain.
@@ -131,15 +147,22 @@ def plot_stages(
     ----------
     posterior : xarray.DataTree
         From `sample_smc`, with a ``sample_stats`` group of dims (chain, stage).
+    var_names : str or sequence of str, optional
+        Statistics, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Such as ``{"chain": [0, 1]}``.
     labels : mapping, optional
         Labels of statistics or simulators by name.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``chain_0``, ``chain_1`` and so on.
+    matplotlib.figure.Figure
+        Its panels have the labels of the statistics.
 
     Raises
     ------
@@ -155,19 +178,21 @@ def plot_stages(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
     ...     posterior = prb.sample_smc(100, chains=2, random_seed=1, progressbar=False)
-    >>> "chain_1" in prb.plots.plot_stages(posterior).viz
-    True
+    >>> figure = prb.plots.plot_stages(posterior, var_names=["beta", "accept_rate"])
+    >>> [axis.get_label() for axis in figure.axes]
+    ['beta', 'accept_rate']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
         raise TypeError(
             f"plot_stages: posterior: got {type(posterior).__name__}, expected the DataTree of "
             "prb.sample_smc, with sample_stats"
         )
+    stages = posterior["sample_stats"].to_dataset()
     # NaN is unknown, or after the last stage of a chain
     statistics = {
         str(name): values.transpose("chain", "stage").astype(np.float64)
-        for name, values in posterior["sample_stats"].data_vars.items()
+        for name, values in subset(stages, coords).data_vars.items()
         if set(values.dims) == {"chain", "stage"}
     }
     if not statistics:
@@ -179,28 +204,24 @@ def plot_stages(
     # Those of one stage only come last
     is_once = {name: values.count("stage").values.max() <= 1 for name, values in statistics.items()}
     names = sorted(statistics, key=lambda name: is_once[name])
-    canvas = Canvas(names, size=(4.6, 3.4), pc_kwargs=pc_kwargs)
-    # Chains differ in colour and in style; five times four before they repeat
-    styles = (SOLID, DASHED, DOTTED, DASHDOT)
-    for name in names:
-        panel = canvas.panels[name]
+    names = select_variables(names, var_names, filter_vars)
+    figure, axes = panels(names, size=(4.6, 3.4), pc_kwargs=pc_kwargs)
+    for name, axis in axes.items():
         rows = statistics[name].values
         chains = [str(chain) for chain in statistics[name].chain.values.tolist()]
         for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
-            visual = f"chain_{chain}"
-            color = CYCLE[c % len(CYCLE)]
-            stages = np.flatnonzero(np.isfinite(row))
+            look: dict[str, Any] = {"color": CYCLE[c % len(CYCLE)], "gid": f"chain_{chain}"}
+            at = np.flatnonzero(np.isfinite(row))
             if is_once[name]:
-                panel.points(visual, ([c + 1.0], row[stages][-1:]), color, size=45)
-            else:
-                look: Any = {"style": styles[c % len(styles)], "legend": f"chain {chain}"}
-                panel.line(visual, (stages + 1.0, row[stages]), color, **look)
+                axis.scatter([c + 1.0], row[at][-1:], 45, **look)
+            else:  # chains differ in colour and in style; five times four before they repeat
+                style = ("-", "--", ":", "-.")[c % 4]
+                axis.plot(at + 1.0, row[at], style, label=f"chain {chain}", **look)
         ticks = chains if is_once[name] else [str(stage + 1) for stage in range(rows.shape[1])]
         step = -(-len(ticks) // 10)  # at most ten
-        places = [float(place + 1) for place in range(0, len(ticks), step)]
+        axis.set_xticks(np.arange(1, len(ticks) + 1, step), ticks[::step])
         y = named(name, STATISTIC_LABELS | dict(labels or {}))
-        x = "chain" if is_once[name] else "stage"
-        panel.axes(x=x, y=y, xticks=(places, ticks[::step]))
+        axis.set(xlabel="chain" if is_once[name] else "stage", ylabel=y)
         if name == "beta":  # starts at a small value and grows by orders of magnitude
-            scale_by_decades(panel.target, rows)
-    return canvas.finish()
+            scale_by_decades(axis, rows)
+    return finish(figure)

@@ -1,4 +1,4 @@
-"""Curves of weighted samples: densities, distributions, histograms; outlines in a plane."""
+"""Curves of weighted samples: densities, distributions; outlines in a plane."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from prbayes._stats import cumulated, quantile
 from prbayes._validate import Floats
-from prbayes.metrics.density import GaussianKDE, Histogram, silverman
+from prbayes.metrics.density import GaussianKDE, silverman
 
 # Points of a curve: a step is a pixel or two of a panel.
 GRID_POINTS = 257
@@ -30,6 +30,18 @@ def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
     bandwidths = [silverman(row, w) for row, w in samples]
     bandwidth = float(np.median(bandwidths)) if bandwidths else 0.0
     return densities(values, weights, grid, bandwidth)
+
+
+def measured_density(observed: Floats, weights: Floats, grid: Floats) -> Floats:
+    """Return the density of measured values, (n,), on a grid, (g,), by the normal reference rule.
+
+    Its bandwidth is 1.06 standard deviations times n^(-1/5) (Scott, Multivariate Density
+    Estimation, 1992): by a robust spread as in Silverman's, a few close values make a high peak.
+    """
+    ((values, w),) = _finite_samples(observed[None], weights[None])
+    deviation = np.sqrt(w @ (values - w @ values) ** 2)
+    bandwidth = 1.06 * deviation * np.sum(w**2) ** 0.2
+    return densities(observed, weights, grid, float(bandwidth))
 
 
 def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
@@ -101,30 +113,6 @@ def axis_range(
         high = max(high, last)
     width = margin * (high - low) or 0.01 * max(abs(low), 1.0)
     return low - width, high + width
-
-
-def histogram(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the corners of a histogram's bars; their area is the share of finite values."""
-    finite = np.isfinite(observed)
-    values = observed[finite]
-    w = weights[finite]
-    area = w.sum()
-    if np.ptp(values) > 0:
-        cells = Histogram().cells(values, w / area)
-        heights = cells.density(values, w)[:-2]  # without those below and above
-        half = cells.widths[0] / 2
-        starts = cells.centers - half
-        ends = np.append(starts[1:], cells.centers[-1] + half)
-    else:  # one bar, as wide as a fiftieth of the value
-        half = max(abs(values[0]), 1.0) / 100
-        heights = np.array([area / (2 * half)])
-        starts = values[:1] - half
-        ends = values[:1] + half
-    # Up at the left of each bar, down at its right
-    zero = np.zeros(heights.size)
-    x = np.column_stack([starts, starts, ends, ends])
-    y = np.column_stack([zero, heights, heights, zero])
-    return x.ravel(), y.ravel()
 
 
 def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
@@ -16,11 +16,14 @@ from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
-from prbayes.plots.canvas import BLUE, Panel
+from prbayes.plots.canvas import BLUE
 from prbayes.plots.curves import pointwise_band
 from prbayes.propagation.base import DesignError
 from prbayes.response.inputs import model_on_context
 from prbayes.results.predict import populations_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +157,7 @@ def middle_of(curves: Floats, ensemble: Ensemble) -> Floats:
 
 
 def draw_calibrated(
-    panel: Panel,
+    axis: Axes,
     grid: Floats,
     curves: Floats,
     ensemble: Ensemble,
@@ -171,6 +174,9 @@ def draw_calibrated(
         sides = pointwise_band(spread, prob)
         top = max(top, float(sides[1].max()))
         text = f"{prob:.0%} band of the {ensemble.spread}"
-        panel.band("band", grid, sides, BLUE, alpha=alpha, legend=text)
-    panel.line("after", (grid, middle), BLUE, width=2.2, legend=f"{name}: {ensemble.label}")
+        axis.fill_between(
+            grid, *sides, color=BLUE, alpha=alpha, linewidth=0, label=text, gid="band"
+        )
+    text = f"{name}: {ensemble.label}"
+    axis.plot(grid, middle, color=BLUE, linewidth=2.2, label=text, gid="after")
     return top

@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
 from prbayes.model.parameters import element_name
-from prbayes.plots.canvas import BLUE, GREY, INK, Canvas, Panel, named, refuse_labels, refuse_look
+from prbayes.plots.canvas import (
+    BLUE,
+    GREY,
+    check_options,
+    finish,
+    ink,
+    named,
+    panels,
+    refuse_labels,
+)
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def plot_individuals(
     individuals: xr.DataTree,
     *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the inputs of each specimen, and its readings beside replicates of them.
 
     An input has an interval for each specimen, in ascending order of their means. A reading is a
@@ -32,18 +48,24 @@ def plot_individuals(
     ----------
     individuals : xarray.DataTree
         From `individuals`.
+    var_names : str or sequence of str, optional
+        Inputs and simulators, or elements of them, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of specimens and outputs by dimension, such as ``{"specimen": [0, 1, 2]}``.
     prob : float
         Probability of the intervals.
     labels : mapping, optional
         Labels of inputs, conditions and simulators by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``interval`` and ``mean`` of inputs, and ``replicates``,
-        ``median`` and ``observed`` of readings.
+    matplotlib.figure.Figure
+        With a panel for each input and each output, whose label is its name.
 
     Raises
     ------
@@ -57,11 +79,11 @@ def plot_individuals(
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
     ...     data = [0.0, 1.0, 2.5, 4.0, 3.0, 1.5]
     ...     y = prb.Simulator("y", lambda x: 2 * x, x, observed=data)
-    >>> picture = prb.plots.plot_individuals(prb.individuals(prb.minimize(model)))
-    >>> sorted(picture.viz["mean"])
-    ['x']
+    >>> figure = prb.plots.plot_individuals(prb.individuals(prb.minimize(model)))
+    >>> [axis.get_label() for axis in figure.axes]
+    ['x', 'y']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     share(prob, "prob")
     groups = individuals.children if isinstance(individuals, xr.DataTree) else {}
     draws = groups["posterior"].to_dataset() if "posterior" in groups else xr.Dataset()
@@ -71,51 +93,65 @@ def plot_individuals(
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
-    inputs = _elements(draws)
-    observed = individuals["observed_data"].to_dataset()
-    replicates = individuals["posterior_predictive"].to_dataset()
+    parts = [groups[name].to_dataset() for name in groups]
+    dims = {dim for part in parts for dim in part.dims} - {"chain", "draw"}
+    observed, replicates = (
+        subset(individuals[name].to_dataset(), coords, dims)
+        for name in ("observed_data", "posterior_predictive")
+    )
+    constant = individuals["constant_data"].to_dataset() if "constant_data" in groups else draws
+    conditions = {} if constant is draws else subset(constant, coords, dims).data_vars
+    inputs = _elements(subset(draws, coords, dims))
     curves = [str(name) for name, y in observed.data_vars.items() if y[0].size > 6]
     readings = _elements(observed.drop_vars(curves))
     replicated = _elements(replicates.drop_vars(curves))
-    conditions = individuals["constant_data"].data_vars if "constant_data" in groups else {}
-    refuse_labels(labels, [*inputs, *readings, *curves, *map(str, conditions), "specimen"])
-    canvas = Canvas([*inputs, *readings, *curves], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
-    for name, values in inputs.items():
-        panel = canvas.panels[name]
-        mean = values.mean(axis=0)
-        order = np.argsort(mean, kind="stable")
-        places = np.arange(len(order))
-        text = f"{prob:.0%} of the draws of a specimen"
-        _intervals(panel, "interval", places, values[:, order], prob, text)
-        panel.points("mean", (places, mean[order]), BLUE, size=14, legend="their mean")
-        panel.axes(x="specimens in ascending order", y=named(name, labels))
-    for name, y in readings.items():
-        panel = canvas.panels[name]
-        of_rows = {str(key): x.values for key, x in conditions.items() if x.size == y.size}
-        x_name, x = next(iter(of_rows.items()), ("specimen", np.arange(y.size)))
-        _intervals(panel, "replicates", x, replicated[name], prob, f"{prob:.0%} of replicates")
-        median = np.nanmedian(replicated[name], axis=0)
-        panel.points("median", (x, median), GREY, size=10, legend="their median")
-        panel.points("observed", (x, y[0]), INK, size=18, legend="measured")
-        panel.axes(x=named(x_name, labels), y=named(name, labels))
-    for name in curves:
-        _draw_curve(canvas.panels[name], observed[name], replicates[name], prob)
-        dim = str(observed[name].dims[-1])
-        canvas.panels[name].axes(x=named(dim, labels), y=named(name, labels))
-    return canvas.finish()
+    names = select_variables([*inputs, *readings, *curves], var_names, filter_vars)
+    refuse_labels(labels, [*names, *map(str, conditions), "specimen"])
+    figure, axes = panels(names, size=(4.6, 3.9), pc_kwargs=pc_kwargs)
+    for name, axis in axes.items():
+        axis.set_ylabel(named(name, labels))
+        if name in inputs:
+            values = inputs[name]
+            mean = values.mean(axis=0)
+            order = np.argsort(mean, kind="stable")
+            places = np.arange(len(order))
+            text = f"{prob:.0%} of the draws of a specimen"
+            _draw_intervals(axis, places, values[:, order], prob, label=text, gid="interval")
+            axis.scatter(
+                places, mean[order], 14, color=BLUE, label="their mean", gid="mean", zorder=3
+            )
+            axis.set_xlabel("specimens in ascending order")
+        elif name in readings:
+            y = readings[name]
+            of_rows = {str(key): x.values for key, x in conditions.items() if x.size == y.size}
+            x_name, x = next(iter(of_rows.items()), ("specimen", np.arange(y.size)))
+            text = f"{prob:.0%} of replicates"
+            _draw_intervals(axis, x, replicated[name], prob, label=text, gid="replicates")
+            median = np.nanmedian(replicated[name], axis=0)
+            look: dict[str, Any] = {"color": GREY, "zorder": 3}
+            axis.scatter(x, median, 10, label="their median", gid="median", **look)
+            axis.scatter(x, y[0], 18, color=ink(), label="measured", gid="observed", zorder=3)
+            axis.set_xlabel(named(x_name, labels))
+        else:
+            _draw_curve(axis, observed[name], replicates[name], prob)
+            axis.set_xlabel(named(str(observed[name].dims[-1]), labels))
+    return finish(figure)
 
 
-def _draw_curve(panel: Panel, y: xr.DataArray, replicates: xr.DataArray, prob: float) -> None:
+def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: float) -> None:
     """Draw the readings of all specimens over their outputs, and the range of replicates."""
     labels = y[y.dims[-1]].values
     x = labels.astype(float) if labels.dtype.kind in "iuf" else np.arange(labels.size, dtype=float)
     tail = (1 - prob) / 2
     values = replicates.values.reshape(-1, x.size)
     low, median, high = np.nanquantile(values, [tail, 0.5, 1 - tail], axis=0)
-    panel.band("replicates", x, (low, high), GREY, legend=f"{prob:.0%} of replicates")
-    panel.line("median", (x, median), GREY, legend="their median")
-    places = np.broadcast_to(x, y.shape).ravel()
-    panel.points("observed", (places, y.values.ravel()), INK, size=12, legend="measured")
+    text = f"{prob:.0%} of replicates"
+    axis.fill_between(
+        x, low, high, color=GREY, alpha=0.25, linewidth=0, label=text, gid="replicates"
+    )
+    axis.plot(x, median, color=GREY, label="their median", gid="median")
+    places = np.broadcast_to(x, y.shape)
+    axis.scatter(places, y, 12, color=ink(), label="measured", gid="observed", zorder=3)
 
 
 def _elements(data: xr.Dataset) -> dict[str, Floats]:
@@ -131,13 +167,8 @@ def _elements(data: xr.Dataset) -> dict[str, Floats]:
     return elements
 
 
-def _intervals(
-    panel: Panel, visual: str, x: NDArray[Any], draws: Floats, prob: float, legend: str
-) -> None:
+def _draw_intervals(axis: Axes, x: Any, draws: Floats, prob: float, **texts: Any) -> None:
     """Draw a vertical interval of draws, (P, n), at each place."""
     tail = (1 - prob) / 2
     low, high = np.nanquantile(draws, [tail, 1 - tail], axis=0)
-    gap = np.full(len(low), np.nan)
-    places = np.stack([x, x, gap], axis=1).ravel()
-    ends = np.stack([low, high, gap], axis=1).ravel()
-    panel.line(visual, (places, ends), GREY, width=1.5, legend=legend)
+    axis.vlines(x, low, high, color=GREY, linewidth=1.5, **texts)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, called, positive_integer
+from prbayes._validate import Floats, positive_integer
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -18,19 +18,22 @@ from prbayes.model.parameters import optimum_elements, single_elements, split_el
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import (
     BLUE,
-    CROSS,
-    DIAMOND,
     GREY,
-    INK,
     VERMILION,
-    Canvas,
-    Panel,
+    check_options,
+    finish,
+    ink,
     metric_label,
     named,
+    panels,
     refuse_labels,
-    refuse_look,
 )
 from prbayes.plots.ensemble import supported
+from prbayes.plots.selection import Coords, FilterVars, VarNames, elements_of, select
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @locked
@@ -38,12 +41,14 @@ def plot_landscape(
     optimum: Optimum,
     *,
     model: pm.Model | None = None,
-    pair: Sequence[str] | None = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     points: int | None = None,
     responses: int = 0,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the objective around the optimum over one or two hyperparameters.
 
     Darker is lower. Contours are at even steps of the root of the objective above its minimum: they
@@ -58,9 +63,13 @@ def plot_landscape(
     model : pymc.Model, optional
         That of the optimum by default; or another with the same hyperparameters, such as one with
         another metric.
-    pair : sequence of str, optional
-        One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by
-        default.
+    var_names : str or sequence of str, optional
+        One or two hyperparameters, or elements of them, such as ``("mu", "sigma")`` or
+        ``("mu[0]", "mu[1]")``: along the x axis, and the y axis. The first two by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of the hyperparameters by dimension, such as ``{"supplier": "Adler"}``.
     points : int, optional
         Along each axis; 41, or 161 for a curve.
     responses : int
@@ -69,13 +78,13 @@ def plot_landscape(
     labels : mapping, optional
         Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and
-        ``local_optima``.
+    matplotlib.figure.Figure
+        Its panel, and over two hyperparameters the bar.
 
     Raises
     ------
@@ -91,15 +100,19 @@ def plot_landscape(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> prb.plots.plot_landscape(prb.minimize(model)).viz["optimum"].name
-    'optimum'
+    >>> figure = prb.plots.plot_landscape(prb.minimize(model))
+    >>> figure.axes[0].get_ylabel()
+    'discrepancy (area metric)'
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
-    hyperparameters = free_names(optimum)
-    names = _axis_names(pair, hyperparameters)
+    hyperparameters = select_free(optimum)
+    names = select_free(optimum, var_names, filter_vars, coords)
+    if var_names is not None and len(names) > 2:
+        raise ValueError(f"plot_landscape: var_names: got {names}, expected one or two of them")
+    names = names[:2]
     refuse_labels(labels, hyperparameters, evaluator=evaluator)
     if points is None:
         points = 161 if len(names) == 1 else 41  # contours look smooth, in about a second
@@ -122,16 +135,17 @@ def plot_landscape(
         )
     fixed = [named(name, labels) for name in hyperparameters if name not in names]
     title = f"{', '.join(fixed)} fixed at the optimum" if fixed else ""
-    canvas = Canvas(["landscape"], size=(6.4, 5.4), pc_kwargs=pc_kwargs)
-    panel = canvas.panels["landscape"]
+    figure, axes = panels(["landscape"], size=(6.4, 5.4), pc_kwargs=pc_kwargs)
+    axis = axes["landscape"]
     texts = [*(named(name, labels) for name in names), objective_label(optimum)]
-    xlim, *ylim = [(float(axis[0]), float(axis[-1])) for axis in surface.axes]
     if len(names) == 1:
-        _draw_curve(panel, surface, alone=not fixed)
+        _draw_curve(axis, surface, alone=not fixed)
     else:
-        _draw_plane(panel, surface, texts[-1])
-    panel.axes(x=texts[0], y=texts[1], title=title, xlim=xlim, ylim=ylim[0] if ylim else None)
-    return canvas.finish()
+        _draw_plane(axis, surface, texts[-1])
+        axis.set_ylim(surface.axes[1][0], surface.axes[1][-1])
+    axis.set_xlim(surface.axes[0][0], surface.axes[0][-1])
+    axis.set(xlabel=texts[0], ylabel=texts[1], title=title)
+    return finish(figure)
 
 
 def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
@@ -151,45 +165,24 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     return evaluator
 
 
-def _axis_names(pair: Sequence[str] | None, hyperparameters: list[str]) -> list[str]:
-    """Return the one or two hyperparameters along the axes."""
-    if pair is None:
-        return hyperparameters[:2]
-    if not isinstance(pair, str | Sequence):
-        raise TypeError(f"pair: got {called(pair)}, expected one or two of {hyperparameters}")
-    names = [pair] if isinstance(pair, str) else list(pair)
-    are_different = len(set(names)) == len(names)
-    if len(names) not in (1, 2) or not are_different or not set(names) <= set(hyperparameters):
-        raise KeyError(f"pair: got {pair}, expected one or two of {hyperparameters}")
-    return names
-
-
-def _draw_plane(panel: Panel, surface: Landscape, objective: str) -> None:
+def _draw_plane(axis: Axes, surface: Landscape, objective: str) -> None:
     """Draw the objective over two hyperparameters, with the path and a colour bar."""
     # Even levels of the root are evenly spaced around an optimum where heights are a parabola.
     finite = surface.heights[np.isfinite(surface.heights)]
     low = float(finite.min())
     high = float(np.quantile(finite, 0.9))
-    roots = np.sqrt(np.maximum(surface.heights - low, 0.0) / max(high - low, 1e-300))
+    roots = np.sqrt(np.maximum(surface.heights - low, 0.0) / max(high - low, 1e-300)).T
     levels = np.linspace(0, 1, 11)
-    filled = panel.library.contourf(
-        *surface.axes,
-        np.minimum(roots, levels[-1]),
-        panel.target,
-        levels=levels,
-        cmap="cividis",
-        alpha=0.45,
+    filled = axis.contourf(
+        *surface.axes, np.minimum(roots, levels[-1]), levels, cmap="cividis", alpha=0.45
     )
-    lines = panel.library.contour(
-        *surface.axes, roots, panel.target, levels=levels[1:-1], color=GREY, alpha=0.6
-    )
-    panel.artists.update(landscape=filled, landscape_lines=lines)
-    bar = panel.target.figure.colorbar(filled, ax=panel.target)
+    filled.set_gid("landscape")
+    axis.contour(*surface.axes, roots, levels[1:-1], colors=GREY, alpha=0.6)
     places = levels[::2]
+    bar = axis.figure.colorbar(filled, ax=axis, label=objective)
     bar.set_ticks(places.tolist(), labels=distinct_texts(low + places**2 * (high - low)))
-    bar.set_label(objective)
-    panel.line("path", surface.path.T, INK, width=1.0)
-    _draw_marks(panel, surface.path.T, surface.optimum.T, surface.local_optima.T)
+    axis.plot(*surface.path.T, color=ink(), linewidth=1.0, gid="path")
+    _draw_marks(axis, surface.path.T, surface.optimum.T, surface.local_optima.T)
 
 
 def distinct_texts(values: Floats) -> list[str]:
@@ -201,7 +194,7 @@ def distinct_texts(values: Floats) -> list[str]:
     return texts
 
 
-def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
+def _draw_curve(axis: Axes, surface: Landscape, *, alone: bool) -> None:
     """Draw the objective over one hyperparameter, ``alone`` with path and other optima."""
     finite = np.isfinite(surface.heights)
     x = surface.axes[0][finite]
@@ -213,20 +206,29 @@ def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
         at = at[(at >= x[0]) & (at <= x[-1])]
         return np.stack([at, np.interp(at, x, heights)])
 
-    panel.line("landscape", (x, heights), BLUE)
+    axis.plot(x, heights, color=BLUE, gid="landscape")
     path = on_curve(surface.path) if alone else None
     local_optima = surface.local_optima if alone else surface.local_optima[:0]
-    _draw_marks(panel, path, on_curve(surface.optimum), on_curve(local_optima))
+    _draw_marks(axis, path, on_curve(surface.optimum), on_curve(local_optima))
 
 
-def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) -> None:
+def _draw_marks(axis: Axes, path: Any, optimum: Floats, local_optima: Floats) -> None:
     """Mark points of the path, the optimum and other optima, shape (2, m) each."""
     if path is not None:
-        panel.points("asked", path, INK, size=14, legend="path of the optimiser")
-    panel.points("optimum", optimum, VERMILION, marker=DIAMOND, size=90, legend="optimum")
+        text = "path of the optimiser"
+        axis.scatter(path[0], path[1], 14, color=ink(), label=text, gid="evaluated", zorder=2)
+    look: dict[str, Any] = {"color": VERMILION, "zorder": 3}
+    axis.scatter(optimum[0], optimum[1], 90, marker="D", label="optimum", gid="optimum", **look)
     if local_optima.size:
-        look: dict[str, Any] = {"marker": CROSS, "size": 70, "legend": "other optima"}
-        panel.points("local_optima", local_optima, VERMILION, **look)
+        axis.scatter(
+            local_optima[0],
+            local_optima[1],
+            70,
+            marker="x",
+            label="other optima",
+            gid="local_optima",
+            **look,
+        )
 
 
 # -- the objective and its values on a grid --------------------------------------------------
@@ -269,10 +271,18 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
     return split_elements(labelled(evaluator, free, {"draw": len(thetas)}).data_vars)
 
 
-def free_names(optimum: Optimum) -> list[str]:
-    """Return the names of these elements, without constants such as zeros of a factor."""
+def select_free(
+    optimum: Optimum,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
+) -> list[str]:
+    """Return names of these elements, all by default, without constants as zeros of a factor."""
     point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}
-    return optimum_elements(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)
+    values = labelled(optimum.evaluator, point, {}).data_vars
+    elements = elements_of({name: value.expand_dims("row") for name, value in values.items()})
+    shown = {name: elements[name] for name in optimum_elements(values, optimum.stderr)}
+    return select(shown, var_names, filter_vars, coords)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
-    DASHED,
-    INK,
-    SOLID,
     VERMILION,
-    Canvas,
     Limits,
-    Panel,
+    check_options,
+    finish,
+    ink,
+    panels,
     refuse_labels,
-    refuse_look,
     round_ticks,
 )
 from prbayes.plots.curves import axis_range, central_range, outlines
 from prbayes.plots.ensemble import read_before, read_result
-from prbayes.plots.responses import Output, displayed_outputs
+from prbayes.plots.responses import Output, displayed_outputs, output_elements
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 # Most outputs of one picture: the pairs of more are too small to be read.
 _MOST = 7
@@ -40,13 +44,14 @@ def plot_outputs(
     result: Optimum | xr.DataTree,
     *,
     model: pm.Model | None = None,
-    simulator: str | None = None,
-    outputs: Sequence[Any] | None = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     before: Mapping[str, Any] | bool | None = None,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw pairs of outputs of a simulator: measured specimens in the calibrated population.
 
     Points are the specimens with both outputs. Solid lines are the smallest regions with 50% and
@@ -60,11 +65,14 @@ def plot_outputs(
         From `minimize`; or with a ``posterior`` group, from any sampler.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
-    simulator : str, optional
-        Name of a simulator with several outputs; the first one by default.
-    outputs : sequence, optional
-        Two to seven outputs by label, such as ``["first", "third"]``, or by number without labels;
-        by default all that vary, but of more than five four, from the first to the last.
+    var_names : str or sequence of str, optional
+        A simulator with several outputs, the first one by default; or outputs as elements of it,
+        such as ``["frame[first]", "frame[third]"]``.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Two to seven outputs by dimension, such as ``{"output": ["first", "third"]}``. By default
+        all that vary, but of more than five four, from the first to the last.
     before : dict or bool, optional
         As in `plot_responses`.
     n_draws : int, optional
@@ -73,13 +81,14 @@ def plot_outputs(
     labels : mapping, optional
         Labels of outputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``measured``, ``before_50``, ``before_89``, ``after_50`` and
-        ``after_89``, by pair: ``"second, first"`` has the first output along the x axis.
+    matplotlib.figure.Figure
+        With a panel for each pair, whose label is ``"second, first"`` where the first output is
+        along the x axis.
 
     Raises
     ------
@@ -109,15 +118,14 @@ def plot_outputs(
     ...     y = prb.Simulator(
     ...         "y", response, a, b, metric=metric, observed=data, propagation=cheap
     ...     )
-    >>> list(prb.plots.plot_outputs(prb.minimize(model)).viz["measured"])
-    ['life, load']
+    >>> prb.plots.plot_outputs(prb.minimize(model)).axes[0].get_label()
+    'life, load'
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     ensemble = read_result(result, model, "prb.plots.plot_outputs", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before, "plot_outputs")
-    k = _simulator_index(evaluator, simulator)
-    columns = _shown_outputs(evaluator, k, outputs)
+    k, columns = _shown_outputs(evaluator, var_names, filter_vars, coords)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
     calibrated = _mixture(evaluator, ensemble.mixture, k)
     earlier = _mixture(evaluator, start, k) if len(start) else None
@@ -131,67 +139,88 @@ def plot_outputs(
 
     # A triangle of pairs: one column less than outputs, and one row
     size = len(columns) - 1
+    texts = [column.node.outputs.names[column.column or 0] for column in columns]
     names = {
-        (i, j): ", ".join(columns[c].name.partition("[")[2][:-1] for c in (i + 1, j))
+        f"{texts[i + 1]}, {texts[j]}": (i, j) if j <= i else None
         for i in range(size)
         for j in range(size)
     }
-    side = 5.4 if size == 1 else 3.4
-    canvas = Canvas(
-        list(names.values()), size=(side, side), pc_kwargs={"col_wrap": size, **pc_kwargs}
-    )
+    side = 5.4 if size == 1 else 3.7
+    options = {"col_wrap": size} | pc_kwargs
+    figure, axes = panels(list(names), size=(side, side), pc_kwargs=options)
     legend = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
-    for (i, j), name in names.items():
-        panel = canvas.panels[name]
-        if j > i:
-            panel.target.set_axis_off()
+    for name, axis in axes.items():
+        place = names[name]
+        if place is None:
+            axis.remove()
             continue
+        i, j = place
         x = columns[j]
         y = columns[i + 1]
         if earlier is not None:
             points = _finite_pairs(x, y, *earlier)
-            _draw_regions(panel, "before", points, VERMILION, DASHED, f"before: {text}")
+            _draw_regions(
+                axis, "before", points, f"before: {text}", color=VERMILION, linestyle="--"
+            )
         points = _finite_pairs(x, y, *calibrated)
-        _draw_regions(panel, "after", points, BLUE, SOLID, legend)
+        _draw_regions(axis, "after", points, legend, color=BLUE)
         measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
-        panel.points("measured", measured[0].T, INK, size=14, legend="measured")
-        correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
-        # Names on the left and below all panels
-        panel.axes(
-            x=x.text(labels) if i == size - 1 else "",
-            y=y.text(labels) if j == 0 else "",
-            title="rank correlation\nmeasured {}, calibrated {}".format(*correlations),
-            xlim=limits[j],
-            ylim=limits[i + 1],
-            xticks=round_ticks(*limits[j]),
-            yticks=round_ticks(*limits[i + 1]),
+        axis.scatter(
+            measured[0][:, 0],
+            measured[0][:, 1],
+            14,
+            color=ink(),
+            label="measured",
+            gid="measured",
+            zorder=3,
         )
-    return canvas.finish()
+        correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
+        title = "rank correlation\nmeasured {}, calibrated {}".format(*correlations)
+        axis.set(title=title, xlim=limits[j], ylim=limits[i + 1])
+        axis.set_xticks(*round_ticks(*limits[j]))
+        axis.set_yticks(*round_ticks(*limits[i + 1]))
+        if i == size - 1:  # names on the left and below all panels
+            axis.set_xlabel(x.text(labels))
+        if j == 0:
+            axis.set_ylabel(y.text(labels))
+    return finish(figure)
 
 
-def _simulator_index(evaluator: Evaluator, simulator: str | None) -> int:
-    """Return the index of a simulator by name, or of the first with several outputs."""
-    names = [node.name for node in evaluator.simulators]
-    several = [node.name for node in evaluator.simulators if len(node.outputs.labels) > 1]
+def _shown_outputs(
+    evaluator: Evaluator,
+    var_names: VarNames | None,
+    filter_vars: FilterVars | None,
+    coords: Coords | None,
+) -> tuple[int, list[Output]]:
+    """Return the index of the simulator, and its outputs in the picture."""
+    nodes = evaluator.simulators
+    alone = len(nodes) == 1
+    several = {
+        k: {output.name: output for output in displayed_outputs(node, alone=alone)}
+        for k, node in enumerate(nodes)
+        if len(node.outputs.labels) > 1
+    }
     if not several:
         raise ValueError(
-            f"plot_outputs: got simulators {names} of one output, expected one with several; draw "
-            "them by prb.plots.plot_responses"
+            f"plot_outputs: got simulators {[node.name for node in nodes]} of one output, expected "
+            "one with several; draw them by prb.plots.plot_responses"
         )
-    if simulator is None:
-        return names.index(several[0])
-    if not isinstance(simulator, str):
-        raise TypeError(f"simulator: got {called(simulator)}, expected a name, one of {several}")
-    if simulator not in several:
-        raise KeyError(f"simulator: got {simulator!r:.60}, expected one of {several}")
-    return names.index(simulator)
-
-
-def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -> list[Output]:
-    """Return the outputs of the picture, by their labels or by default."""
-    node = evaluator.simulators[k]
-    columns = displayed_outputs(node, alone=len(evaluator.simulators) == 1)
-    if labels is None:
+    elements = output_elements(
+        output for outputs in several.values() for output in outputs.values()
+    )
+    names = select(elements, var_names, filter_vars, coords)
+    selected = {k: sum(name in outputs for name in names) for k, outputs in several.items()}
+    # The first simulator, but one of which only some outputs are selected comes before.
+    first = [k for k, n in selected.items() if 0 < n < len(several[k])]
+    k = (first or [k for k, n in selected.items() if n])[0]
+    rest = [name for name in names if name not in several[k]]
+    if rest and var_names is not None:
+        raise ValueError(
+            f"plot_outputs: var_names: got outputs of several simulators, {names[0]} and "
+            f"{rest[0]}, expected those of one"
+        )
+    columns = [several[k][name] for name in names if name in several[k]]
+    if len(columns) == len(several[k]):
         varying = []  # by more than rounding
         for output in columns:
             observed, _ = output.measured()
@@ -199,29 +228,14 @@ def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -
             if np.ptp(finite) > 1e-9 * np.abs(finite).max():
                 varying.append(output)
         columns = varying if len(varying) > 1 else columns
-        if len(columns) <= 5:
-            return columns
-        # Of many outputs, such as a curve, four from the first to the last
-        return [columns[round(place)] for place in np.linspace(0, len(columns) - 1, 4)]
-    available = list(node.outputs.labels)
-    listed = str(available)
-    if len(available) > 2 * _MOST:
-        listed = f"{str(available[:_MOST])[:-1]}, ...]"
-    if isinstance(labels, str) or not isinstance(labels, Sequence):
-        raise TypeError(
-            f"outputs: got {called(labels)}, expected a list of two to {_MOST} of {listed}"
+        if len(columns) > 5:  # of many outputs, such as a curve, four from the first to the last
+            columns = [columns[round(place)] for place in np.linspace(0, len(columns) - 1, 4)]
+    if not 2 <= len(columns) <= _MOST:
+        raise ValueError(
+            f"plot_outputs: coords: got {len(columns)} outputs, expected two to {_MOST} of "
+            f"{list(several[k])!s:.200}"
         )
-    if not 2 <= len(labels) <= _MOST:
-        raise ValueError(f"outputs: got {len(labels)} outputs, expected two to {_MOST} of {listed}")
-    indices = []
-    for label in labels:
-        names = [x for x in (available, list(node.outputs.names)) if label in x]
-        if not names or isinstance(label, bool):
-            raise KeyError(f"outputs: got {label!r:.60}, expected some of {listed}")
-        indices.append(names[0].index(label))
-    if len(set(indices)) < len(indices):
-        raise ValueError(f"outputs: got {list(labels)!r:.200}, expected different ones")
-    return [columns[i] for i in indices]
+    return k, columns
 
 
 def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> tuple[Floats, Floats]:
@@ -251,15 +265,14 @@ def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> tupl
 
 
 def _draw_regions(
-    panel: Panel, visual: str, sample: tuple[Floats, Floats], color: str, style: str, text: str
+    axis: Axes, name: str, sample: tuple[Floats, Floats], text: str, **look: Any
 ) -> None:
     """Draw the outlines of regions of a weighted sample of points."""
     if len(sample[0]) < 2:
         return
     probs = (0.5, INTERVAL)
     for prob, line in zip(probs, outlines(*sample, probs), strict=True):
-        name = f"{visual}_{100 * prob:.0f}"
-        panel.line(name, line, color, style=style, width=1.5, legend=text)
+        axis.plot(*line, linewidth=1.5, label=text, gid=f"{name}_{100 * prob:.0f}", **look)
 
 
 def _written(r: float) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
@@ -14,24 +14,21 @@ from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
-from prbayes.model.margins import Margin, margins, select_margins
+from prbayes.model.margins import Margin, margins
+from prbayes.model.parameters import variable_of
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots.canvas import (
-    BLUE,
-    DASHED,
-    SOLID,
-    Canvas,
-    Panel,
-    named,
-    refuse_labels,
-    refuse_look,
-)
+from prbayes.plots.canvas import BLUE, check_options, finish, named, panels, refuse_labels
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
 from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import with_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @locked
@@ -39,12 +36,14 @@ def plot_population(
     result: Optimum | xr.DataTree,
     *,
     model: pm.Model | None = None,
-    inputs: Sequence[Any] | None = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the calibrated population of each aleatory input, with its uncertainty.
 
     The curve is the posterior predictive density of the input, or its density at the optimum; the
@@ -58,21 +57,27 @@ def plot_population(
         From `minimize`; or with a ``posterior`` group, from any sampler.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
-    inputs : sequence, optional
-        Names, or ``.dist()`` objects; all by default. The name of an input is that of the
-        response's argument.
+    var_names : str or sequence of str, optional
+        Inputs, or elements of them, in this order; all by default. The name of an input is that
+        of its distribution or of the response's argument.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels by dimension: of groups, such as ``{"supplier": ["Adler"]}``; ``{"x_dim_0": [0]}``
+        is the first element of a multivariate input.
     prob : float
     n_draws : int, optional
         Number of populations in the band; 200 by default.
     labels : mapping, optional
         Labels of inputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``band`` and ``after``; of pairs, ``half`` and ``region``.
+    matplotlib.figure.Figure
+        With a panel for each input, whose label is its name, and for each pair.
 
     Raises
     ------
@@ -88,30 +93,44 @@ def plot_population(
     ...     y = prb.Simulator(
     ...         "y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plots.plot_population(prb.minimize(model)).viz["after"])
-    ['load']
+    >>> prb.plots.plot_population(prb.minimize(model)).axes[0].get_label()
+    'load'
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     share(prob, "prob")
     ensemble = read_result(result, model, "prb.plots.plot_population", n_draws, free=True)
-    shown = select_margins(margins(ensemble.evaluator), inputs)
+    available = {margin.name: margin for margin in margins(ensemble.evaluator)}
+    elements = {
+        name: (variable_of(name), _coordinates(ensemble.evaluator, margin))
+        for name, margin in available.items()
+    }
+    names = select(elements, var_names, filter_vars, coords)
+    shown = [available[name] for name in names]
     densities = margin_densities(ensemble.evaluator, shown, ensemble.every)
-    names = [margin.name for margin in shown]
     refuse_labels(labels, names, evaluator=ensemble.evaluator)
     pairs = _pairs(shown)
-    canvas = Canvas([*names, *pairs], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
+    figure, axes = panels([*names, *pairs], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
     for margin in shown:
-        panel = canvas.panels[margin.name]
+        axis = axes[margin.name]
         grid, curves = densities[margin.name]
-        draw_calibrated(panel, grid, curves, ensemble, prob)
+        draw_calibrated(axis, grid, curves, ensemble, prob)
         y = "probability" if margin.discrete else "density"
-        panel.axes(x=_text(margin, labels), y=y)
+        axis.set(xlabel=_text(margin, labels), ylabel=y)
     for name, (first, second) in pairs.items():
-        panel = canvas.panels[name]
-        correlation = _draw_pair(panel, ensemble, first, second, prob)
+        correlation = _draw_pair(axes[name], ensemble, first, second, prob)
         title = f"correlation {correlation:.2f}"
-        panel.axes(x=_text(first, labels), y=_text(second, labels), title=title)
-    return canvas.finish()
+        axes[name].set(xlabel=_text(first, labels), ylabel=_text(second, labels), title=title)
+    return finish(figure)
+
+
+def _coordinates(evaluator: Evaluator, margin: Margin) -> dict[str, Any]:
+    """Return the group of a margin, and its place in a multivariate input, by dimension."""
+    variable = variable_of(margin.name)
+    places: dict[str, Any] = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
+    groups = evaluator.simulators[margin.node].inputs.groups
+    if groups is not None and margin.group:
+        places[groups.dim] = groups.labels[groups.names.index(margin.group)]
+    return places
 
 
 def _text(margin: Margin, labels: Mapping[str, str] | None) -> str:
@@ -131,7 +150,7 @@ def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
     return pairs
 
 
-def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: float) -> float:
+def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float) -> float:
     """Draw outlines of regions of the calibrated population; return the correlation within it."""
     # 200 000 specimens in all make a smooth line.
     n = max(2, 200_000 // len(ensemble.mixture))
@@ -140,9 +159,9 @@ def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: flo
     points = points[np.isfinite(points).all(axis=1)]
     weights = np.full(len(points), 1 / len(points))
     half, region = outlines(points, weights, (0.5, prob))
-    for visual, p, line, style in (("half", 0.5, half, DASHED), ("region", prob, region, SOLID)):
+    for gid, p, line, style in (("half", 0.5, half, "--"), ("region", prob, region, "-")):
         text = f"{p:.0%} of the calibrated population: {ensemble.label}"
-        panel.line(visual, line, BLUE, style=style, width=1.5, legend=text)
+        axis.plot(*line, style, color=BLUE, linewidth=1.5, label=text, gid=gid)
     correlations: Any = np.corrcoef(points.T)
     return float(correlations[0, 1])
 

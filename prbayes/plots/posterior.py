@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
@@ -21,24 +21,29 @@ from prbayes.model.parameters import (
     split_elements,
     stacked_draws,
     table_elements,
-    variable_of,
 )
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.plots.canvas import (
     BLUE,
-    DASHED,
-    DIAMOND,
-    DOTTED,
     GREY,
     VERMILION,
-    Canvas,
-    Panel,
+    check_options,
+    layout,
     named,
     refuse_labels,
-    refuse_look,
-    round_ticks,
 )
 from prbayes.plots.curves import bounded_density, central_levels
+from prbayes.plots.selection import Coords, FilterVars, VarNames, elements_of, select
+
+if TYPE_CHECKING:
+    from arviz_plots.plot_collection import PlotCollection
+
+# Colour, and ArviZ's codes of line style and marker, of each distribution.
+_LOOKS = {
+    "posterior": (BLUE, "C0", "C0"),
+    "optimum": (VERMILION, "C1", "C4"),
+    "prior": (GREY, "C2", "C0"),
+}
 
 
 def plot_posterior(
@@ -46,12 +51,15 @@ def plot_posterior(
     *,
     optimum: Optimum | None = None,
     model: pm.Model | None = None,
-    var_names: Sequence[str] | None = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
+    backend: str | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
-    """Draw the posterior of each hyperparameter against the optimum and the prior.
+) -> PlotCollection:
+    """Draw the posterior of each hyperparameter against the optimum and the prior, by ArviZ.
 
     The bar below the posterior is its equal-tailed interval, with the mean as a dot. The bar and
     the diamond below are the optimum and the interval of the normal distribution with its standard
@@ -66,20 +74,27 @@ def plot_posterior(
     model : pymc.Model, optional
         Restricts the picture to the model's variables, its deterministics among them, and adds
         their prior; by default all variables that posterior and optimum share.
-    var_names : sequence of str, optional
-        Variables, or elements of them, such as ``"mu[Adler]"``; all by default.
+    var_names : str or sequence of str, optional
+        Variables, or elements of them, such as ``"mu[Adler]"``, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of the variables by dimension, such as ``{"supplier": ["Adler"]}``.
     prob : float
         Probability of the intervals.
+    backend : {"matplotlib", "plotly", "bokeh"}, optional
+        Library that ArviZ draws with; that of ``arviz.rcParams`` by default.
     labels : mapping, optional
         Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``, such as
+        ``col_wrap``.
 
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``posterior``, ``interval``, ``mean``, ``prior``, ``normal``,
-        ``stderr`` and ``optimum``.
+        Of `arviz.plot_dist`: its visuals ``dist``, ``credible_interval`` and ``point_estimate``
+        have the dimension ``distribution``, with the labels posterior, optimum and prior.
 
     Raises
     ------
@@ -100,10 +115,10 @@ def plot_posterior(
     ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
     ...     )
     >>> pc = prb.plots.plot_posterior(posterior, optimum=optimum, model=model)
-    >>> list(pc.viz["posterior"])
+    >>> list(pc.viz["dist"])
     ['mu']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs, by_arviz=True)
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
         raise TypeError(
             f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
@@ -119,6 +134,10 @@ def plot_posterior(
     if model is not None:
         require_of_model(posterior, model, "plot_posterior", Level.PRIORS)
     share(prob, "prob")
+    if backend not in (None, "matplotlib", "plotly", "bokeh", "none"):
+        raise ValueError(
+            f"backend: got {backend!r:.60}, expected 'matplotlib', 'plotly', 'bokeh' or 'none'"
+        )
     evaluator = None if model is None else Evaluator.of(model)
 
     # Elements of the variables that posterior, optimum and model share
@@ -142,38 +161,26 @@ def plot_posterior(
             f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of "
             "optimum and model"
         )
-    names = _select([name for name in draws if name in shared], var_names)
+    elements = elements_of(stacked)
+    available = {name: elements[name] for name in draws if name in shared}
+    names = select(available, var_names, filter_vars, coords)
+    if var_names is None:  # those that a reader wants
+        names = list(readable_elements(names))
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
-    canvas = Canvas(names, size=(4.6, 3.6), pc_kwargs=pc_kwargs)
+    summaries = {}
     for name in names:
-        panel = canvas.panels[name]
         estimate = (best[name], errors.get(name, np.nan)) if name in best else None
-        top = _draw(panel, draws[name], prior.get(name), estimate, prob)
-        panel.axes(x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
-    return canvas.finish()
+        # Names are paths in a tree, with slashes between levels.
+        key = name.replace("/", "\u2215")
+        summaries[key] = _summary(draws[name], prior.get(name), estimate, prob)
+    texts = {name.replace("/", "\u2215"): named(name, labels) for name in names}
+    return _draw(summaries, texts, prob, backend, pc_kwargs)
 
 
-def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
-    """Return the hyperparameters of the picture; by default those that a reader wants."""
-    if var_names is None:
-        return list(readable_elements(names))
-    is_list = isinstance(var_names, Sequence) and not isinstance(var_names, str)
-    selection = list(var_names) if is_list else [var_names]
-    unknown = set(selection) - {*names, *map(variable_of, names)}
-    if unknown or not selection:
-        got = [name for name in selection if name in unknown] or "none"
-        raise KeyError(f"plot_posterior: var_names: got {got}, expected some of {names}")
-    return [name for name in names if {name, variable_of(name)} & set(selection)]
-
-
-def _draw(
-    panel: Panel,
-    draws: Floats,
-    prior: Floats | None,
-    estimate: tuple[float, float] | None,
-    prob: float,
-) -> float:
-    """Draw densities and intervals, of optimum and standard error too; return the top."""
+def _summary(
+    draws: Floats, prior: Floats | None, estimate: tuple[float, float] | None, prob: float
+) -> xr.Dataset:
+    """Return densities, intervals, points, and places of bars, by distribution."""
     low = float(draws.min())
     high = float(draws.max())
     best, error = estimate or (0.0, np.nan)
@@ -184,25 +191,101 @@ def _draw(
         high = max(high, best + reach)
     grid = np.linspace(low, high, 301)
     density = bounded_density(draws, grid)
-    top = float(density.max())
-    # Far enough apart that the diamond of one does not touch the dot of the other
-    posterior_row, optimum_row = np.array([-0.07, -0.15]) * top
-
-    if prior is not None:
-        density_before = bounded_density(prior, grid)
-        panel.line("prior", (grid, density_before), GREY, style=DOTTED, legend="prior")
-    panel.line("posterior", (grid, density), BLUE, width=2.2, legend="posterior")
     levels = central_levels(prob)
-    row = np.repeat(posterior_row, 2)
-    text = f"{prob:.0%} intervals"
-    panel.line("interval", (np.quantile(draws, levels), row), BLUE, width=3, legend=text)
-    panel.points("mean", (draws.mean(), posterior_row), BLUE, size=90, legend="posterior mean")
-    if has_error:
-        normal = norm(best, error)
-        text = "normal with the optimum's standard error"
-        panel.line("normal", (grid, normal.pdf(grid)), VERMILION, style=DASHED, legend=text)
-        panel.line("stderr", (normal.ppf(levels), np.repeat(optimum_row, 2)), VERMILION, width=3)
+    nothing = np.full(2, np.nan)
+    # By distribution: draws, density, ends of the interval, point, and place of both below zero,
+    # far enough apart that the diamond of one does not touch the dot of the other.
+    rows: dict[str, tuple[Any, ...]] = {
+        "posterior": (draws, density, np.quantile(draws, levels), draws.mean(), -0.07)
+    }
     if estimate is not None:
-        look: dict[str, Any] = {"marker": DIAMOND, "size": 110, "legend": "optimum"}
-        panel.points("optimum", (best, optimum_row), VERMILION, **look)
-    return top
+        normal = norm(best, error if has_error else 1.0)
+        curve = normal.pdf(grid) if has_error else np.full(grid.shape, np.nan)
+        ends = normal.ppf(levels) if has_error else nothing
+        rows["optimum"] = (np.array([best]), curve, ends, best, -0.17)
+    if prior is not None:
+        rows["prior"] = (prior, bounded_density(prior, grid), nothing, np.nan, 0.0)
+    samples, curves, ends, points, places = zip(*rows.values(), strict=True)
+    size = max(map(len, samples))
+    padded = [np.append(x, np.full(size - len(x), np.nan)) for x in samples]
+    along = "distribution"
+    # ArviZ leaves out a line without numbers.
+    lines = [[np.where(np.isnan(curve), np.nan, grid), curve] for curve in curves]
+    return xr.Dataset(
+        {
+            "draws": ((along, "sample"), padded),
+            "density": ((along, "plot_axis", "kde_dim"), lines, {"kind": "kde"}),
+            "interval": ((along, "ci_bound"), np.array(ends)),
+            "point": (along, np.array(points)),
+            "place": (along, np.array(places) * float(density.max())),
+        },
+        coords={along: list(rows), "plot_axis": ["x", "y"], "ci_bound": ["lower", "upper"]},
+    )
+
+
+def _draw(
+    summaries: Mapping[str, xr.Dataset],
+    texts: dict[str, str],
+    prob: float,
+    backend: str | None,
+    pc_kwargs: dict[str, Any],
+) -> PlotCollection:
+    """Return the picture that ArviZ draws of summaries by hyperparameter."""
+    import arviz as az  # heavy, and only needed for pictures
+
+    def by_name(key: str) -> xr.Dataset:
+        return xr.Dataset({name: summary[key] for name, summary in summaries.items()})
+
+    backend = backend or az.rcParams["plot.backend"]
+    columns, options = layout(len(summaries), (4.6, 3.6), pc_kwargs)
+    if backend != "matplotlib":
+        options.pop("layout")
+        if "figsize" not in pc_kwargs.get("figure_kwargs", {}):  # in dots, 100 per inch
+            width, height = options["figsize"]
+            options |= {"figsize": (100 * width, 100 * height), "figsize_units": "dots"}
+    rest = {key: value for key, value in pc_kwargs.items() if key != "figsize"}
+    shown = next(iter(summaries.values())).distribution.values.tolist()
+    colors, styles, markers = zip(*(_LOOKS[name] for name in shown), strict=True)
+    along = ["distribution"]
+    place = {"y": by_name("place")}
+    settings = {
+        "cols": ["__variable__"],
+        "col_wrap": columns,
+        "aes": {"color": along, "linestyle": along, "marker": along},
+        "color": list(colors),
+        "linestyle": list(styles),
+        "marker": list(markers),
+    }
+    drawn: Any = az.plot_dist(
+        by_name("draws"),
+        kind="kde",
+        sample_dims="sample",
+        backend=backend,
+        labeller=az.labels.MapLabeller(var_name_map=texts),
+        aes_by_visuals={
+            "dist": ["color", "linestyle"],
+            "credible_interval": ["color"],
+            "point_estimate": ["color", "marker"],
+        },
+        visuals={
+            "dist": {"width": 2},
+            "credible_interval": place | {"width": 3},
+            "point_estimate": place | {"size": 90},
+            "point_estimate_text": False,
+        },
+        stats={
+            "dist": by_name("density"),
+            "credible_interval": by_name("interval"),
+            "point_estimate": by_name("point"),
+        },
+        **(settings | rest | {"figure_kwargs": options}),
+    )
+    look: dict[str, Any] = {"loc": "outside lower center", "ncols": len(shown), "frameon": False}
+    drawn.add_legend(
+        "distribution",
+        aes=["color", "linestyle"],
+        title=f"{prob:.0%} intervals, with the mean or the optimum",
+        **(look if backend == "matplotlib" else {}),
+    )
+    collection: PlotCollection = drawn
+    return collection

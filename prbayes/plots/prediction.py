@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import share
-from prbayes.plots.canvas import BLUE, INK, Canvas, named, refuse_labels, refuse_look
+from prbayes.plots.canvas import BLUE, check_options, finish, ink, named, panels, refuse_labels
 from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
@@ -18,18 +18,25 @@ from prbayes.plots.curves import (
     pointwise_band,
     staircase,
 )
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select
 from prbayes.response.outputs import with_unit
 from prbayes.validation.conditions import comparables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_prediction(
     observed: Any,
     predicted: xr.DataArray | Mapping[str, xr.DataArray],
     *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the distribution functions of measured responses and of their prediction.
 
     The steps are the measured values, the curve is the predicted distribution of all populations
@@ -43,18 +50,25 @@ def plot_prediction(
         Of specimens that were not used in the calibration; by condition, if by name.
     predicted : xarray.DataArray, or a mapping of such
         From `predict`: dims (chain, draw, sample), and one of outputs; by the same names.
+    var_names : str or sequence of str, optional
+        Conditions, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of outputs by dimension, such as ``{"output": ["load"]}``.
     prob : float
         Share of the populations in the band.
     labels : mapping, optional
         Labels of conditions or outputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        A panel for each condition and output; of more than eight outputs eight from the first to
-        the last. Its ``viz`` has the artists ``band``, ``predicted`` and ``measured``.
+    matplotlib.figure.Figure
+        With a panel for each condition and output, whose label is its name; of more than eight
+        outputs eight from the first to the last.
 
     Raises
     ------
@@ -69,31 +83,36 @@ def plot_prediction(
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
     ...     y = prb.Simulator("y", np.exp, x, metric=prb.AreaMetric(), observed=[1.0, 2.0, 4.0])
     >>> later = prb.predict(prb.minimize(model), lambda x: 2 * np.exp(x), x, name="later")
-    >>> list(prb.plots.plot_prediction([2.5, 3.0, 9.0], later).viz["measured"])
-    ['later']
+    >>> prb.plots.plot_prediction([2.5, 3.0, 9.0], later).axes[0].get_label()
+    'later'
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     prob = share(prob, "prob")
-    pairs = comparables(observed, predicted, "plot_prediction")
-    names = [pair.name for pair in pairs]
+    pairs = {pair.name: pair for pair in comparables(observed, predicted, "plot_prediction")}
+    elements = {name: (pair.condition, pair.coords) for name, pair in pairs.items()}
+    names = select(elements, var_names, filter_vars, coords)
     refuse_labels(labels, names)
-    canvas = Canvas(names, size=(5.0, 3.9), pc_kwargs=pc_kwargs)
-    for pair in pairs:
-        panel = canvas.panels[pair.name]
+    figure, axes = panels(names, size=(5.0, 3.9), pc_kwargs=pc_kwargs)
+    for name, axis in axes.items():
+        pair = pairs[name]
         measured = pair.measured
         weights = pair.weights
         limits = axis_range(measured, central_range(pair.predicted, weights, tail=0.005), None)
         grid = np.linspace(*limits, GRID_POINTS)
         curves = distribution_function(pair.predicted, weights, grid)
+        look: dict[str, Any] = {"color": BLUE, "linewidth": 2.2}
         if len(curves) > 1:
+            sides = pointwise_band(curves, prob)
             text = f"{prob:.0%} of the populations"
-            panel.band("band", grid, pointwise_band(curves, prob), BLUE, legend=text)
-        panel.line("predicted", (grid, curves.mean(axis=0)), BLUE, width=2.2, legend="predicted")
+            axis.fill_between(
+                grid, *sides, color=BLUE, alpha=0.25, linewidth=0, label=text, gid="band"
+            )
+        axis.plot(grid, curves.mean(axis=0), **look, label="predicted", gid="predicted")
         steps = staircase(measured, np.full(measured.size, 1 / measured.size), *limits)
-        panel.line("measured", steps, INK, width=1.4, legend="measured")
+        axis.plot(*steps, color=ink(), linewidth=1.4, label="measured", gid="measured")
         failed = np.count_nonzero(np.isinf(measured))
         title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
-        label = named(pair.name, labels)
-        label = with_unit(label, pair.unit) if label == pair.name else label
-        panel.axes(x=label, y="share of specimens", title=title)
-    return canvas.finish()
+        label = named(name, labels)
+        label = with_unit(label, pair.unit) if label == name else label
+        axis.set(xlabel=label, ylabel="share of specimens", title=title)
+    return finish(figure)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
@@ -14,26 +14,26 @@ from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import Floats, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
+from prbayes.model.parameters import variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
-    DASHED,
     GREY,
-    INK,
     VERMILION,
-    Canvas,
     Limits,
-    Panel,
+    check_options,
+    finish,
+    ink,
     named,
+    panels,
     refuse_labels,
-    refuse_look,
 )
 from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
     central_levels,
     central_range,
-    histogram,
+    measured_density,
     smooth_densities,
     staircase,
     with_gaps,
@@ -45,7 +45,12 @@ from prbayes.plots.ensemble import (
     read_before,
     read_result,
 )
+from prbayes.plots.selection import Coords, Elements, FilterVars, VarNames, select
 from prbayes.response.outputs import Outputs, with_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @locked
@@ -53,17 +58,20 @@ def plot_responses(
     result: Optimum | xr.DataTree,
     *,
     model: pm.Model | None = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     before: Mapping[str, Any] | bool | None = None,
     ecdf: bool = False,
     prob: float = INTERVAL,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the responses before and after a calibration against the measured ones.
 
-    Measured responses are a histogram with a mark for each, or steps. The calibrated curve is the
-    posterior predictive distribution, or the optimum's population. The band contains the share
+    Measured responses are a mark for each and a smooth density, or steps. The calibrated curve is
+    the posterior predictive distribution, or the optimum's population. The band contains the share
     ``prob`` of the populations at each response: those of the posterior's draws, or of the
     optimum's sampling distribution if it is known.
 
@@ -78,6 +86,13 @@ def plot_responses(
         From `minimize`; or with a ``posterior`` group, from any sampler.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
+    var_names : str or sequence of str, optional
+        Simulators, or outputs as elements of them, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels by dimension: of outputs, such as ``{"output": ["load"]}``, or of groups. Places of a
+        curve that are chosen here have a panel of their own.
     before : dict or bool, optional
         Hyperparameters before the calibration, in the user's own units; False for none. By default
         the optimiser's first point, if it was given a start or did not screen for one, otherwise
@@ -92,14 +107,14 @@ def plot_responses(
     labels : mapping, optional
         Labels of simulators or outputs by name, with units: ``{"crack": "relative length"}``.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and
-        ``after``; with lines, ``population``. The panel of an output has the name of an element of
-        the simulator, ``"frame[first]"``.
+    matplotlib.figure.Figure
+        With a panel for each simulator or output, whose label is the name of an element of the
+        simulator, ``"frame[first]"``.
 
     Raises
     ------
@@ -122,27 +137,30 @@ def plot_responses(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> prb.plots.plot_responses(prb.minimize(model)).viz["after"].name
-    'after'
+    >>> prb.plots.plot_responses(prb.minimize(model)).axes[0].get_label()
+    'y'
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     flag(ecdf, "ecdf")
     share(prob, "prob")
     ensemble = read_result(result, model, "prb.plots.plot_responses", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before, "plot_responses")
-    by_simulator = panels_of(evaluator.simulators)
-    names = [output.name for panels in by_simulator for output in panels]
+    shown = panels_of(evaluator.simulators, var_names, filter_vars, coords)
+    names = [output.name for output in shown]
     refuse_labels(labels, names, evaluator=evaluator)
-    has_lines = any(in_one_panel(node.outputs) for node in evaluator.simulators)
+    has_lines = any(output.is_in_lines for output in shown)
     size = (7.2, 4.8) if has_lines else (5.4, 4.2)
-    canvas = Canvas(names, size=size, pc_kwargs=pc_kwargs)
+    figure, axes = panels(names, size=size, pc_kwargs=pc_kwargs)
     limits: dict[str, Limits] = {}  # by axis: panels of groups have one
     contents = []
-    for k, panels in enumerate(by_simulator):
+    for k, node in enumerate(evaluator.simulators):
+        columns = [output for output in shown if output.node is node]
+        if not columns:
+            continue
         values, weights = evaluator.populations(ensemble.every, k)
         earlier = evaluator.populations(start, k) if len(start) else None
-        for output in panels:
+        for output in columns:
             sample = output.of(values), weights
             first = None if earlier is None else (output.of(earlier[0]), earlier[1])
             contents.append((output, sample, first))
@@ -154,12 +172,12 @@ def plot_responses(
                 least, most = limits.get(output.axis, (low, high))
                 limits[output.axis] = min(low, least), max(high, most)
     for output, sample, first in contents:
-        draw = _Drawing(canvas.panels[output.name], ensemble, text, prob, output.text(labels))
+        draw = _Drawing(axes[output.name], ensemble, text, prob, output.text(labels), labels)
         if sample[0].ndim == 2:
             draw.distribution(output, sample, first, limits[output.axis], ecdf=ecdf)
         else:
             draw.lines(output, sample, first)
-    return canvas.finish()
+    return finish(figure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +187,12 @@ class _Drawing:
     Populations are responses and weights, shape (P, n) each; of outputs, responses (P, n, m).
     """
 
-    panel: Panel
+    axis: Axes
     ensemble: Ensemble
     start: str  # name of the population before
     prob: float
     text: str  # label of the responses
+    labels: Mapping[str, str] | None
 
     def distribution(
         self,
@@ -185,42 +204,40 @@ class _Drawing:
         ecdf: bool,
     ) -> None:
         """Draw the distribution of one output: data first, then the populations."""
-        panel = self.panel
+        axis = self.axis
         observed, weights = output.measured()
         is_sheet = output.node.metric.exact_likelihood  # statistics, which have no distribution
         grid = np.linspace(*limits, GRID_POINTS)
         curves_of = distribution_function if ecdf else smooth_densities
+        marks: dict[str, Any] = {"marker": "|", "color": ink(), "gid": "rug", "zorder": 3}
+        top = 1.0 if ecdf else 0.0
         if is_sheet:
             top = 0.0
-            panel.points("rug", (observed, 0.0), INK, marker="|", size=60, legend="data sheet")
+            axis.scatter(observed, 0 * observed, 60, label="data sheet", **marks)
         elif ecdf:
-            top = 1.0
             stairs = staircase(observed, weights, *limits)
-            panel.line("measured", stairs, INK, width=1.4, legend="measured")
+            axis.plot(*stairs, color=ink(), linewidth=1.4, label="measured", gid="measured")
         else:
-            x, y = histogram(observed, weights)
-            top = float(y.max())
-            panel.line("measured", (x, y), INK, width=0.9, legend="measured")
+            density = measured_density(observed, weights, grid)
+            top = float(density.max())
+            look: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
+            axis.fill_between(grid, density, **look, label="measured, smoothed", gid="measured")
             finite = observed[np.isfinite(observed)]
-            panel.points("rug", (finite, 0.0), INK, marker="|", size=60)
+            axis.scatter(finite, 0 * finite, 60, label="measured", **marks)
         initial = np.zeros(1)
         if earlier is not None:
             (initial,) = curves_of(*earlier, grid)
             text = f"before: {self.start}"
-            panel.line("before", (grid, initial), VERMILION, style=DASHED, legend=text)
+            axis.plot(grid, initial, "--", color=VERMILION, label=text, gid="before")
         curves = curves_of(*population, grid)
-        top = max(top, draw_calibrated(panel, grid, curves, self.ensemble, self.prob))
-        # A narrow peak before would dwarf all other curves
-        ylim = (-0.05 * top, 2 * top) if initial.max() > 2 * top else None
+        top = max(top, draw_calibrated(axis, grid, curves, self.ensemble, self.prob))
+        if initial.max() > 2 * top:  # a narrow peak before would dwarf all other curves
+            axis.set_ylim(-0.05 * top, 2 * top)
         failed = np.count_nonzero(np.isinf(observed))
-        panel.axes(
-            x=self.text,
-            y="share of specimens" if ecdf else "density",
-            title=f"{observed.size} {'statistics' if is_sheet else 'measured values'}"
-            + (f", {failed} failed" if failed else ""),
-            xlim=limits,
-            ylim=ylim,
-        )
+        title = f"{observed.size} {'statistics' if is_sheet else 'measured values'}"
+        title += f", {failed} failed" if failed else ""
+        y = "share of specimens" if ecdf else "density"
+        axis.set(xlabel=self.text, ylabel=y, title=title, xlim=limits)
 
     def lines(
         self,
@@ -229,7 +246,7 @@ class _Drawing:
         earlier: tuple[Floats, Floats] | None,
     ) -> None:
         """Draw a line over all outputs for each specimen; median and most of the population."""
-        panel = self.panel
+        axis = self.axis
         outputs = output.node.outputs
         observed = output.node.observed
         y = self.text
@@ -237,14 +254,13 @@ class _Drawing:
             places = np.array(outputs.labels, dtype=np.float64)
             order = np.argsort(places)
             center, unit = np.zeros(places.size), np.ones(places.size)
-            xticks = None
         else:  # outputs with names, each in its own spread
             order = np.arange(len(outputs.labels))
             places = order.astype(np.float64)
             finite = np.where(np.isfinite(observed), observed, np.nan)
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
-            xticks = (places.tolist(), list(outputs.names))
+            axis.set_xticks(places, list(outputs.names))
             y += ", standard deviations from the mean"
         x = places[order]
         measured = ((observed - center) / unit)[:, order]
@@ -260,21 +276,23 @@ class _Drawing:
         lines = np.clip(lines, low - room, high + room)
         lower, upper = (middle_of(lines[:, i], self.ensemble) for i in (0, 2))
         text = f"{INTERVAL:.0%} of the calibrated population"
-        panel.band("population", x, (lower, upper), BLUE, alpha=0.25, legend=text)
-        panel.line("measured", _joined(x, measured), GREY, width=0.5, legend="measured")
+        look: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
+        axis.fill_between(x, lower, upper, **look, label=text, gid="population")
+        line = _joined(x, measured)
+        axis.plot(*line, color=GREY, linewidth=0.5, label="measured", gid="measured")
         if earlier is not None:
             text = f"before: {self.start}"
             line = _joined(x, np.clip(initial, low - room, high + room))
-            panel.line("before", line, VERMILION, style=DASHED, legend=text)
+            axis.plot(*line, "--", color=VERMILION, label=text, gid="before")
         median: Any = {"name": "median, calibrated", "alpha": 0.55}
-        draw_calibrated(panel, x, lines[:, 1], self.ensemble, self.prob, **median)
+        draw_calibrated(axis, x, lines[:, 1], self.ensemble, self.prob, **median)
 
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
         failed = np.count_nonzero(np.isinf(observed).any(axis=1))
         title = f"{len(observed)} measured specimens"
         title += f", {incomplete} incomplete" if incomplete else ""
         title += f", {failed} failed" if failed else ""
-        panel.axes(x=outputs.dim, y=y, title=title, ylim=(low, high), xticks=xticks)
+        axis.set(xlabel=named(outputs.dim, self.labels), ylabel=y, title=title, ylim=(low, high))
 
 
 def _finite_range(values: Floats) -> Limits:
@@ -308,9 +326,21 @@ class Output:
         """The simulator's name, with the output's as the index of an element."""
         if self.column is None:
             return self.node.name
-        # Names of panels are paths in a tree, with slashes between levels.
-        output = self.node.outputs.names[self.column].replace("/", "\u2215")
-        return f"{self.node.name}[{output}]"
+        return f"{self.node.name}[{self.node.outputs.names[self.column]}]"
+
+    @property
+    def is_in_lines(self) -> bool:
+        """Whether it is several outputs as lines over their labels."""
+        return self.column is None and bool(self.node.outputs.event)
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """The labels of output and group by dimension."""
+        outputs, groups = self.node.outputs, self.node.inputs.groups
+        labels = {} if self.column is None else {outputs.dim: outputs.labels[self.column]}
+        if groups is not None and self.node.group:
+            labels[groups.dim] = groups.labels[groups.names.index(self.node.group)]
+        return labels
 
     @property
     def axis(self) -> str:
@@ -353,20 +383,38 @@ class Output:
         return values[is_measured], weights[is_measured] / weights[is_measured].sum()
 
 
-def panels_of(nodes: Sequence[PopulationSimulator]) -> list[list[Output]]:
-    """Return the panels of each simulator: its outputs, or one for a curve or many outputs."""
+def output_elements(outputs: Iterable[Output]) -> Elements:
+    """Return outputs as elements of simulators, by name."""
+    return {x.name: (variable_of(x.name), x.coordinates) for x in outputs}
+
+
+def panels_of(
+    nodes: Sequence[PopulationSimulator],
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
+) -> list[Output]:
+    """Return the panels of simulators: their outputs, or one for a curve or many outputs."""
     alone = len(nodes) == 1
-    return [
-        [Output(node, None, alone)]
-        if not node.outputs.event or in_one_panel(node.outputs)
-        else displayed_outputs(node, alone=alone)
-        for node in nodes
-    ]
+    by_node = {node.name: displayed_outputs(node, alone=alone) for node in nodes}
+    available = {x.name: x for outputs in by_node.values() for x in outputs}
+    shown: dict[str, Output] = {}
+    names = select(output_elements(available.values()), var_names, filter_vars, coords)
+    for name in names:
+        output = available[name]
+        outputs = by_node[output.node.name]
+        if in_one_panel(output.node.outputs) and {x.name for x in outputs} <= set(names):
+            output = Output(output.node, None, alone)
+        shown[output.name] = output
+    if coords is not None and sum(x.column is not None for x in shown.values()) > 24:
+        raise ValueError(f"coords: got {len(shown)} outputs, expected all, or at most 24 in panels")
+    return list(shown.values())
 
 
 def displayed_outputs(node: PopulationSimulator, *, alone: bool) -> list[Output]:
-    """Return all of several outputs of a simulator."""
-    return [Output(node, j, alone) for j in range(len(node.outputs.labels))]
+    """Return all outputs of a simulator, or its only one."""
+    columns = range(len(node.outputs.labels)) if node.outputs.event else [None]
+    return [Output(node, column, alone) for column in columns]
 
 
 def in_one_panel(outputs: Outputs) -> bool:

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes.plots.canvas import (
     BLUE,
-    CIRCLE,
-    DIAMOND,
-    DOTTED,
     GREY,
     VERMILION,
-    Canvas,
+    check_options,
+    finish,
     named,
+    panels,
     refuse_labels,
-    refuse_look,
 )
+from prbayes.plots.selection import FilterVars, VarNames, select_variables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_sensitivity(
     table: xr.Dataset,
     *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the sensitivity indices of hyperparameters and inputs, a row per factor.
 
     A dot is the share of the variance that a factor explains by itself, a diamond the share that is
@@ -37,16 +41,20 @@ def plot_sensitivity(
     ----------
     table : xarray.Dataset
         From `sensitivity`.
+    var_names : str or sequence of str, optional
+        Hyperparameters and inputs, or elements of them, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
     labels : mapping, optional
         Labels of factors by name.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        With the panels ``hyperparameter`` and ``input``; its ``viz`` has the artists ``first`` and
-        ``total``, and the errors ``first_0``, ``total_0`` and so on by factor.
+    matplotlib.figure.Figure
+        With the panels ``hyperparameter`` and ``input``.
 
     Raises
     ------
@@ -60,42 +68,45 @@ def plot_sensitivity(
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0, name="x")
     ...     y = prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
     >>> table = prb.sensitivity(prb.minimize(model), prb.decision.Mean(np.square, x))
-    >>> sorted(prb.plots.plot_sensitivity(table).viz["first"])
+    >>> figure = prb.plots.plot_sensitivity(table)
+    >>> [axis.get_label() for axis in figure.axes]
     ['hyperparameter', 'input']
     """
-    refuse_look(labels, pc_kwargs)
+    check_options(labels, pc_kwargs)
     variables = {"first", "total", "first_error", "total_error", "factor", "kind"}
     if not isinstance(table, xr.Dataset) or not variables <= set(table.variables):
         got = type(table).__name__
         raise TypeError(
             f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
         )
-    refuse_labels(labels, map(str, table.factor.values))
+    names = select_variables(table.factor.values.tolist(), var_names, filter_vars)
+    table = table.sel(factor=names)
+    refuse_labels(labels, names)
     titles = {
         "hyperparameter": "share of the quantity's variance",
         "input": f"share of the variance of\n{table.attrs.get('of_inputs', 'the response')}",
     }
     by_kind = {kind: table.sel(factor=(table.kind == kind).values) for kind in titles}
+    by_kind = {kind: factors for kind, factors in by_kind.items() if factors.sizes["factor"]}
     n = max(factors.sizes["factor"] for factors in by_kind.values())
-    limits = (-0.6, n - 0.4)
-    canvas = Canvas(list(titles), size=(4.8, 1.6 + 0.4 * n), pc_kwargs=pc_kwargs)
-    for kind, title in titles.items():
+    size = (4.8, 1.6 + 0.4 * n)
+    figure, axes = panels(list(by_kind), size=size, pc_kwargs=pc_kwargs)
+    for kind, axis in axes.items():
         factors = by_kind[kind]
         rows = n - 1.0 - np.arange(factors.sizes["factor"])
-        panel = canvas.panels[kind]
         for end in (0.0, 1.0):
-            panel.line(f"end_{end:.0f}", ([end, end], limits), GREY, style=DOTTED, width=1.0)
+            axis.axvline(end, color=GREY, linestyle=":", linewidth=1.0)
         for key, shift, color, marker, text in (
-            ("first", 0.12, BLUE, CIRCLE, "by itself"),
-            ("total", -0.12, VERMILION, DIAMOND, "with all others known"),
+            ("first", 0.12, BLUE, "o", "by itself"),
+            ("total", -0.12, VERMILION, "D", "with all others known"),
         ):
             indices = factors[key].values
             errors = 2 * factors[f"{key}_error"].values
             y = rows + shift
-            for i in np.flatnonzero(np.isfinite(indices)):
-                ends = [indices[i] - errors[i], indices[i] + errors[i]]
-                panel.line(f"{key}_{i}", (ends, [y[i], y[i]]), color, width=2)
-            panel.points(key, (indices, y), color, marker=marker, legend=text)
-        names = [named(str(factor), labels) for factor in factors.factor.values]
-        panel.axes(x=title, ylim=limits, yticks=(rows.tolist(), names))
-    return canvas.finish()
+            axis.hlines(
+                y, indices - errors, indices + errors, color=color, linewidth=2, gid=f"{key}_error"
+            )
+            axis.scatter(indices, y, 30, color=color, marker=marker, label=text, gid=key, zorder=3)
+        axis.set(xlabel=titles[kind], ylim=(-0.6, n - 0.4))
+        axis.set_yticks(rows, [named(str(factor), labels) for factor in factors.factor.values])
+    return finish(figure)

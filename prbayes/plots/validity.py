@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +11,25 @@ from numpy.typing import NDArray
 from prbayes._validate import Floats
 from prbayes.plots.canvas import (
     BLUE,
-    DASHED,
-    DOTTED,
-    INK,
     PALE,
-    SOLID,
     VERMILION,
-    Canvas,
-    refuse_look,
+    check_options,
+    finish,
+    ink,
+    panels,
 )
 from prbayes.plots.curves import steps, with_gaps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def plot_validity(
     tests: ValidityTest | Mapping[str, ValidityTest],
     **pc_kwargs: Any,
-) -> Any:
+) -> Figure:
     """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
 
     The shaded area is the statistic. The title has the critical value and the verdict; the band
@@ -41,13 +42,13 @@ def plot_validity(
     tests : ValidityTest or mapping
         From `area_test`; several by name, one panel each.
     **pc_kwargs
-        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
+        `matplotlib.pyplot.figure`.
 
     Returns
     -------
-    arviz.PlotCollection
-        With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and
-        ``ecdf``; of several outputs ``identity``, ``ecdf`` and ``folded``.
+    matplotlib.figure.Figure
+        With a panel for each test, whose label is its name, or ``u`` of a single one.
 
     Raises
     ------
@@ -60,10 +61,10 @@ def plot_validity(
     >>> rng = np.random.default_rng(1)
     >>> predicted = rng.normal(rng.normal(0, 0.2, (200, 1)), 1.0, (200, 500))
     >>> test = prb.area_test(rng.normal(0, 1, 20), predicted)
-    >>> prb.plots.plot_validity(test).viz["ecdf"].name
-    'ecdf'
+    >>> prb.plots.plot_validity(test).axes[0].get_xlabel()
+    'u-value'
     """
-    refuse_look(None, pc_kwargs)
+    check_options(None, pc_kwargs)
     by_name = dict(tests) if isinstance(tests, Mapping) else {"": tests}
     if not by_name or not all(isinstance(test, ValidityTest) for test in by_name.values()):
         kinds = {type(test).__name__ for test in by_name.values()}
@@ -73,40 +74,40 @@ def plot_validity(
             "name"
         )
     # The panel of a single test has a name too
-    canvas = Canvas([name or "u" for name in by_name], size=(4.6, 4.8), pc_kwargs=pc_kwargs)
-    for name, test in by_name.items():
-        panel = canvas.panels[name or "u"]
+    names = [name or "u" for name in by_name]
+    figure, axes = panels(names, size=(4.6, 4.8), pc_kwargs=pc_kwargs)
+    for (name, test), axis in zip(by_name.items(), axes.values(), strict=True):
         color = VERMILION if test.rejected else BLUE
         directions = in_directions(test)
         if directions:
             # Conditions of one output are one line of their own
             single = test.u_values[~_is_of_direction(test)]
             lines = [single, *directions] if single.size else directions
-            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
+            thin: dict[str, Any] = {"color": color, "linewidth": 0.8}
             if not test.folded:
-                panel.line("ecdf", _ecdf(lines), color, width=0.8)
+                axis.plot(*_ecdf(lines), **thin, gid="ecdf")
             folded = _ecdf([np.abs(2 * u - 1) for u in (lines if test.folded else directions)])
-            style = SOLID if test.folded else DOTTED
-            panel.line("folded", folded, color, style=style, width=0.8)
+            axis.plot(*folded, "-" if test.folded else ":", **thin, gid="folded")
             x = "u-value; dotted: |2u - 1|"
             y = f"share of values in each of {len(directions)} directions"
             statistic = "mean area"
         else:
             values = np.abs(2 * test.u_values - 1) if test.folded else test.u_values
             ecdf = _ecdf([values])
-            panel.band("envelope", *_envelope(test), PALE, alpha=0.4)
-            panel.band("area", *_between(*ecdf), color, alpha=0.4)
-            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
-            panel.line("ecdf", ecdf, color, width=None)
+            axis.fill_between(*_envelope(test), color=PALE, alpha=0.4, linewidth=0, gid="envelope")
+            axis.fill_between(*_between(*ecdf), color=color, alpha=0.4, linewidth=0, gid="area")
+            axis.plot(*ecdf, color=color, gid="ecdf")
             x = "u-value"
             y = f"share of {values.size} values"
             statistic = "area"
+        axis.plot([0, 1], [0, 1], "--", color=ink(), gid="identity")
         level = f", level {test.alpha:.0%}"
         first = f"{name}, p = {test.p_value:.2g}" if name else f"p = {test.p_value:.2g}{level}"
         sign, verdict = (">", "rejected") if test.rejected else ("<", "not rejected")
         second = f"{statistic} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}"
-        panel.axes(x="|2u - 1|" if test.folded else x, y=y, title=f"{first}\n{second}: {verdict}")
-    return canvas.finish()
+        title = f"{first}\n{second}: {verdict}"
+        axis.set(xlabel="|2u - 1|" if test.folded else x, ylabel=y, title=title)
+    return finish(figure)
 
 
 def in_directions(test: ValidityTest) -> list[Floats]:
@@ -133,7 +134,7 @@ def _ecdf(samples: Sequence[Floats]) -> Floats:
     return with_gaps(curves)
 
 
-def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+def _between(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     """Return places, and the lower and upper side of the area between an ECDF and the identity."""
     # Where a step crosses the identity there is a corner too: between two corners of one height
     crosses = (x[:-1] < y[:-1]) & (x[1:] > y[:-1])
@@ -141,10 +142,10 @@ def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
     height = y[at]
     x = np.insert(x, at + 1, height)
     y = np.insert(y, at + 1, height)
-    return x, (np.minimum(x, y), np.maximum(x, y))
+    return x, np.minimum(x, y), np.maximum(x, y)
 
 
-def _envelope(test: ValidityTest) -> tuple[Floats, tuple[Floats, Floats]]:
+def _envelope(test: ValidityTest) -> tuple[Floats, Floats, Floats]:
     """Return places and sides of the envelope; the smallest values make the highest ECDF."""
     smallest, largest = test.envelope
     places = np.unique(np.concatenate([[0.0], smallest, largest, [1.0]]))
@@ -155,4 +156,4 @@ def _envelope(test: ValidityTest) -> tuple[Floats, tuple[Floats, Floats]]:
         at = np.searchsorted(values, places, side="right")
         return np.column_stack([below, at]).ravel() / values.size
 
-    return np.repeat(places, 2), (at_corners(largest), at_corners(smallest))
+    return np.repeat(places, 2), at_corners(largest), at_corners(smallest)

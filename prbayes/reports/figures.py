@@ -34,7 +34,7 @@ _log = logging.getLogger("prbayes")
 class Illustration:
     """A picture that a report shows where it has the contents."""
 
-    function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
+    function: Callable[..., Any]  # returns a figure with ``savefig``
     after: str  # title of the section that it belongs to
     title: str
     alt: str
@@ -156,8 +156,8 @@ def requests(m: Material) -> dict[str, Request]:
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
         """Return as keywords the labels of names in a picture without a model."""
         variables = {variable_of(str(name)) for name in names}
-        chosen = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": chosen} if chosen else {}
+        texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+        return {"labels": texts} if texts else {}
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
@@ -170,7 +170,8 @@ def requests(m: Material) -> dict[str, Request]:
             requested["outputs"] = requested["population"]
     if posterior is not None:
         shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        requested["posterior"] = ((posterior,), {"optimum": optimum, "model": m.model, **shown})
+        shown = {"optimum": optimum, "model": m.model, "backend": "matplotlib", **shown}
+        requested["posterior"] = ((posterior,), shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
     if optimum is not None:

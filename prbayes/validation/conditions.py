@@ -21,6 +21,7 @@ from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
+from prbayes.model.parameters import element_name
 from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
 
@@ -338,6 +339,8 @@ class Comparable:
     measured: Floats  # (n,): +inf is a specimen that failed
     predicted: Floats  # (P, S): a row for each population; NaN has no weight
     unit: str = ""
+    condition: str = ""
+    coords: Mapping[str, Any] = field(default_factory=dict)  # the output's label by dimension
 
     @property
     def weights(self) -> Floats:
@@ -384,11 +387,11 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
         attrs = {**getattr(observed[name], "attrs", {}), **prediction.attrs}
         units = np.broadcast_to(attrs.get("units", ""), m)
         for j in map(round, np.linspace(0, m - 1, min(m, 8)).tolist()):
-            label = f"{name}[{prediction[dims[0]].values.tolist()[j]}]" if event else str(name)
-            # Panels are places in a tree, whose levels a slash separates.
-            label = label.replace("/", "\u2215")
+            coords = {str(dim): prediction[dim].values.tolist()[j] for dim in dims}
+            label = element_name(str(name), list(coords.values()))
             measured = columns[~np.isnan(columns[:, j]), j]
-            pairs.append(Comparable(label, measured, samples[..., j], str(units[j])))
+            unit = str(units[j])
+            pairs.append(Comparable(label, measured, samples[..., j], unit, str(name), coords))
     return pairs
 
 

@@ -234,11 +234,11 @@ def test_pictures_have_the_units() -> None:
     model = normal_model(propagation=prb.Reweighted(64), units={"k": "kN/mm", "y": "mm"})
     posterior = reference_posterior(40, 7)
     (k,) = margins(Evaluator.of(model))
-    drawn = prb.plots.plot_population(posterior, model=model).viz["after"]["k"].item()
-    assert drawn.axes.get_xlabel() == "k (kN/mm)"
+    (axis,) = prb.plots.plot_population(posterior, model=model).axes
+    assert axis.get_xlabel() == "k (kN/mm)"
     later = prb.predict(posterior, np.positive, k.dist, model=model, n_samples=50, stored=False)
-    drawn = prb.plots.plot_prediction(DATA, later).viz["predicted"]["positive"].item()
-    assert drawn.axes.get_xlabel() == "positive (mm)"
+    (axis,) = prb.plots.plot_prediction(DATA, later).axes
+    assert axis.get_xlabel() == "positive (mm)"
 
 
 def test_one_time_series_is_no_population() -> None:

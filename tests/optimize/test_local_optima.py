@@ -173,7 +173,7 @@ def test_unidentified_directions_are_named_and_make_no_optima(response: Any) -> 
     assert np.isinf(optimum.stderr["idle"])
     (text,) = [str(f) for f in optimum.findings if f.code == "not-identified"]
     assert "about idle (" in text
-    assert text.endswith("; see docs/optimum_or_abc.md#no-answer.")
+    assert text.endswith('; see prb.help("not-identified").')
 
 
 @pytest.mark.long

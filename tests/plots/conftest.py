@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 from scipy import stats
 
 import prbayes as prb
@@ -125,29 +127,48 @@ def comparison(optimum: prb.Optimum, posterior: xr.DataTree) -> xr.Dataset:
 
 @pytest.fixture(scope="session")
 def read() -> SimpleNamespace:
-    """How to read a plot: its artists, their places, the sides of a band, the legend's texts."""
+    """How to read a figure: its artists, their places, the sides of a band, the legend's texts."""
 
-    def artist(pc: Any, visual: str, panel: str) -> Any:
-        return pc.viz[visual][panel].item()
+    def panel(figure: Figure, name: str) -> Any:
+        (axis,) = (axis for axis in figure.axes if axis.get_label() == name)
+        return axis
 
-    def xy(pc: Any, visual: str, panel: str) -> Array:
+    def panels(figure: Figure, gid: str) -> list[str]:
+        """Return the names of the panels that have an artist."""
+        axes = [axis for axis in figure.axes if axis.findobj(lambda x: x.get_gid() == gid)]
+        return [str(axis.get_label()) for axis in axes]
+
+    def artist(figure: Figure, gid: str, name: str) -> Any:
+        (drawn,) = panel(figure, name).findobj(lambda x: x.get_gid() == gid)
+        return drawn
+
+    def xy(figure: Figure, gid: str, name: str) -> Array:
         """Return the places of a line or of markers, shape (2, n)."""
-        drawn = artist(pc, visual, panel)
+        drawn = artist(figure, gid, name)
         if hasattr(drawn, "get_offsets"):
             return np.array(drawn.get_offsets().T, dtype=float)
         return np.array(drawn.get_data(), dtype=float)
 
-    def sides(pc: Any, visual: str, panel: str, at: Array) -> Array:
+    def sides(figure: Figure, gid: str, name: str, at: Array) -> Array:
         """Return the lower and the upper side of a band at some places, shape (2, n)."""
-        x, y = np.asarray(artist(pc, visual, panel).get_paths()[0].vertices).T
+        x, y = np.asarray(artist(figure, gid, name).get_paths()[0].vertices).T
         there = [y[np.isclose(x, place, atol=1e-9)] for place in at]
         return np.array([[v.min() for v in there], [v.max() for v in there]])
 
-    def texts(pc: Any) -> list[str]:
-        (legend,) = pc.viz["figure"].item().legends
+    def texts(figure: Figure) -> list[str]:
+        (legend,) = figure.legends
         return [text.get_text() for text in legend.get_texts()]
 
-    return SimpleNamespace(artist=artist, xy=xy, sides=sides, texts=texts)
+    return SimpleNamespace(
+        artist=artist, xy=xy, sides=sides, texts=texts, panel=panel, panels=panels
+    )
+
+
+@pytest.fixture(autouse=True)
+def _close_figures() -> Iterator[None]:
+    """Close the figures of a test, which stay readable."""
+    yield
+    plt.close("all")
 
 
 @pytest.fixture(scope="session")
@@ -166,7 +187,7 @@ def pictures(
         ),
         "optimizer": lambda **k: prb.plots.plot_optimizer(optimum, **k),
         "landscape": lambda **k: prb.plots.plot_landscape(optimum, points=21, **k),
-        "curve": lambda **k: prb.plots.plot_landscape(optimum, pair="sigma", points=21, **k),
+        "curve": lambda **k: prb.plots.plot_landscape(optimum, var_names="sigma", points=21, **k),
         "stages": lambda **k: prb.plots.plot_stages(posterior, **k),
         "comparison": lambda **k: prb.plots.plot_comparison(comparison, **k),
         "scores": lambda **k: prb.plots.plot_comparison(comparison, scores=True, **k),

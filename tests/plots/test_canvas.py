@@ -8,10 +8,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 import prbayes as prb
-from prbayes.plots.canvas import draw_legend, metric_label, named, round_ticks, scale_by_decades
+from prbayes.plots.canvas import finish, metric_label, named, round_ticks, scale_by_decades
 
 PICTURES = ["responses", "ecdf", "outputs", "population", "posterior", "optimizer"]
 PICTURES += ["landscape", "curve", "stages", "comparison", "scores"]
@@ -26,8 +27,10 @@ def test_every_picture_is_drawn_with_labels(
     if picture == "outputs":
         labels = {"frame": "FRAME", "first": "FIRST", "mu": "MEAN"}
     pc = pictures[picture](labels=labels)
-    panels = [pc.get_target(name, {}) for name in pc.data.data_vars]
-    texts = {text for panel in panels for text in (panel.get_xlabel(), panel.get_ylabel())}
+    figure = pc if isinstance(pc, Figure) else pc.viz["figure"].item()
+    texts = {
+        x for axis in figure.axes for x in (axis.get_xlabel(), axis.get_ylabel(), axis.get_title())
+    }
     assert texts & set(labels.values())
     assert not texts & (set(labels) - {"x", "y"})
     pc.savefig(tmp_path / "picture.png", dpi=60)
@@ -50,8 +53,28 @@ def test_settings_of_the_collection_are_passed_on(posterior: xr.DataTree) -> Non
     assert pc.viz["row_index"]["sigma"].item() == 1
     figure = prb.plots.plot_posterior(posterior, figsize=(9, 3)).viz["figure"]
     assert tuple(figure.item().get_size_inches()) == (9, 3)
-    with pytest.raises(TypeError, match=r"backend: got str 'plotly', expected none"):
-        prb.plots.plot_posterior(posterior, backend="plotly")
+    sizes = {"figsize": (9, 3), "col_wrap": 1, "figure_kwargs": {"facecolor": "0.9"}}
+    drawn = prb.plots.plot_stages(posterior, **sizes)
+    assert tuple(drawn.get_size_inches()) == (9, 3)
+    assert drawn.axes[1].get_subplotspec().rowspan.start == 1
+    assert drawn.get_facecolor()[0] == pytest.approx(0.9)
+    with pytest.raises(TypeError, match=r"backend: got str 'plotly', expected figsize, col_wrap"):
+        prb.plots.plot_stages(posterior, backend="plotly")
+
+
+def test_a_notebook_shows_a_figure_once(
+    monkeypatch: pytest.MonkeyPatch, posterior: xr.DataTree
+) -> None:
+    """IPython displays the last value of a cell, then pyplot its open figures."""
+    own = plt.figure()
+    figure: Any = prb.plots.plot_stages(posterior)
+    with pytest.raises(NotImplementedError):
+        figure._ipython_display_()
+    assert plt.fignum_exists(figure.number)
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "inline")
+    with pytest.raises(NotImplementedError):
+        figure._ipython_display_()
+    assert plt.get_fignums() == [own.number]
 
 
 @pytest.mark.parametrize(("width", "columns"), [(3, 1), (5, 2), (12, 4)])
@@ -60,7 +83,7 @@ def test_legend_entries_are_in_rows_of_equal_length_that_fit(width: float, colum
     for axis in axes:
         for text in ("a first entry", "a second entry", "a third entry", "a fourth one"):
             axis.plot([0, 1], label=text)
-    draw_legend(figure, list(axes))
+    finish(figure)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
     assert legend._ncols == columns

@@ -18,11 +18,12 @@ def test_a_comparison_has_a_row_for_each_result(
     table = comparison.sel(hyperparameter="sigma")
     for i, row in ((0, 1.0), (1, 0.0)):
         ends = [float(table[k][i]) for k in ("lower", "upper")]
-        np.testing.assert_allclose(read.xy(pc, f"interval_{i}", "sigma"), [ends, [row, row]])
+        segment = read.artist(pc, "interval", "sigma").get_segments()[i]
+        np.testing.assert_allclose(segment.T, [ends, [row, row]])
         np.testing.assert_allclose(
             read.xy(pc, "estimate", "sigma")[:, i], [float(table.estimate[i]), row]
         )
-    axis = pc.viz["plot"]["sigma"].item()
+    axis = read.panel(pc, "sigma")
     at = dict(zip(axis.get_yticks(), [t.get_text() for t in axis.get_yticklabels()], strict=True))
     assert at == {1.0: "optimum", 0.0: "draws"}
     np.testing.assert_allclose(read.xy(pc, "first", "sigma")[0], optimum.point["sigma"])

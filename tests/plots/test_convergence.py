@@ -16,10 +16,10 @@ def test_the_trace_is_in_the_users_units(
     pc = drawn("optimizer")
     trace = optimum.search.trace
     evaluations, theta = trace["evaluations"], trace["theta"]
-    np.testing.assert_allclose(read.xy(pc, "asked", "mu"), [evaluations, theta[:, 0]])
+    np.testing.assert_allclose(read.xy(pc, "evaluated", "mu"), [evaluations, theta[:, 0]])
     np.testing.assert_allclose(read.xy(pc, "path", "sigma"), [evaluations, np.exp(theta[:, 1])])
     np.testing.assert_allclose(read.xy(pc, "optimum", "sigma")[1], optimum.point["sigma"])
-    _, y = read.xy(pc, "best", "discrepancy")
+    _, y = read.xy(pc, "lowest", "discrepancy")
     assert y[-1] == pytest.approx(optimum.discrepancy, rel=1e-6)
     assert (np.diff(y) <= 0).all()
 
@@ -29,7 +29,7 @@ def test_stages_by_chain(read: SimpleNamespace, drawn: Any) -> None:
     np.testing.assert_allclose(read.xy(pc, "chain_0", "accept_rate"), [[1, 2, 3], [0.2, 0.3, 0.4]])
     np.testing.assert_allclose(read.xy(pc, "chain_1", "accept_rate"), [[1, 2], [0.5, 0.6]])
     np.testing.assert_allclose(read.xy(pc, "chain_0", "beta"), [[1, 2, 3], [1e-3, 0.1, 1]])
-    assert pc.viz["plot"]["beta"].item().get_yscale() == "log"
+    assert read.panel(pc, "beta").get_yscale() == "log"
     np.testing.assert_allclose(read.xy(pc, "chain_1", "log_marginal_likelihood"), [[2], [-4]])
     assert read.texts(pc) == ["chain 0", "chain 1"]
 

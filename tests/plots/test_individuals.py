@@ -29,27 +29,37 @@ def tree(width: int) -> xr.DataTree:
 def test_specimens_and_readings(read: SimpleNamespace) -> None:
     data = tree(2)
     pc = plot_individuals(data, prob=0.8)
-    offsets = pc.viz["mean"]["k"].item().get_offsets()
+    offsets = read.artist(pc, "mean", "k").get_offsets()
     mean = data["posterior"]["k"].mean(("chain", "draw")).values
     np.testing.assert_allclose(offsets[:, 1], np.sort(mean))
-    _, y = pc.viz["interval"]["k"].item().get_data()
-    low, high = data["posterior"]["k"].quantile([0.1, 0.9], ("chain", "draw")).values
-    np.testing.assert_allclose(y[0::3], low[np.argsort(mean)])
-    np.testing.assert_allclose(y[1::3], high[np.argsort(mean)])
-    assert sorted(pc.viz["observed"].data_vars) == ["y[0.0]", "y[0.5]"]
-    places = pc.viz["observed"]["y[0.5]"].item().get_offsets()
+    y = np.array(read.artist(pc, "interval", "k").get_segments())[..., 1]
+    sides = data["posterior"]["k"].quantile([0.1, 0.9], ("chain", "draw")).values
+    np.testing.assert_allclose(y.T, sides[:, np.argsort(mean)])
+    assert read.panels(pc, "observed") == ["y[0.0]", "y[0.5]"]
+    places = read.artist(pc, "observed", "y[0.5]").get_offsets()
     np.testing.assert_allclose(places[:, 0], [5.0, 7.0, 6.0])
     np.testing.assert_allclose(places[:, 1], data["observed_data"]["y"][:, 1])
 
 
-def test_a_curve_has_one_panel() -> None:
+def test_a_curve_has_one_panel(read: SimpleNamespace) -> None:
     data = tree(8)
     pc = plot_individuals(data, prob=0.8)
-    assert list(pc.viz["observed"].data_vars) == ["y"]
-    x, y = pc.viz["median"]["y"].item().get_data()
+    assert read.panels(pc, "observed") == ["y"]
+    x, y = read.xy(pc, "median", "y")
     np.testing.assert_allclose(x, np.arange(8) / 2)
     expected = data["posterior_predictive"]["y"].median(("chain", "draw", "specimen"))
     np.testing.assert_allclose(y, expected)
+
+
+def test_some_specimens_and_outputs(read: SimpleNamespace) -> None:
+    coords = {"specimen": [0, 2], "time": 0.5}
+    figure = plot_individuals(tree(2), coords=coords, var_names="y")
+    assert [axis.get_label() for axis in figure.axes] == ["y[0.5]"]
+    assert read.xy(figure, "observed", "y[0.5]")[0].tolist() == [5.0, 6.0]
+    with pytest.raises(KeyError, match="got 9, expected some of"):
+        plot_individuals(tree(2), coords={"specimen": 9})
+    with pytest.raises(KeyError, match=r"got \['depth'\], expected some of the dimensions"):
+        plot_individuals(tree(2), coords={"depth": 9})
 
 
 def test_another_tree_is_refused() -> None:

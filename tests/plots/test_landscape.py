@@ -28,7 +28,7 @@ def test_the_landscape_is_not_turned_over(
     np.testing.assert_allclose(read.xy(pc, "path", "landscape"), [trace[:, 0], np.exp(trace[:, 1])])
     mark = read.xy(pc, "optimum", "landscape")[:, 0]
     np.testing.assert_allclose(mark, [point["mu"], point["sigma"]])
-    axis = pc.viz["plot"]["landscape"].item()
+    axis = read.panel(pc, "landscape")
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("mu", "sigma")
     paths = read.artist(pc, "landscape", "landscape").get_paths()
     (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
@@ -40,7 +40,7 @@ def test_the_landscape_is_not_turned_over(
     assert (np.diff(np.array(layers)[order]) >= 0).all()
     assert len(set(layers)) > 3
     # The colours are of roots: the height above the lowest is the square of the place on the bar
-    bar = pc.viz["figure"].item().axes[-1]
+    bar = pc.axes[-1]
     assert bar.get_ylabel() == "discrepancy (area metric)"
     values = np.array([text.get_text() for text in bar.get_yticklabels()], dtype=float)
     above = (values - values[0]) / (values[-1] - values[0])
@@ -55,9 +55,9 @@ def test_a_curve_over_one_hyperparameter(
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([np.full(x.size, optimum.theta[0]), np.log(x)])
     np.testing.assert_allclose(y, optimum.evaluator(thetas).discrepancies[:, 0])
-    assert pc.viz["plot"]["landscape"].item().get_title() == "mu fixed at the optimum"
+    assert read.panel(pc, "landscape").get_title() == "mu fixed at the optimum"
     np.testing.assert_allclose(read.xy(pc, "optimum", "landscape")[0], optimum.point["sigma"])
-    assert "asked" not in pc.viz
+    assert not read.panels(pc, "evaluated")
 
 
 def test_other_optima_are_marked(read: SimpleNamespace) -> None:
@@ -65,12 +65,14 @@ def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
     pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), points=21)
     np.testing.assert_allclose(read.xy(pc, "local_optima", "landscape")[0], -optimum.theta)
-    path = read.xy(pc, "asked", "landscape")[0]
+    path = read.xy(pc, "evaluated", "landscape")[0]
     largest = np.abs(optimum.search.trace["theta"]).max()
     np.testing.assert_allclose(np.abs(path).max(), largest)
 
 
-def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.Model]) -> None:
+def test_a_landscape_that_costs_responses_says_how_many(
+    build: Callable[..., pm.Model], read: SimpleNamespace
+) -> None:
     model = build(prb.Resimulated(64))
     found = prb.minimize(model)
     with pytest.raises(
@@ -78,11 +80,11 @@ def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.
         match=r"got responses=0, expected at least 1600: 25 points with 64 responses each",
     ):
         prb.plots.plot_landscape(found, points=5)
-    assert "landscape" in prb.plots.plot_landscape(found, points=5, responses=1600).viz
+    assert read.panels(prb.plots.plot_landscape(found, points=5, responses=1600), "landscape")
     with pytest.raises(
-        KeyError, match=r"pair: got \['mu', 'nu'\], expected one or two of \['mu', 'sigma'\]"
+        KeyError, match=r"var_names: got \['nu'\], expected some of \['mu', 'sigma'\]"
     ):
-        prb.plots.plot_landscape(found, pair=["mu", "nu"])
+        prb.plots.plot_landscape(found, var_names=["mu", "nu"])
 
 
 def test_the_landscape_of_another_metric(
@@ -93,7 +95,7 @@ def test_the_landscape_of_another_metric(
         prb.Simulator(
             "y", np.positive, x, metric=prb.ProbabilityResidual(), observed=known.observed
         )
-    pc = prb.plots.plot_landscape(optimum, model=other, pair="mu", points=9)
+    pc = prb.plots.plot_landscape(optimum, model=other, var_names="mu", points=9)
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])

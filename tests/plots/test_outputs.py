@@ -33,7 +33,7 @@ def test_specimens_with_both_outputs_names_units_and_correlations(
     points = read.xy(pc, "measured", "second, first")
     is_complete = np.isfinite(pair.observed).all(axis=1)
     np.testing.assert_allclose(points.T, pair.observed[is_complete])
-    axis = pc.viz["plot"]["second, first"].item()
+    axis = read.panel(pc, "second, first")
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("first (Hz)", "second (Hz)")
     r = stats.spearmanr(pair.observed[is_complete]).statistic
     # Of normal values 6 / pi arcsin(.8 / 2) = .786
@@ -44,11 +44,11 @@ def test_specimens_with_both_outputs_names_units_and_correlations(
         "measured",
     ]
     count = pair.calls()
-    named = prb.plots.plot_outputs(
+    figure = prb.plots.plot_outputs(
         pair.posterior, model=pair.model, before=False, labels={"first": "F"}
     )
-    assert named.viz["plot"]["second, first"].item().get_xlabel() == "F"
-    assert "before_50" not in named.viz
+    assert read.panel(figure, "second, first").get_xlabel() == "F"
+    assert not read.panels(figure, "before_50")
     assert pair.calls() == count
 
 
@@ -89,44 +89,46 @@ def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
     data = np.column_stack([np.full(5, 0.1), np.arange(5.0), np.arange(5.0) ** 2])
     outputs = Outputs(("none", "one", "two"))
     node: Any = SimpleNamespace(name="y", outputs=outputs, observed=data, weights=np.full(5, 0.2))
+    node.inputs = SimpleNamespace(groups=None)
     evaluator: Any = SimpleNamespace(simulators=[node])
-    assert [output.name for output in _shown_outputs(evaluator, 0, None)] == ["y[one]", "y[two]"]
+    k, shown = _shown_outputs(evaluator, None, None, None)
+    assert k == 0
+    assert [output.name for output in shown] == ["y[one]", "y[two]"]
 
 
-def pairs(pc: Any) -> list[str]:
+def pairs(figure: Any) -> list[str]:
     """Return the pairs that are drawn."""
-    return list(pc.viz["measured"].data_vars)
+    return [axis.get_label() for axis in figure.axes]
 
 
 @pytest.mark.long
 def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
-    pc = prb.plots.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], **how)
-    assert pairs(pc) == ["r\u2215s, p", "u, p", "u, r\u2215s"]
-    axes = np.array(pc.viz["figure"].item().axes, dtype=object).reshape(2, 2)
-    assert [axis.axison for axis in axes.ravel()] == [True, False, True, True]
-    assert axes[0, 0].get_xlabel() == axes[1, 1].get_ylabel() == ""
-    assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("five: p", "five: u")
+    pc = prb.plots.plot_outputs(several.posterior, coords={"name": ["p", "r/s", "u"]}, **how)
+    assert pairs(pc) == ["r/s, p", "u, p", "u, r/s"]
+    first, below, last = pc.axes
+    assert first.get_xlabel() == last.get_ylabel() == ""
+    assert (below.get_xlabel(), below.get_ylabel()) == ("five: p", "five: u")
     every = prb.plots.plot_outputs(several.posterior, **how)
     assert len(pairs(every)) == 10
 
 
 def test_of_a_curve_some_places_are_drawn(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
-    pc = prb.plots.plot_outputs(several.posterior, simulator="curve", **how)
+    pc = prb.plots.plot_outputs(several.posterior, var_names="curve", **how)
     assert pairs(pc)[-1] == "5.5, 3.5"
     assert len(pairs(pc)) == 6
-    chosen = prb.plots.plot_outputs(several.posterior, simulator="curve", outputs=[0.5, "5"], **how)
+    chosen = prb.plots.plot_outputs(several.posterior, coords={"hour": [0.5, 5.0]}, **how)
     assert pairs(chosen) == ["5, 0.5"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "error", "match"),
     [
-        ({"simulator": "one"}, KeyError, r"'one', expected one of \['five', 'curve'\]"),
-        ({"outputs": ["p"]}, ValueError, "got 1 outputs, expected two to 7"),
-        ({"outputs": ["p", "p"]}, ValueError, "expected different ones"),
-        ({"outputs": ["p", "z"]}, KeyError, "got 'z', expected some of"),
+        ({"var_names": "one"}, KeyError, r"got \['one'\], expected some of \['five\[p\]'"),
+        ({"var_names": ["five", "curve"]}, ValueError, r"several simulators, five\[p\] and curve"),
+        ({"coords": {"name": "p"}}, ValueError, "got 1 outputs, expected two to 7"),
+        ({"coords": {"name": ["p", "z"]}}, KeyError, r"name: got \['p', 'z'\], expected some of"),
     ],
 )
 def test_what_is_not_there_is_refused(

@@ -62,17 +62,20 @@ def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
     posterior = xr.DataTree.from_dict({"posterior": draws})
     pc = prb.plots.plot_population(posterior, model=correlated(), prob=0.89)
     pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
-    assert list(pc.viz["region"].data_vars) == list(pc.viz["half"].data_vars) == pairs
+    assert read.panels(pc, "region") == read.panels(pc, "half") == pairs
     # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.
     for name, share in (("region", 0.89), ("half", 0.5)):
-        x, y = pc.viz[name][pairs[0]].item().get_data()
+        x, y = read.xy(pc, name, pairs[0])
         reach = np.sqrt(stats.chi2.ppf(share, 2))
         np.testing.assert_allclose([np.nanmax(x) - 1, 1 - np.nanmin(x)], reach, rtol=0.06)
         np.testing.assert_allclose([np.nanmax(y) - 2, 2 - np.nanmin(y)], 2 * reach, rtol=0.06)
         top = x[np.nanargmax(y)] - 1
         assert top == pytest.approx(0.6 * reach, abs=0.3 * reach)
-    titles = [axis.get_title() for axis in pc.viz["region"][pairs[0]].item().figure.axes]
-    assert any("correlation 0.6" in title for title in titles)
+    assert "correlation 0.6" in read.panel(pc, pairs[0]).get_title()
+    coords = {"loads_dim_0": [0, 2]}
+    some = prb.plots.plot_population(posterior, model=correlated(), coords=coords)
+    labels = [axis.get_label() for axis in some.axes]
+    assert labels == ["loads[0]", "loads[2]", "z", "loads[2], loads[0]"]
 
 
 def two_inputs(propagation: Propagation) -> tuple[pm.Model, list[object]]:

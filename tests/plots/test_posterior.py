@@ -12,39 +12,61 @@ from scipy import stats
 import prbayes as prb
 
 
+def artist(pc: Any, visual: str, name: str, distribution: str) -> Any:
+    return pc.viz[visual][name].sel(distribution=distribution).item()
+
+
 def test_the_posterior_stands_against_the_optimum(
-    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
+    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace
 ) -> None:
     pc = prb.plots.plot_posterior(posterior, optimum=optimum, model=optimum.model, prob=0.8)
     for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
-        x, y = read.xy(pc, "posterior", name)
+        x, y = artist(pc, "dist", name, "posterior").get_data()
         expected = stats.norm.pdf(x, draws.mean(), draws.std())
         np.testing.assert_allclose(y, expected, atol=0.25 * expected.max())
         assert np.trapezoid(y, x) == pytest.approx(1, abs=0.02)
-        np.testing.assert_allclose(read.xy(pc, "interval", name)[0], np.quantile(draws, [0.1, 0.9]))
-        np.testing.assert_allclose(read.xy(pc, "mean", name)[0], draws.mean())
         center, error = optimum.point[name], optimum.stderr[name]
-        np.testing.assert_allclose(read.xy(pc, "optimum", name)[0], center)
-        np.testing.assert_allclose(
-            read.xy(pc, "stderr", name)[0], center + error * np.array([-1.2816, 1.2816]), rtol=1e-4
-        )
-        x, y = read.xy(pc, "normal", name)
+        x, y = artist(pc, "dist", name, "optimum").get_data()
         np.testing.assert_allclose(y, stats.norm.pdf(x, center, error))
-        visuals = ("interval", "mean", "stderr", "optimum")
-        rows = {visual: float(read.xy(pc, visual, name)[1, 0]) for visual in visuals}
-        assert 0 > rows["interval"] == rows["mean"] > rows["stderr"] == rows["optimum"]
-        assert min(pc.viz["plot"][name].item().get_yticks()) == 0
-    x, y = read.xy(pc, "prior", "sigma")
+        intervals = {
+            "posterior": (np.quantile(draws, [0.1, 0.9]), draws.mean()),
+            "optimum": (center + error * np.array([-1.2816, 1.2816]), center),
+        }
+        rows = []
+        for distribution, (ends, point) in intervals.items():
+            x, y = artist(pc, "credible_interval", name, distribution).get_data()
+            np.testing.assert_allclose(x, ends, rtol=1e-4)
+            ((at, row),) = artist(pc, "point_estimate", name, distribution).get_offsets()
+            assert at == pytest.approx(point)
+            assert (y == row).all()
+            rows.append(row)
+        assert 0 > rows[0] > rows[1]
+        assert artist(pc, "credible_interval", name, "prior") is None
+    x, y = artist(pc, "dist", "sigma", "prior").get_data()
     np.testing.assert_allclose(y, stats.halfnorm.pdf(x, scale=2), atol=0.06)
+    (legend,) = pc.viz["figure"].item().legends
+    assert [text.get_text() for text in legend.get_texts()] == ["posterior", "optimum", "prior"]
+    assert legend.get_title().get_text().startswith("80% intervals")
 
 
 def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
     pc = prb.plots.plot_posterior(posterior)
-    assert not {"optimum", "normal", "prior"} & set(pc.viz.children)
+    assert pc.data.distribution.values.tolist() == ["posterior"]
     blind = replace(optimum, stderr={"mu": np.inf, "sigma": np.nan})
     pc = prb.plots.plot_posterior(posterior, optimum=blind)
-    assert "optimum" in pc.viz
-    assert "normal" not in pc.viz
+    assert artist(pc, "point_estimate", "mu", "optimum") is not None
+    assert artist(pc, "dist", "mu", "optimum") is None
+
+
+@pytest.mark.parametrize("backend", ["none", "plotly", "bokeh"])
+def test_every_library_of_arviz_draws(
+    backend: str, optimum: prb.Optimum, posterior: xr.DataTree
+) -> None:
+    if backend != "none":
+        pytest.importorskip(backend)
+    pc = prb.plots.plot_posterior(posterior, optimum=optimum, backend=backend, figsize=(8, 3))
+    assert pc.backend == backend
+    assert set(pc.viz["dist"]) == {"mu", "sigma"}
 
 
 def test_some_of_the_variables(posterior: xr.DataTree) -> None:
@@ -55,11 +77,14 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
     tree = xr.DataTree.from_dict({"posterior": many})
 
     def drawn(var_names: Any) -> list[str]:
-        return list(prb.plots.plot_posterior(tree, var_names=var_names).viz["posterior"])
+        return list(prb.plots.plot_posterior(tree, var_names=var_names).viz["dist"])
 
     assert drawn(["rate"]) == ["rate[Adler]", "rate[Busch]"]
     assert drawn("mu") == ["mu"]
-    assert drawn(["rate[Busch]", "mu"]) == ["mu", "rate[Busch]"]
+    assert drawn(["rate[Busch]", "mu"]) == ["rate[Busch]", "mu"]
+    adler = prb.plots.plot_posterior(tree, coords={"supplier": "Adler"}, labels={"mu": "MEAN"})
+    assert list(adler.viz["dist"]) == ["mu", "sigma", "rate[Adler]"]
+    assert adler.viz["plot"]["mu"].item().get_title() == "MEAN"
     with pytest.raises(KeyError, match=r"var_names: got \['nu'\], expected some of \['mu'"):
         drawn(["mu", "nu"])
     with pytest.raises(KeyError, match="var_names: got none"):
@@ -74,9 +99,9 @@ def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
         for name, size in sizes.items()
     }
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
-    drawn = list(prb.plots.plot_posterior(tree).viz["posterior"])
+    drawn = list(prb.plots.plot_posterior(tree).viz["dist"])
     assert drawn == ["chol_stds[0]", "chol_stds[1]", "chol_corr[0]"]
-    drawn = list(prb.plots.plot_posterior(tree, var_names="chol").viz["posterior"])
+    drawn = list(prb.plots.plot_posterior(tree, var_names="chol").viz["dist"])
     assert drawn == ["chol[0]", "chol[1]", "chol[2]"]
 
 

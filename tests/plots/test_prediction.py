@@ -48,18 +48,23 @@ def test_what_failed_and_what_is_missing(read: SimpleNamespace) -> None:
     pc = prb.plots.plot_prediction(measured, predicted)
     assert read.xy(pc, "measured", "later")[1].max() == pytest.approx(0.8)
     assert read.xy(pc, "predicted", "later")[1].max() <= 1 - 40 / 360 + 1e-9
-    title = pc.viz["plot"]["later"].item().get_title()
+    title = read.panel(pc, "later").get_title()
     assert title == "5 measured values, 1 failed"
 
 
-def test_conditions_and_outputs_have_panels() -> None:
+def test_conditions_and_outputs_have_panels(read: SimpleNamespace) -> None:
     both = xr.concat([PREDICTED, 2 * PREDICTED], "part").transpose("chain", "draw", "sample", ...)
     both = both.assign_coords(part=["shaft", "disk"])
     measured = np.column_stack([MEASURED, 2 * MEASURED])
-    pc = prb.plots.plot_prediction(
-        {"cold": MEASURED, "hot": measured}, {"cold": PREDICTED, "hot": both}
+    data = {"cold": MEASURED, "hot": measured}, {"cold": PREDICTED, "hot": both}
+    pc = prb.plots.plot_prediction(*data)
+    assert read.panels(pc, "measured") == ["cold", "hot[shaft]", "hot[disk]"]
+    disk = prb.plots.plot_prediction(*data, coords={"part": "disk"})
+    assert read.panels(disk, "measured") == ["cold", "hot[disk]"]
+    hot = prb.plots.plot_prediction(
+        *data, var_names="o", filter_vars="like", coords={"part": ["shaft"]}
     )
-    assert list(pc.viz["measured"]) == ["cold", "hot[shaft]", "hot[disk]"]
+    assert read.panels(hot, "measured") == ["cold", "hot[shaft]"]
 
 
 def test_what_does_not_belong_together_is_refused() -> None:

@@ -26,7 +26,10 @@ def table() -> xr.Dataset:
 def test_a_factor_has_a_row_with_two_errors(table: xr.Dataset, read: SimpleNamespace) -> None:
     pc = prb.plots.plot_sensitivity(table, labels={"mu": "mean"})
     np.testing.assert_allclose(read.xy(pc, "first", "hyperparameter"), [[0.7, 0.2], [1.12, 0.12]])
-    np.testing.assert_allclose(read.xy(pc, "first_0", "hyperparameter")[0], [0.66, 0.74])
-    np.testing.assert_allclose(read.xy(pc, "total_1", "hyperparameter")[0], [0.28, 0.32])
-    axis = pc.viz["plot"]["hyperparameter"].item()
+    segments = [read.artist(pc, f"{x}_error", "hyperparameter") for x in ("first", "total")]
+    np.testing.assert_allclose(segments[0].get_segments()[0][:, 0], [0.66, 0.74])
+    np.testing.assert_allclose(segments[1].get_segments()[1][:, 0], [0.28, 0.32])
+    axis = read.panel(pc, "hyperparameter")
     assert [t.get_text() for t in axis.get_yticklabels()] == ["mean", "sigma"]
+    (axis,) = prb.plots.plot_sensitivity(table, var_names="~x").axes
+    assert axis.get_label() == "hyperparameter"

@@ -1,9 +1,9 @@
 """The u-values of a validity test against their envelope."""
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
-import arviz as az
 import numpy as np
 import pytest
 
@@ -35,35 +35,35 @@ def shoelace(corners: np.ndarray[Any, Any]) -> float:
 
 
 @pytest.mark.parametrize(("shift", "folded"), [(0.0, False), (1.2, False), (0.0, True)])
-def test_the_shaded_area_is_the_statistic(shift: float, folded: bool) -> None:
+def test_the_shaded_area_is_the_statistic(
+    shift: float, folded: bool, read: SimpleNamespace
+) -> None:
     test = validity(shift, folded)
     pc = prb.plots.plot_validity(test)
-    assert isinstance(pc, az.PlotCollection)
-    assert shoelace(polygon(pc.viz["area"]["u"].item())) == pytest.approx(test.statistic, abs=1e-9)
-    line = pc.viz["ecdf"]["u"].item()
+    assert shoelace(polygon(read.artist(pc, "area", "u"))) == pytest.approx(
+        test.statistic, abs=1e-9
+    )
+    line = read.artist(pc, "ecdf", "u")
     tested = np.abs(2 * test.u_values - 1) if folded else test.u_values
     x, y = line.get_xdata(), line.get_ydata()
     np.testing.assert_allclose(np.interp(0.5, x, y), (tested <= 0.5).mean(), atol=1e-12)
-    np.testing.assert_array_equal(pc.viz["identity"]["u"].item().get_xdata(), [0, 1])
+    np.testing.assert_array_equal(read.xy(pc, "identity", "u")[0], [0, 1])
 
 
 def test_the_verdict_stands_in_the_title() -> None:
     for shift, verdict, sign in ((0.0, "not rejected", "<"), (1.2, "rejected", ">")):
         test = validity(shift)
-        axis = prb.plots.plot_validity(test).viz["plot"]["u"].item()
+        axis = prb.plots.plot_validity(test).axes[0]
         expected = f"area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}: {verdict}"
         assert axis.get_title() == f"p = {test.p_value:.2g}, level 5%\n{expected}"
         assert axis.get_xlabel() == "u-value"
-    assert (
-        prb.plots.plot_validity(validity(0.0, True)).viz["plot"]["u"].item().get_xlabel()
-        == "|2u - 1|"
-    )
+    assert prb.plots.plot_validity(validity(0.0, True)).axes[0].get_xlabel() == "|2u - 1|"
 
 
-def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
+def test_the_envelope_holds_the_ecdf_of_a_right_model(read: SimpleNamespace) -> None:
     for shift, inside in ((0.0, True), (1.2, False)):
         test = validity(shift)
-        path = prb.plots.plot_validity(test).viz["envelope"]["u"].item().get_paths()[0]
+        path = read.artist(prb.plots.plot_validity(test), "envelope", "u").get_paths()[0]
         v = np.linspace(0.011, 0.989, 200)
         low, high = (np.searchsorted(test.envelope[i], v, side="right") / 20 for i in (1, 0))
         ecdf = np.searchsorted(np.sort(test.u_values), v, side="right") / 20
@@ -76,9 +76,8 @@ def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
 def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
     small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
     pc = prb.plots.plot_validity({"all": validity(), "some": small})
-    axes = pc.viz["plot"]
-    assert [axes[n].item().get_title().split(",")[0] for n in ("all", "some")] == ["all", "some"]
-    assert [axes[n].item().get_ylabel() for n in ("all", "some")] == [
+    assert [axis.get_title().split(",")[0] for axis in pc.axes] == ["all", "some"]
+    assert [axis.get_ylabel() for axis in pc.axes] == [
         "share of 20 values",
         "share of 7 values",
     ]
@@ -99,24 +98,26 @@ def of_outputs(folded: bool = False) -> prb.validation.ValidityTest:
 @pytest.mark.parametrize("folded", [False, True])
 def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic(
     folded: bool,
+    read: SimpleNamespace,
 ) -> None:
     test = of_outputs(folded)
     pc = prb.plots.plot_validity(test)
     expected = {"identity", "folded"} if folded else {"identity", "folded", "ecdf"}
-    assert set(pc.viz.children) & {"area", "envelope", "identity", "ecdf", "folded"} == expected
+    gids = {artist.get_gid() for artist in pc.findobj()}
+    assert gids & {"area", "envelope", "identity", "ecdf", "folded"} == expected
     # The areas of the lines make the statistic, shared by numbers of values
     directions = in_directions(test)
     assert [u.size for u in directions] == [12] * len(directions)
     alone = test.u_values[test.conditions == "b"]
     mean = 0.0
     for line in expected - {"identity"}:
-        x, y = pc.viz[line]["u"].item().get_data()
+        x, y = read.xy(pc, line, "u")
         parts = np.split(np.arange(x.size), np.flatnonzero(np.isnan(x)))
         # Of one output the area of u alone
         drawn = [alone, *directions] if folded or line == "ecdf" else directions
         for part, u in zip(parts, drawn, strict=True):
             known = part[~np.isnan(x[part])]
-            at, (low, high) = _between(x[known], y[known])
+            at, low, high = _between(x[known], y[known])
             area = np.trapezoid(high - low, at)
             share = 1.0 if folded or u is alone else 0.5
             mean += area * share * u.size / test.u_values.size
@@ -125,7 +126,7 @@ def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic
 
 def test_the_title_of_outputs_has_the_mean_area_and_p() -> None:
     test = of_outputs()
-    axis = prb.plots.plot_validity(test).viz["plot"]["u"].item()
+    axis = prb.plots.plot_validity(test).axes[0]
     assert axis.get_title().startswith(f"p = {test.p_value:.2g}, level 5%\nmean area 0.")
     assert axis.get_ylabel() == f"share of values in each of {len(in_directions(test))} directions"
     assert in_directions(validity()) == []

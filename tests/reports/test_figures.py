@@ -77,7 +77,10 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     # The others are for several outputs, a decision, and data of a test
     assert set(calls) == set(figures.ILLUSTRATIONS) - {"outputs", "sensitivity", "prediction"}
     assert calls["responses"] == calls["population"] == ((posterior,), {"model": model})
-    assert calls["posterior"] == ((posterior,), {"optimum": optimum, "model": model})
+    assert calls["posterior"] == (
+        (posterior,),
+        {"optimum": optimum, "model": model, "backend": "matplotlib"},
+    )
     assert calls["optimizer"] == ((optimum,), {"col_wrap": 2})
     assert calls["landscape"] == ((optimum,), {"model": model})
     assert calls["validity"] == ((test,), {})

@@ -183,8 +183,7 @@ def test_outputs_and_units_are_those_of_the_model_in_a_result_alone(frame: Any) 
         about, listed = data(material)
         assert listed.text[1] == "k: 1.000, 2.000, 4.000."
         assert about.table["units"].tolist() == ["N/mm"]
-    picture = prb.plots.plot_responses(optimum)
-    assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"
+    assert prb.plots.plot_responses(optimum).axes[0].get_xlabel() == "k (N/mm)"
 
 
 def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
