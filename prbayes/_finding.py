@@ -51,6 +51,11 @@ class Finding:
         return f'{sentence}; see prb.help("{self.code}"){period}'
 
 
+def counted(n: int, noun: str, plural: str = "") -> str:
+    """Return a number with a noun, in the plural unless the number is one."""
+    return f"{n} {noun}" if n == 1 else f"{n} {plural or f'{noun}s'}"
+
+
 def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
     """Log findings by the logger ``prbayes``, each in a record with its ``code``; return them."""
     for finding in findings:

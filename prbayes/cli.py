@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add("files", nargs="+", type=Path, metavar="FILE.nc", help=kinds)
     add("--title", help="by default the name of the first file")
     add("--author", default="", help="below the title")
-    add("--date", default="", help="below the title; none is made up")
+    add("--date", help="below the title; that of the results by default")
     add("--out", type=Path, metavar="REPORT.html", help="report.html by default")
     add("--force", action="store_true", help="replace files that exist")
     pictures = "write report.md and pictures into a folder"

@@ -358,3 +358,12 @@ def test_specimens_that_fail_are_infinite(propagation: prb.propagation.Propagati
     direct = prb.AreaMetric()(values[0], OBSERVED, weights=weights[0])
     np.testing.assert_allclose(evaluator(theta).discrepancies[0, 0], direct, rtol=1e-12)
     assert np.isfinite(direct)
+
+
+def test_a_model_in_the_place_of_a_number_belongs_into_model() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        prb.Simulator("y", never, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    for function in (prb.sample, prb.sample_smc):
+        with pytest.raises(TypeError, match=r"draws: got Model .*; pass a model as model="):
+            function(model)  # type: ignore[operator]

@@ -93,6 +93,7 @@ def by_specimen() -> prb.Optimum:
 
 
 def aleatory(model: pm.Model) -> Any:
+    optimum()  # the first use
     return next(iter(simulators(model).values())).inputs.aleatory[0]
 
 
@@ -235,3 +236,55 @@ def test_failures_and_missing_values_of_a_prediction_are_shown() -> None:
     x = aleatory(build())
     shown = str(prb.predict(optimum(), lambda x: np.where(x > 2, np.inf, x), x, name="f"))
     assert "inf" in shown
+
+
+def test_tables_have_the_numbers_of_their_results() -> None:
+    drawn = result("individuals")
+    table = drawn.to_dataframe()
+    draws = drawn["posterior"]["x"].isel(specimen=1)
+    row = table[table["specimen"] == drawn["posterior"]["specimen"].values[1]].iloc[0]
+    expected = [draws.mean(), draws.std(), *draws.quantile([0.055, 0.945])]
+    np.testing.assert_allclose(row[["mean", "sd", "lower", "upper"]].astype(float), expected)
+
+    products = result("calibrate_each")
+    table = products.to_dataframe()
+    mu = products["posterior"]["mu"].sel(product="B").values
+    np.testing.assert_allclose(
+        table.loc["B", ["mu", "sd of mu"]].astype(float), [mu.mean(), mu.std()]
+    )
+    assert f"{mu.mean():.4g} ± {mu.std():.2g}" in str(products)
+    assert "0 of 1 rejected" in str(products)
+
+    ranks = result("simulation_based_calibration")
+    assert ranks.to_dataframe().loc["mu", "mean rank"] == ranks["prior_sbc"]["mu"].mean()
+
+    x = aleatory(build())
+    box = prb.decision.p_box(optimum(), np.positive, x, n_draws=50)
+    median = next(line for line in str(box).splitlines() if "50% quantile" in line)
+    mean, low, to, high = median.split()[2:6]
+    assert float(mean) == pytest.approx(optimum().point["mu"], abs=0.05)
+    assert float(low) < float(mean) < float(high)
+    assert to == "to"
+
+    predicted = prb.predict(optimum(), two, x, n_samples=500)
+    first, second = (line.split() for line in str(predicted).splitlines()[2:4])
+    assert [first[0], second[0]] == ["two[first]", "two[second]"]
+    np.testing.assert_allclose(
+        np.array(first[1:], dtype=float),
+        [
+            *(predicted.sel(output="first").mean(), predicted.sel(output="first").std()),
+            *predicted.sel(output="first").quantile([0.05, 0.5, 0.95]),
+        ],
+        rtol=1e-3,
+    )
+
+
+def test_outputs_of_a_mapping_keep_their_names_when_runs_are_known() -> None:
+    x = aleatory(build())
+
+    def fresh(x: Any) -> Any:
+        return {"up": x, "down": -x}
+
+    for _ in range(2):
+        drawn = prb.predict(optimum(), fresh, x, n_samples=50)
+        assert drawn["output"].values.tolist() == ["up", "down"]

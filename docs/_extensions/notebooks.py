@@ -1,8 +1,8 @@
 """Downloads of executed pages as notebooks, with outputs, that run in an empty folder."""
 
 import base64
-import json
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ FOLDER = "notebooks"  # in the site
 LINK = "This page as a notebook"
 _EXECUTED = re.compile(r"\A---\n.*?^file_format: mystnb$.*?^---$", re.S | re.M)
 _HEADING = re.compile(r"^# .+$", re.M)
-_ROLE = re.compile(r"\{[\w:]+\}`(?:([^`<]*?) *<[^`>]*>|([^`]*))`")
+_ROLE = re.compile(r"(?<!`)\{[\w:]+\}`(?:([^`<]*?) *<[^`>]*>|([^`]*))`")
 _FENCE = re.compile(r"^(`{3,}|:{3,})\{(\w+)\}([^\n]*)\n(.*?)^\1$\n?", re.S | re.M)
 _OPTION = re.compile(r"^:(\w+): *(.*)\n", re.M)
 _PAGE = re.compile(r"(?<!!)\[([^]]*)\]\((?!\))(?:[\w./-]+\.md)?(?:#[\w.-]+)?\)")
@@ -134,19 +134,25 @@ def with_link(app: Any, page: str, source: list[str]) -> None:
 
 def write(app: Any, failed: Exception | None) -> None:
     """Write the notebooks of all executed pages into the site."""
+    import nbformat
+    from jupyter_cache import get_cache
+
     if failed is not None or app.builder.format != "html":
         return
+    cache = get_cache(app.env.mystnb_config.execution_cache_path)
     for page in sorted(app.env.found_docs):
         path = Path(app.env.doc2path(page))
         text = path.read_text(encoding="utf-8") if path.suffix == ".md" else ""
         if not is_executed(text):
             continue
-        # Here MyST-NB writes what it has executed.
-        executed = Path(app.outdir).parent / "jupyter_execute" / f"{page}.ipynb"
-        notebook = json.loads(executed.read_text(encoding="utf-8"))
+        # MyST-NB writes a page's cells to this folder, and keeps its outputs in the cache.
+        cells = Path(app.env.mystnb_config.output_folder, f"{page}.ipynb")
+        notebook = nbformat.read(cells, as_version=4)
+        with suppress(KeyError):  # a page that was not executed
+            _, notebook = cache.merge_match_into_notebook(notebook)
         target = Path(app.outdir, FOLDER, f"{page}.ipynb")
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(json.dumps(portable(notebook, path.parent), indent=1), encoding="utf-8")
+        nbformat.write(nbformat.from_dict(portable(notebook, path.parent)), target)
 
 
 def setup(app: Any) -> dict[str, bool]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from prbayes._display import Shown, View
+from prbayes._finding import counted
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate
@@ -181,7 +182,7 @@ class Runs(Shown):
         m, table = 1 if outputs is None else max(1, len(outputs.labels)), len(self.outputs)
         if outputs is not None and m != table:
             raise ValueError(
-                f"{name}: observed: got {m} output(s) for a table of runs with "
+                f"{name}: observed: got {counted(m, 'output')} for a table of runs with "
                 f"{', '.join(self.outputs)}, expected {table}; make prb.Runs of those measured"
             )
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from prbayes._finding import counted
 from prbayes._validate import Floats, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
@@ -172,8 +173,8 @@ def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
     least = max(8, 4 * d)
     if usable < least:
         raise ValueError(
-            f"{caller}: got {usable} runs with responses for {d} input(s), expected at least "
-            f"{least}; add runs, or leave inputs out that do not matter"
+            f"{caller}: got {usable} runs with responses for {counted(d, 'input')}, expected at "
+            f"least {least}; add runs, or leave inputs out that do not matter"
         )
     if n > 4000:  # the time of a surface grows with their cube
         raise ValueError(

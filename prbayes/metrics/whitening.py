@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from prbayes._finding import counted
 from prbayes._stats import quantile
 from prbayes._validate import Floats
 from prbayes.metrics.density import spread
@@ -40,9 +41,10 @@ class Components:
     def summary(self) -> str:
         """The number of components, and the variance that they leave out."""
         return (
-            f"{len(self.axes)} outputs are compared by {self.number} principal component(s), which "
-            f"leave out {self.left_out:.2g} of the variance of the data; neighbours in what is "
-            f"left out are correlated by {self.rest_correlation:.2f}"
+            f"{len(self.axes)} outputs are compared by "
+            f"{counted(self.number, 'principal component')}, without {self.left_out:.2g} of the "
+            "variance of the data; neighbours in what is left out are correlated by "
+            f"{self.rest_correlation:.2f}"
         )
 
     def share_left_out(self, values: Floats, weights: Floats) -> float:

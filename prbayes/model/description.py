@@ -24,6 +24,7 @@ from prbayes.model.random_variable import Node, nodes, response_name
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.response.dims import is_random
+from prbayes.response.inputs import argument_names, unit_of
 from prbayes.response.outputs import Outputs
 
 # Fields of the description of a variable, and of a simulator.
@@ -72,17 +73,20 @@ def _simulator(
 ) -> dict[str, str]:
     """Return the description of a simulator."""
     inputs = []
-    for argument in simulator.inputs.arguments:
+    names = argument_names(simulator.inputs, simulator.responses.function)
+    for name, argument in zip(names, simulator.inputs.arguments, strict=True):
         if isinstance(argument, int):  # the place of an aleatory input
             x = simulator.inputs.aleatory[argument]
             is_known = argument in simulator.inputs.conditions
-            inputs.append(f"condition {x.name}" if is_known else _distribution(x, named))
+            unit = f" ({unit_of(x)})" if unit_of(x) else ""
+            text = _distribution(x, named)
+            inputs.append(f"condition {x.name}" if is_known else f"{name}{unit} ~ {text}")
         elif isinstance(argument, Variable):
             inputs.append(str(argument.name or f"an expression of {_parents(argument, named)}"))
         else:
             value = np.asarray(argument)
             number = f"{value.item():.6g}" if value.size == 1 else ""
-            inputs.append(number or f"an array of shape {value.shape}")
+            inputs.append(f"{name} = {number or f'an array of shape {value.shape}'}")
     specimens = ""
     if simulator.specimens is not None:
         labels = list(dict.fromkeys(map(str, simulator.specimens.tolist())))

@@ -15,7 +15,7 @@ from pytensor import config
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._validate import (
     Floats,
     called,
@@ -690,7 +690,7 @@ def _prepared_metric(
             observed = observed_sample(observed, minimum=least, failures=metric.counts_failures)
         elif len(observed) < 2:
             raise ValueError(
-                f"observed: got {len(observed)} specimen(s), expected at least 2 of them"
+                f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of them"
             )
         target = metric.against(observed, weights)
         if not metric.symbolic:

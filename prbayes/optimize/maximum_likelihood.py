@@ -18,7 +18,7 @@ import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._validate import Floats
 from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
@@ -126,7 +126,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         search=SearchRecord(
             result=Result.CONVERGED if is_converged else Result.FAILED,
             prior=settings.prior,
-            details=f"{len(modes)} local optimum(s) from {len(starts)} starts.",
+            details=f"{counted(len(modes), 'local optimum', 'local optima')} "
+            f"from {counted(len(starts), 'start')}.",
             n_evaluations=objective.count,
             n_screened=n_screened,
             n_computed=n_computed(evaluator),

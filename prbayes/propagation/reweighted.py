@@ -17,7 +17,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
@@ -213,10 +213,10 @@ class Reweighted(Propagation):
         if self.coarse is not None:
             if not self.emulates(inputs):
                 raise TypeError(
-                    f"{name}: coarse: got a coarse response for {inputs.dimensions} aleatory "
-                    f"number(s) and n = {self.n}, expected several continuous numbers for each "
-                    f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
-                    "leave coarse= out"
+                    f"{name}: coarse: got a coarse response for "
+                    f"{counted(inputs.dimensions, 'aleatory number')} and n = {self.n}, expected "
+                    "several continuous numbers for each specimen and at most "
+                    f"{MOST_RUNS} runs, between which something is emulated: leave coarse= out"
                 )
             refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 
@@ -419,14 +419,15 @@ class ReweightedBound(Bound):
         values = np.empty(0)
         if pairs:
             # The design may have other runs, after the first ones in common.
-            _, earlier = pairs[0]
+            previous, earlier = pairs[0]
+            responses.outputs = responses.outputs or previous.outputs  # names of a mapping
             n = min(len(earlier), len(runs))
             equal = np.ones(n, dtype=bool)
             for x, y in zip(earlier.points, runs.points, strict=True):
                 equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
             values = earlier.values[: n if equal.all() else int(equal.argmin())]
             points = self.points_of(responses.inputs, earlier.points)
-            responses.refuse_change(points, earlier.values, pairs[0][0])
+            responses.refuse_change(points, earlier.values, previous)
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]

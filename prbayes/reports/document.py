@@ -17,7 +17,7 @@ import xarray as xr
 
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
-from prbayes.reports.material import gather
+from prbayes.reports.material import date_of, gather, versions_of
 from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section, is_broad, kind_of
 from prbayes.reports.sections import sections_of
@@ -55,8 +55,14 @@ class Report:
     title : str
     sections : tuple of Section
         By default those of the results; with sections, results are not read.
-    author, date : str
-        Below the title. No date is made up.
+    author : str
+        Below the title.
+    date : str, optional
+        By default the day of the latest result, in UTC, which is stored in it; ``""`` for none. An
+        optimum in memory has today's.
+    note : str, optional
+        Below author and date; by default versions of the software, as results have them, and the
+        probability of all intervals: that of `exceedance` in ``decision``, or else 89%.
     model : pymc.Model, optional
         Needed for distributions of populations and for the graph; the rest is in the results.
     optimum : Optimum or xarray.DataTree, or a mapping of such, optional
@@ -98,13 +104,14 @@ class Report:
     >>> optimum = prb.minimize(model)
     >>> report = prb.Report("Shaft stiffness", model=model, optimum=optimum, pictures=False)
     >>> [section.title for section in report.sections if section.level == 2][:3]
-    ['Summary', 'Model', 'Data']
+    ['Not tested', 'Decision', 'Answer']
     """
 
     title: str
     sections: tuple[Section, ...]
     author: str
     date: str
+    note: str
 
     def __init__(
         self,
@@ -112,7 +119,8 @@ class Report:
         sections: Sequence[Section] = (),
         *,
         author: str = "",
-        date: str = "",
+        date: str | None = None,
+        note: str | None = None,
         model: pm.Model | None = None,
         optimum: Optimum | xr.DataTree | Mapping[str, Optimum | xr.DataTree] | None = None,
         posterior: xr.DataTree | Mapping[str, xr.DataTree] | None = None,
@@ -126,7 +134,8 @@ class Report:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
         plain_text(author, "Report: author", empty=True)
-        plain_text(date, "Report: date", empty=True)
+        plain_text(date or "", "Report: date", empty=True)
+        plain_text(note or "", "Report: note", empty=True)
         flag(pictures, "Report: pictures")
         if not isinstance(sections, Sequence):
             raise TypeError(
@@ -138,13 +147,21 @@ class Report:
                 model, optimum, posterior, validity, comparison, decision, validation, labels
             )
             contents = sections_of(material, pictures=pictures)
+            date = date_of(material) if date is None else date
+            if note is None and material.results:
+                names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
+                packages = versions_of(material).items()
+                parts = [f"{names[name]} {version}" for name, version in packages if name in names]
+                note = ", ".join([*parts, f"intervals of {material.prob:.0%} probability"])
         for section in contents:
             if not isinstance(section, Section):
                 got = type(section).__name__
                 raise TypeError(
                     f"Report: sections: got {got}, expected prb.reports.Section objects"
                 )
-        vars(self).update(title=title, sections=contents, author=author, date=date)
+        vars(self).update(
+            title=title, sections=contents, author=author, date=date or "", note=note or ""
+        )
 
     def with_section(self, section: Section, *, after: str | None = None) -> Report:
         """Return a report with one more section.

@@ -12,8 +12,10 @@ from typing import Any
 import pymc as pm
 
 from prbayes._finding import Finding, report
+from prbayes._stats import INTERVAL
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import variable_of
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.convergence import plot_optimizer, plot_stages
 from prbayes.plots.landscape import plot_landscape
@@ -24,7 +26,7 @@ from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.material import Material, kind_of_decision
+from prbayes.reports.material import Material, constants_of, kind_of_decision
 from prbayes.reports.section import Section, image
 
 _log = logging.getLogger("prbayes")
@@ -35,103 +37,80 @@ class Illustration:
     """A picture that a report shows where it has the contents."""
 
     function: Callable[..., Any]  # returns a figure with ``savefig``
-    after: str  # title of the section that it belongs to
     title: str
     alt: str
-    caption: str
+    caption: str = ""
 
 
-# In the order of the report, and within a section in this order.
 ILLUSTRATIONS = {
     "responses": Illustration(
         plot_responses,
-        after="Data",
         title="Measured and calibrated responses",
-        alt="Distribution of the measured responses with that of the calibrated population, "
-        "one panel per simulator or output.",
-        caption="Measured responses and the calibrated population.",
+        alt="Distribution function of the measured responses with that of the calibrated "
+        "population, one panel per simulator or output.",
+        caption="Measured responses and the calibrated population, as shares of the specimens.",
     ),
     "outputs": Illustration(
         plot_outputs,
-        after="Data",
         title="Pairs of outputs",
         alt="Measured specimens as points, one panel per pair of outputs, with outlines of the "
         "calibrated population.",
-        caption="Measured specimens, and regions with 50% and 89% of the calibrated population.",
+        caption="Measured specimens, and regions of the calibrated population.",
     ),
     "optimizer": Illustration(
         plot_optimizer,
-        after="Optimum",
         title="Path of the optimiser",
         alt="Objective, and hyperparameters, against the number of evaluations.",
-        caption="The objective at the points that the optimiser evaluated.",
     ),
     "landscape": Illustration(
         plot_landscape,
-        after="Optimum",
         title="Objective around the optimum",
         alt="Objective over the hyperparameters, with the optimum marked.",
-        caption="The objective around the optimum.",
     ),
     "posterior": Illustration(
         plot_posterior,
-        after="Posterior",
         title="Marginal posteriors",
         alt="Posterior density of each hyperparameter, with its interval.",
-        caption="Posterior distribution of each hyperparameter after the calibration.",
     ),
     "population": Illustration(
         plot_population,
-        after="Posterior",
         title="Calibrated population of the inputs",
         alt="Distribution of each input over the specimens, with a band for its uncertainty.",
-        caption="Variation of the inputs from specimen to specimen.",
     ),
     "stages": Illustration(
         plot_stages,
-        after="Posterior",
         title="Stages of the sampler",
         alt="Tempering, acceptance rate and moves against the stages of the sampler, "
         "one line per chain.",
-        caption="Stages of the sampler from the prior to the posterior.",
     ),
     "comparison": Illustration(
         plot_comparison,
-        after="Comparison",
         title="Estimates side by side",
         alt="Estimate and interval of each result, one panel per hyperparameter.",
-        caption="Estimates with their intervals.",
     ),
     "prediction": Illustration(
         plot_prediction,
-        after="Validity",
         title="Measured and predicted responses",
         alt="Distribution functions of the measured responses, as steps, and of the predicted ones "
         "with a band, one panel per condition or output.",
-        caption="Specimens that were not used in the calibration, beside their prediction; the "
-        "band contains 89% of the populations of the posterior.",
+        caption="Measured values of the test beside their prediction. Steps in the band agree.",
     ),
     "validity": Illustration(
         plot_validity,
-        after="Validity",
         title="Distribution of the u-values",
         alt="Step curve of the sorted u-values against the diagonal, "
         "with the area between them, and of one output an acceptance band.",
-        caption="Places of the measured responses in the predicted distribution. "
-        "A right model is near the diagonal; the shaded area is the statistic. "
-        "With one output, the band contains the whole curve of a right model with probability one "
-        "minus the test's level; several outputs have a line for each direction, and no band. "
-        "Curves of a rejected model are red.",
+        caption="A right model is near the diagonal; the shaded area is the statistic. With one "
+        "output, the whole curve of a right model is in the band with probability one minus the "
+        "test's level; several outputs have a line for each direction. Rejected: red.",
     ),
     "sensitivity": Illustration(
         plot_sensitivity,
-        after="Decision",
-        title="Shares of hyperparameters and inputs",
-        alt="Share of each hyperparameter in the variance of the decision quantity, and of each "
-        "input in that of the response.",
-        caption="Sensitivity of the decision: a dot is the share of a factor by itself, a diamond "
-        "the share that is left when all others are known, with two standard errors to either "
-        "side.",
+        title="Shares of parameters and inputs",
+        alt="Share of each parameter of the population in the variance of the decision quantity, "
+        "and of each input in that of the response.",
+        caption="A dot is the share of a factor by itself, a diamond the share that is left with "
+        "all others known; bars are two standard errors.",
     ),
 }
 
@@ -150,8 +129,10 @@ def requests(m: Material) -> dict[str, Request]:
     # An optimum from a file has no evaluator, hence no population.
     optimum = next(iter(m.live_optima.values()), None)
     # Labels of the model, which has no conditions of a test
-    of_model = {name: text for name, text in m.labels.items() if name not in m.validation}
-    labels = {"labels": of_model} if of_model else {}
+    elsewhere = {*m.validation, *constants_of(m.description)}
+    of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
+    labels: dict[str, Any] = {"labels": of_model} if of_model else {}
+    prob = {"prob": m.prob} if m.prob != INTERVAL else {}
 
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
         """Return as keywords the labels of names in a picture without a model."""
@@ -161,16 +142,19 @@ def requests(m: Material) -> dict[str, Request]:
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
-        requested["population"] = ((result,), {"model": m.model, **labels})
-    if m.model is not None and _computes_responses(m.model):
+        requested["population"] = ((result,), {"model": m.model, **labels, **prob})
+    if m.model is not None and _computes_responses(m.model) and _is_costly(optimum):
         requested["responses"] = "it would recompute responses; call prb.plots.plot_responses"
     elif "population" in requested:
-        requested["responses"] = requested["population"]
+        # Distribution functions: a histogram of a dozen values has boxes above any density
+        of_responses = {"model": m.model, "ecdf": True, "before": False, **labels, **prob}
+        requested["responses"] = ((result,), of_responses)
         if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
-            requested["outputs"] = requested["population"]
+            requested["outputs"] = ((result,), {"model": m.model, **labels})
     if posterior is not None:
         shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        shown = {"optimum": optimum, "model": m.model, "backend": "matplotlib", **shown}
+        shown = {"optimum": optimum, "model": m.model, **shown, **prob}
+        shown["backend"] = "matplotlib"
         requested["posterior"] = ((posterior,), shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
@@ -178,7 +162,7 @@ def requests(m: Material) -> dict[str, Request]:
         requested["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
         if m.model is not None:
             requested["landscape"] = ((optimum,), {"model": m.model, **labels})
-    if m.comparison is not None:
+    if m.comparison is not None and not prob:
         names = m.comparison["hyperparameter"].values
         requested["comparison"] = ((m.comparison,), labels_of(names))
     if m.tests:
@@ -190,36 +174,56 @@ def requests(m: Material) -> dict[str, Request]:
     if m.validation:
         measured = {name: pair[0] for name, pair in m.validation.items()}
         predicted = {name: pair[1] for name, pair in m.validation.items()}
-        requested["prediction"] = ((measured, predicted), labels_of(m.validation))
+        requested["prediction"] = ((measured, predicted), labels_of(m.validation) | prob)
     return requested
 
 
+def _is_costly(optimum: Optimum | None) -> bool:
+    """Return whether responses of the populations of a picture would take ten seconds."""
+    if optimum is None:
+        return True
+    seconds_each = optimum.search.seconds / max(optimum.n_responses, 1)
+    return 100 * optimum.evaluator.responses_per_theta * seconds_each > 10
+
+
 def _computes_responses(model: pm.Model) -> bool:
-    """Return whether a draw of the model's simulators computes responses: a report spends none."""
+    """Return whether a draw of the model's simulators computes responses."""
     return any(not simulator.has_specimens for simulator in population_simulators(model))
 
 
 # -- drawing ---------------------------------------------------------------------------------
 
 
-def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
-    """Return the sections with pictures after those that they belong to."""
-    requested = requests(material)
-    illustrated: list[Section] = []
-    pictures: list[Section] = []
-    for section in sections:
-        if section.level == 2:  # pictures come after all parts of the section before
-            illustrated += pictures
-            pictures = [
-                _picture(illustration, requested[name])
-                for name, illustration in ILLUSTRATIONS.items()
-                if illustration.after == section.title and name in requested
-            ]
-        illustrated.append(section)
-    return (*illustrated, *pictures)
+def pictures_of(m: Material) -> tuple[dict[str, list[Section]], list[Section]]:
+    """Return the pictures by name, and a section on those that could not be made.
+
+    The one of measured values beside predicted ones, or else beside the calibrated population, is
+    called "front".
+    """
+    drawn: dict[str, list[Section]] = {}
+    missing = []
+    for name, request in requests(m).items():
+        picture = _picture(ILLUSTRATIONS[name], request)
+        if isinstance(picture, Section):
+            drawn[name] = [picture]
+        else:
+            missing.append(f"{ILLUSTRATIONS[name].title}: {picture.removesuffix('.')}.")
+    drawn["front"] = drawn.pop("prediction", []) or drawn.pop("responses", [])
+    graph = None if m.model is None else _graph(m.model)
+    if graph is not None:
+        names = ", ".join(variable["name"] for variable in (m.description or {})["variables"])
+        graph_section = Section(
+            "Graph",
+            picture=graph,
+            alt=f"Graph of the model: arrows from its variables ({names}) to the simulators.",
+            caption="Variables of the model; filled: compared with measured responses.",
+            level=3,
+        )
+        drawn["graph"] = [graph_section]
+    return drawn, [Section("Pictures that could not be made", missing, level=3)] if missing else []
 
 
-def _picture(illustration: Illustration, request: Request) -> Section:
+def _picture(illustration: Illustration, request: Request) -> Section | str:
     """Return a picture, or the reason why it is missing."""
     reason = request
     if not isinstance(request, str):
@@ -238,29 +242,10 @@ def _picture(illustration: Illustration, request: Request) -> Section:
                 pyplot.close(figure)
     name = illustration.function.__name__
     report(Finding("no-picture", f"report: no picture by {name}: {reason}"))
-    return Section(illustration.title, f"This picture could not be made: {reason}", level=3)
+    return str(reason)
 
 
 # -- the model's graph -----------------------------------------------------------------------
-
-
-def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...]:
-    """Add the model's graph after the parts of the section on the model, where it can be drawn."""
-    picture = None if m.model is None else _graph(m.model)
-    if picture is None:
-        return sections
-    names = ", ".join(variable["name"] for variable in m.variables)
-    graph = Section(
-        "Graph",
-        picture=picture,
-        alt=f"Graph of the model: arrows from its variables ({names}) to the simulators.",
-        caption="Variables of the model; filled: compared with measured responses.",
-        level=3,
-    )
-    place = [section.title for section in sections].index("Model") + 1
-    while place < len(sections) and sections[place].level == 3:
-        place += 1
-    return (*sections[:place], graph, *sections[place:])
 
 
 def _graph(model: pm.Model) -> bytes | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import from_json
+from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, texts
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
@@ -52,6 +55,7 @@ class Material:
     validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
     # Labels of variables, inputs, simulators and outputs, with units
     labels: Mapping[str, str] = field(default_factory=dict)
+    sheets: Mapping[str, str] = field(default_factory=dict)  # statistics by simulator
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -77,23 +81,31 @@ class Material:
         return dict(_estimates(self.results[label]).attrs)
 
     @property
-    def has_problems(self) -> bool:
-        """Whether a diagnosis found a problem.
+    def problems(self) -> list[str]:
+        """The problems that a diagnosis found, each once.
 
         Specimens that are too few for the standard errors of an optimum are none beside draws.
         """
         accepted = {"few-specimens"} if self.posteriors else set()
-        return any(
-            finding.code not in accepted
+        texts = [
+            str(finding)
             for diagnosis in self.diagnoses.values()
             if diagnosis is not None
             for finding in diagnosis.findings
-        )
+            if finding.code not in accepted
+        ]
+        return list(dict.fromkeys(texts))
 
     @property
     def is_usable(self) -> bool:
         """Whether no test rejected the model, and no diagnosis found a problem."""
-        return not (self.rejected or self.has_problems)
+        return not (self.rejected or self.problems)
+
+    @property
+    def prob(self) -> float:
+        """The probability of all intervals: that of the first probability of a decision."""
+        probs = [t.attrs["prob"] for t in self.decisions.values() if kind_of_decision(t) == "risk"]
+        return float(probs[0]) if probs else INTERVAL
 
     @property
     def is_by_specimen(self) -> bool:
@@ -106,11 +118,6 @@ class Material:
         return bool(flags) and all(flags)
 
     @property
-    def variables(self) -> list[dict[str, Any]]:
-        """The variables of the model; none where they are unknown."""
-        return [] if self.description is None else list(self.description["variables"])
-
-    @property
     def simulators(self) -> list[dict[str, Any]]:
         """The simulators of the model; none where they are unknown."""
         return [] if self.description is None else list(self.description["simulators"])
@@ -119,9 +126,57 @@ class Material:
     def hyperparameters(self) -> list[str]:
         """Names of the hyperparameters, without deterministics where they are known as such."""
         if self.description is not None:
-            return [v["name"] for v in self.variables if v["role"] == "hyperparameter"]
+            variables = self.description["variables"]
+            return [v["name"] for v in variables if v["role"] == "hyperparameter"]
         first = next(iter(self.results.values()), None)
         return [] if first is None else list(map(str, _estimates(first).data_vars))
+
+
+def metrics_of(m: Material) -> dict[str, str]:
+    """Return the metric by simulator; by result as well, where results differ in it."""
+    by_result = {}
+    for label, table in m.calibrations.items():
+        pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
+        by_result[label] = {str(name): str(metric) for name, metric in pairs}
+    if not by_result:
+        return {s["name"]: s["metric"] for s in m.simulators}
+    first, *rest = by_result.values()
+    if all(metrics == first for metrics in rest):
+        return first
+    return {
+        f"{label}, {name}": metric
+        for label, metrics in by_result.items()
+        for name, metric in metrics.items()
+    }
+
+
+def sheets_of(m: Material) -> dict[str, str]:
+    """Return the statistics of each simulator that has a data sheet in place of specimens."""
+    pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
+    found = {name: pattern.fullmatch(metric) for name, metric in metrics_of(m).items()}
+    return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
+
+
+def constants_of(description: Mapping[str, Any] | None) -> set[str]:
+    """Return the names of inputs that are numbers."""
+    texts = [s["inputs"] for s in (description or {}).get("simulators", ())]
+    return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
+
+
+def date_of(m: Material) -> str:
+    """Return the day of the latest result: of an optimum in memory today; nothing if unknown."""
+    days = [str(m.attrs(label).get("created_at", ""))[:10] for label in m.results]
+    if m.live_optima:
+        days.append(datetime.now(UTC).isoformat()[:10])
+    return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
+
+
+def versions_of(m: Material) -> dict[str, str]:
+    """Return versions by package, as the results have them."""
+    attrs = [pair for label in m.results for pair in m.attrs(label).items()]
+    names = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy", "python")
+    versions = {str(key).removesuffix("_version"): str(value) for key, value in attrs}
+    return {name: versions[name] for name in names if name in versions}
 
 
 def gather(
@@ -172,6 +227,7 @@ def gather(
         names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
         if description is not None:
             names |= {str(variable["name"]) for variable in description["variables"]}
+            names |= constants_of(description)
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
@@ -183,7 +239,7 @@ def gather(
         needs_model = not {"optimum", "calibration"} & set(result.children)
         is_possible = own_model is not None or not needs_model
         diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
-    return Material(
+    material = Material(
         model=model,
         description=description,
         optima=optima,
@@ -198,6 +254,10 @@ def gather(
         validation=dict(validation),
         labels=dict(labels or {}),
     )
+    # Statistics of a data sheet are no measured responses
+    sheets = sheets_of(material)
+    sampled = {name: y for name, y in observed.items() if name not in sheets}
+    return replace(material, observed=sampled, sheets=sheets)
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:
@@ -329,8 +389,7 @@ def _observed(
     """Return the measured responses, and their columns, by simulator."""
     if model is not None:
         simulators = population_simulators(model)
-        sampled = [s for s in simulators if not s.metric.exact_likelihood]  # no data sheets
-        observed = {simulator.name: simulator.observed for simulator in sampled}
+        observed = {simulator.name: simulator.observed for simulator in simulators}
         return observed, {simulator.name: simulator.outputs for simulator in simulators}
     observed, outputs = {}, {}
     tree = next((tree for tree in results.values() if "observed_data" in tree), None)

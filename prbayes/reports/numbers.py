@@ -83,9 +83,12 @@ def percentage(share: float) -> str:
     return f"{100 * share:g}%"
 
 
-def probability(p: float) -> str:
-    """Return a p-value after its sign: '= 0.18' or, beyond 9999 replicates, '< 0.001'."""
-    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
+def in_percent(p: float, floor: float = 1e-5) -> str:
+    """Return a probability with two digits, such as '0.47%'; below the floor as such."""
+    if 0 < p < floor:
+        return f"under {100 * floor:g}%"
+    digits = 4 if p > 0.99 else 2
+    return f"{float(f'{100 * p:.{digits}g}'):g}%"
 
 
 def span(values: Any, form: str) -> str:
@@ -93,11 +96,6 @@ def span(values: Any, form: str) -> str:
     low = f"{values.min():{form}}"
     high = f"{values.max():{form}}"
     return low if low == high else f"{low} to {high}"
-
-
-def counted(n: int, noun: str) -> str:
-    """Return a number with a noun."""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def enumerated(items: list[str]) -> str:

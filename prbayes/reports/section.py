@@ -12,6 +12,9 @@ from typing import Any
 from prbayes._validate import plain_text
 from prbayes.reports.numbers import cells
 
+# Signs in front of the titles of verdicts: colour is not all that distinguishes them.
+SIGNS = {"": "", "good": "\u2713", "bad": "\u2717", "open": "?"}
+
 # Beginnings of files (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, marker SOI).
 _BEGINNINGS = (
     (b"\x89PNG\r\n", "png", "image/png"),
@@ -40,6 +43,8 @@ class Section:
         Below the picture.
     level : int
         2 for a section, 3 for a part of the section before it.
+    verdict : str
+        "good", "bad" or "open" for a coloured box, with a sign in front of the title.
 
     Attributes
     ----------
@@ -68,6 +73,7 @@ class Section:
     alt: str
     caption: str
     level: int
+    verdict: str
 
     def __init__(
         self,
@@ -79,6 +85,7 @@ class Section:
         alt: str = "",
         caption: str = "",
         level: int = 2,
+        verdict: str = "",
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Section: title: got {title!r:.60}, expected a text")
@@ -92,6 +99,10 @@ class Section:
         if level not in (2, 3):
             raise ValueError(
                 f"Section: level: got {level!r}, expected 2, or 3 for a part of a section"
+            )
+        if verdict not in SIGNS:
+            raise ValueError(
+                f'Section: verdict: got {verdict!r}, expected "good", "bad", "open" or nothing'
             )
         if table is not None:
             cells(table)  # raises errors of the table now
@@ -109,7 +120,13 @@ class Section:
             alt=alt,
             caption=caption,
             level=level,
+            verdict=verdict,
         )
+
+    @property
+    def heading(self) -> str:
+        """The title, after the sign of a verdict."""
+        return f"{SIGNS[self.verdict]} {self.title}".strip()
 
     @property
     def kind(self) -> str:

@@ -1,21 +1,19 @@
-"""The sections of a report: model, data, metric, optima, posteriors, decision; the order of all."""
+"""How a reader checks the answer: method, diagnostics and appendix; the order of all sections."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes._finding import from_json
+from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats
-from prbayes.decision.population_table import population
 from prbayes.model.description import labelled
-from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import (
     optimum_elements,
     readable_elements,
@@ -24,112 +22,68 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
-from prbayes.optimize.optimum import Optimum, compared_in
-from prbayes.plots.canvas import named
+from prbayes.optimize.optimum import compared_in
+from prbayes.plots.canvas import metric_label, named
+from prbayes.plots.validity import in_directions
 from prbayes.reports.assessment import (
-    answers,
-    diagnostics,
-    failures,
-    interval_of,
+    agreement,
+    answer,
+    data,
+    decision,
     next_steps,
-    origin,
-    specimens,
-    summary,
-    validity,
+    population_in_units,
+    shown_outputs,
+    validation_pairs,
+    verdict,
 )
-from prbayes.reports.figures import illustrate, with_graph
-from prbayes.reports.material import Material, kind_of_decision
+from prbayes.reports.figures import pictures_of
+from prbayes.reports.material import (
+    CALLED,
+    Material,
+    kind_of_decision,
+    metrics_of,
+    versions_of,
+)
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
     correlation_table,
-    counted,
-    described,
+    enumerated,
     number,
     percentage,
     places,
     plus_minus,
     rows_table,
     sample_sd,
-    with_zeros,
+    span,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT, with_unit
+from prbayes.response.outputs import SINGLE_OUTPUT
+from prbayes.validation.area_test import ValidityTest, u_values
+from prbayes.validation.conditions import DIRECTION
 
 
-def sections_of(material: Material, *, pictures: bool) -> tuple[Section, ...]:
+def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
     """Return the sections that the material allows, with or without pictures."""
-    parts = (
-        _summary,
-        population_in_units,
-        model,
-        data,
-        metric,
-        optima,
-        posteriors,
-        comparison,
-        diagnostics,
-        failures,
-        validity,
-        specimens,
-        decision,
-        origin,
-    )
-    sections = tuple(section for part in parts for section in part(material))
-    return illustrate(with_graph(sections, material), material) if pictures else sections
+    drawn, missing = pictures_of(m) if pictures else ({}, [])
+    sections: list[Section] = []
+    for title, parts in _CHAPTERS.items():
+        chapter: list[Section] = []
+        for part in parts:
+            chapter += part(m) if callable(part) else drawn.get(part, [])
+        if title == "Appendix":
+            chapter += missing
+        if chapter and chapter[0].level == 3:
+            chapter.insert(0, Section(title))
+        sections += chapter
+    return tuple(sections)
 
 
-def _summary(m: Material) -> list[Section]:
-    if not (m.results or m.tests or m.description):
-        return []
-    sections = [Section("Summary", summary(m), rows_table(answers(m)))]
-    steps = next_steps(m)
-    if steps:
-        sections.append(Section("What to do next", steps, level=3))
-    return sections
-
-
-# -- population ------------------------------------------------------------------------------
-
-
-def population_in_units(m: Material) -> list[Section]:
-    """Return moments, quantiles and tolerance bounds of the inputs, by the first result."""
-    results: list[Optimum | xr.DataTree] = [*m.posteriors.values(), *m.live_optima.values()]
-    result = results[0] if results else None
-    if m.model is None or result is None or m.rejected or not population_simulators(m.model):
-        return []
-    try:
-        table = population(result, model=m.model)
-    except (TypeError, ValueError, NotImplementedError) as error:
-        return [Section("Population", f"Not shown: {error}.", level=3)]
-    quantities = table["quantity"].values.tolist()
-    columns: dict[str, dict[str, str]] = {}
-    for name, unit, cells in table.rows():
-        label = named(name, m.labels)
-        texts = {}
-        for quantity in quantities:
-            value, interval = cells.get(quantity, ("", ""))
-            texts[quantity.replace("cv", "cv, %")] = f"{value} ({interval})" if interval else value
-        columns[with_unit(label, unit) if label == name else label] = texts
-    if len(columns) <= 4:  # a line for each quantity, which fits on a page
-        names = next(iter(columns.values()))
-        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in names]
-    else:
-        rows = [{"input": x} | texts for x, texts in columns.items()]
-    about = (
-        "How the inputs vary from specimen to specimen: mean, standard deviation (sd), coefficient "
-        f"of variation (cv) and quantiles, with {INTERVAL:.0%} intervals in brackets. "
-        "A B-basis (A-basis) value is a tolerance bound: 90% (99%) of all specimens exceed it, "
-        "with 95% confidence."
-    )
-    return [Section("Population", about, rows_table(rows), level=3)]
-
-
-# -- model -----------------------------------------------------------------------------------
+# -- method ----------------------------------------------------------------------------------
 
 
 def model(m: Material) -> list[Section]:
-    """Return the variables of the model, and its simulators."""
+    """Return the variables of the model, its simulators, and how responses are compared."""
     if m.description is None:
         return []
     variables = [
@@ -139,15 +93,20 @@ def model(m: Material) -> list[Section]:
             "distribution": v["distribution"],
             "meaning": m.labels.get(v["name"], ""),
         }
-        for v in m.variables
+        for v in m.description["variables"]
     ]
     about = (
         "Hyperparameters describe how the inputs vary from specimen to specimen, "
         "and have prior distributions."
     )
-    sections = [Section("Model", about, rows_table(variables))]
+    sections = [Section("Method", about, rows_table(variables))]
     simulators = [
-        {"simulator": s["name"]} | {key: s[key] for key in ("response", "inputs", "propagation")}
+        {
+            "simulator": s["name"],
+            "response": s["response"],
+            "inputs": _labelled_inputs(s["inputs"], m.labels),
+            "runs": _runs(s["propagation"]),
+        }
         for s in m.simulators
     ]
     if simulators:
@@ -156,108 +115,129 @@ def model(m: Material) -> list[Section]:
     return sections
 
 
-# -- data ------------------------------------------------------------------------------------
+def _labelled_inputs(text: str, labels: Mapping[str, str]) -> str:
+    """Return the inputs of a simulator with the labels of their names, in place of units."""
+
+    def labelled_name(found: re.Match[str]) -> str:
+        comma, name, unit = found.groups(default="")
+        return comma + labels.get(name, name + unit)
+
+    return re.sub(r"(^|, )(\w+)( \([^)]*\))?(?= [=~] )", labelled_name, text)
 
 
-def data(m: Material) -> list[Section]:
-    """Return a summary of the measured responses, correlations of outputs, and the values."""
-    if not m.observed:
+def _runs(propagation: str) -> str:
+    """Return in words how the population of inputs becomes one of responses."""
+    size = re.match(r"(Reweighted|Resimulated|Fresh)\(n=(\d+)", propagation)
+    if size is None:
+        return propagation.partition("(")[0]
+    if size[1] == "Reweighted":
+        return f"{size[2]} runs, once; weighted for each population"
+    return f"{size[2]} runs for each population"
+
+
+def comparison_of_responses(m: Material) -> list[Section]:
+    """Return how measured and simulated responses are compared."""
+    if not (m.calibrations or m.simulators):
         return []
-    rows: list[dict[str, Any]] = []
-    text = ["Measured responses, in the units of the response."]
-    for simulator in m.simulators:
-        if simulator["specimens"]:
-            text.append(f"{simulator['name']}: {simulator['specimens']}.")
-    correlations = []
-    # The measured values, by which a calibration can be repeated; at most half a page
-    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
-    values = [about]
-    for name, y in m.observed.items():
-        outputs = m.outputs.get(name, SINGLE_OUTPUT)
-        columns: list[tuple[str, int, Floats]] = []
-        if y.ndim == 1:
-            columns = [("", 0, y)]
-        else:  # at most twelve outputs, half a page, from the first to the last
-            n = y.shape[1]
-            places = map(round, np.linspace(0, n - 1, min(n, 12)).tolist())
-            columns = [(outputs.names[j], j, y[:, j]) for j in places]
-            if len(columns) < n:
-                text.append(f"{name}: {len(columns)} of {n} outputs are shown.")
-            if n > 1:
-                correlations.append(_correlations(name, columns))
-        for output, j, column in columns:
-            meaning = m.labels.get(name, "")
-            if y.ndim > 1:
-                meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
-            units = outputs.units[j] if outputs.units else ""
-            row = {"simulator": name, "meaning": meaning, "output": output, "units": units}
-            rows.append(row | described(column))
-        if y.size > 300:
-            values.append(f"{name}: {y.size} values, which are too many to print.")
-        else:
-            names = [name] if y.ndim == 1 else [f"{name}[{output}]" for output in outputs.names]
-            for element, column in zip(names, np.atleast_2d(y.T), strict=True):
-                texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
-                values.append(f"{element}: {', '.join(texts)}.")
-    table = rows_table(with_zeros(rows))
-    return [
-        Section("Data", text, table),
-        *correlations,
-        Section("Measured values", values, level=3),
-    ]
-
-
-def _correlations(name: str, columns: list[tuple[str, int, Floats]]) -> Section:
-    """Return the correlations of outputs, each of the specimens that have both."""
-    pandas: Any = import_module("pandas")
-    y = np.column_stack([column for *_, column in columns])
-    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
+    labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
     about = (
-        f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
-        "those that failed are in none."
+        "The metric measures how far the distribution of the simulated responses is "
+        "from that of the measured ones; smaller is better."
     )
-    table = correlation_table([output for output, *_ in columns], r, 3)
-    return Section(f"Correlations of {name}", about, table, level=3)
+    if m.is_by_specimen:
+        about = (
+            "The log-likelihood compares specimens: the density of each measured response in the "
+            "population, through the inputs that reproduce it, on an emulator of the response."
+        )
+    elif m.sheets and len(m.sheets) == len(metrics_of(m)):
+        labels = {}
+        about = "The likelihood is the density of the statistics of the data sheet."
+    text = [about]
+    if labels and not m.is_by_specimen:
+        text.append(f"Here it is the {enumerated(list(labels))}.")
+    text += dict.fromkeys(line for t in m.calibrations.values() for line in compared_in(t))
+    return [Section("Measured against simulated responses", text, level=3)]
 
 
-# -- metric ----------------------------------------------------------------------------------
+# -- diagnostics -----------------------------------------------------------------------------
+
+
+def diagnostics(m: Material) -> list[Section]:
+    """Return the problems of the results in sentences, and remarks."""
+    problems: dict[str, list[str]] = {}  # labels of the results by sentence
+    remarks: dict[str, list[str]] = {}
+    for label, diagnosis in m.diagnoses.items():
+        if diagnosis is None:
+            missing = "not diagnosed, because that needs the model, which was not given."
+            problems.setdefault(missing, []).append(label)
+            continue
+        clear = diagnosis.all_clear
+        for sentence in diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",):
+            problems.setdefault(sentence, []).append(label)
+        for sentence in (*diagnosis.notes, *diagnosis.untested):
+            remarks.setdefault(sentence, []).append(label)
+    for label, table in m.decisions.items():
+        for finding in from_json(str(table.attrs.get("findings", "[]"))):
+            problems.setdefault(str(finding), []).append(label)
+    if not problems:
+        return []
+    sections = [Section("Diagnostics", _with_labels(problems))]
+    if remarks:
+        sections.append(Section("Remarks", _with_labels(remarks), level=3))
+    return sections
+
+
+def _with_labels(sentences: Mapping[str, list[str]]) -> list[str]:
+    """Return sentences after the names of the results that they are about."""
+    texts = []
+    for sentence, labels in sentences.items():
+        names = enumerated(labels)
+        texts.append(f"{names[0].upper()}{names[1:]}: {sentence}")
+    return texts
+
+
+def failures(m: Material) -> list[Section]:
+    """Return the failed responses with the reasons, a page of them."""
+    rows: dict[tuple[str, ...], dict[str, Any]] = {}
+    for tree in m.results.values():
+        if "failures" in tree.children:
+            table = tree["failures"].to_dataset()
+            columns = (table[key].values for key in ("simulator", "inputs", "reason"))
+            for name, inputs, reason in zip(*columns, strict=True):
+                at = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
+                row = {"simulator": str(name), "inputs": at, "reason": str(reason)}
+                rows.setdefault(tuple(row.values()), row)
+    if not rows:
+        return []
+    first = list(rows.values())[:20]
+    about = f"{len(rows)} responses failed; the values that replaced them are no results."
+    more = "" if len(first) == len(rows) else f" The first {len(first)} are shown."
+    return [Section("Failed responses", about + more, rows_table(first), level=3)]
+
+
+# -- appendix: estimates ---------------------------------------------------------------------
 
 
 def metric(m: Material) -> list[Section]:
-    """Return the metric, and the discrepancies and epsilons of the results."""
+    """Return the discrepancies and epsilons of the results."""
     rows = [
         row
         for label, calibration in m.calibrations.items()
         for row in _discrepancies(label, calibration)
     ]
-    metrics = _metrics(m)
-    if not rows and not metrics:
+    if not rows:
         return []
     if m.is_by_specimen:
-        about = (
-            "The log-likelihood compares specimens: the density of each measured response in the "
-            "population, through the inputs that reproduce it. It is evaluated on an emulator of "
-            "the response, whose runs are counted here. The log-likelihood of a posterior is the "
-            "mean over its draws."
-        )
         for row in rows:
             row["log-likelihood"] = -row["discrepancy"]
         keys = ("result", "simulator", "log-likelihood", "runs")
         table = rows_table([{key: row[key] for key in keys} for row in rows])
-        return [Section("Log-likelihood", about, table)]
-    about = (
-        "The metric measures how far the distribution of the simulated responses is "
-        "from that of the measured ones; smaller is better."
-    )
+        about = "Runs are those of the emulator. Of a posterior the mean over its draws is shown."
+        return [Section("Log-likelihood", about, table, level=3)]
+    about = "Of a posterior the mean discrepancy over its draws is shown."
     if any(row["epsilon"] is not None for row in rows):
-        about += (
-            " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
-            " The discrepancy of a posterior is the mean over its draws."
-        )
-    lines = [f"{name}: {metric}." for name, metric in metrics.items()]
-    compared = [line for table in m.calibrations.values() for line in compared_in(table)]
-    text = (about, *lines, *dict.fromkeys(compared))
-    return [Section("Metric and epsilon", text, rows_table(rows))]
+        about += " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
+    return [Section("Metric and epsilon", about, rows_table(rows), level=3)]
 
 
 def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
@@ -280,27 +260,6 @@ def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _metrics(m: Material) -> dict[str, str]:
-    """Return the metric by simulator; by result as well, where results differ in it."""
-    by_result = {}
-    for label, table in m.calibrations.items():
-        pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
-        by_result[label] = {str(name): str(metric) for name, metric in pairs}
-    if not by_result:
-        return {s["name"]: s["metric"] for s in m.simulators}
-    first, *rest = by_result.values()
-    if all(metrics == first for metrics in rest):
-        return first
-    return {
-        f"{label}, {name}": metric
-        for label, metrics in by_result.items()
-        for name, metric in metrics.items()
-    }
-
-
-# -- optima ----------------------------------------------------------------------------------
 
 
 def optima(m: Material) -> list[Section]:
@@ -338,7 +297,8 @@ def optima(m: Material) -> list[Section]:
         for name in names:
             estimate, error = alike((point[name], stderr[name]), stderr[name])
             rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
-        sections.append(Section(_titled("Optimum", label, m.optima), text, rows_table(rows)))
+        title = _titled("Optimum", label, m.optima)
+        sections.append(Section(title, text, rows_table(rows), level=3))
     return sections
 
 
@@ -361,9 +321,6 @@ def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Seq
     return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
 
 
-# -- posteriors ------------------------------------------------------------------------------
-
-
 def posteriors(m: Material) -> list[Section]:
     """Return a section for each posterior."""
     sections = []
@@ -371,14 +328,11 @@ def posteriors(m: Material) -> list[Section]:
         posterior = tree["posterior"]
         chains = counted(int(posterior.sizes["chain"]), "chain")
         by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
-        text = [
-            f"{chains} of {posterior.sizes['draw']} draws{by}. "
-            f"Intervals contain {INTERVAL:.0%} of the draws, with equal tails."
-        ]
+        text = [f"{chains} of {posterior.sizes['draw']} draws{by}. Intervals have equal tails."]
         # The width of the draws of `sample_smc`
         adjustment = str(posterior.attrs.get("adjustment", ""))
-        if m.is_by_specimen or not adjustment:
-            pass
+        if m.is_by_specimen or m.sheets or not adjustment:
+            pass  # of data sheets the likelihood is exact
         elif adjustment == "estimate":
             text.append(
                 "The posterior is that given the metric's own estimate: prior times density of the "
@@ -388,12 +342,13 @@ def posteriors(m: Material) -> list[Section]:
             text.append(
                 "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
             )
+        text += _sampler_sentences(tree, by_specimen=m.is_by_specimen)
         draws = stacked_draws(posterior)
         values = split_elements(draws)
         names = readable_elements(table_elements(draws))
         title = _titled("Posterior", label, m.posteriors)
-        table = rows_table(_posterior_rows(tree, list(values), names))
-        sections.append(Section(title, text, table))
+        table = rows_table(_posterior_rows(tree, list(values), names, m.prob))
+        sections.append(Section(title, text, table, level=3))
         varying = [name for name in names if np.ptp(values[name]) > 0]
         if 2 <= len(varying) <= 8:  # more do not fit on a page
             r = np.corrcoef([values[name] for name in varying])
@@ -404,18 +359,18 @@ def posteriors(m: Material) -> list[Section]:
 
 
 def _posterior_rows(
-    tree: xr.DataTree, elements: list[str], names: Sequence[str]
+    tree: xr.DataTree, elements: list[str], names: Sequence[str], prob: float
 ) -> list[dict[str, Any]]:
     arviz: Any = import_module("arviz")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
-        table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
-    percent = f"{100 * INTERVAL:.0f}"
+        table = arviz.summary(tree, kind="all", ci_kind="eti", ci_prob=prob, round_to="none")
+    bounds = [key for key in table.columns if key.startswith("eti")]
     rows = []
     # ArviZ has the same elements in the same order, with names of its own.
     for name, (_, values) in zip(elements, table.iterrows(), strict=True):
         if name not in names:
             continue
-        in_units = [values[k] for k in ("mean", "sd", f"eti{percent}_lb", f"eti{percent}_ub")]
+        in_units = [values[k] for k in ("mean", "sd", *bounds)]
         mean, sd, lower, upper = alike(in_units, float(values["sd"]))
         bulk, tail, rhat, mcse = (
             float(values[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
@@ -426,7 +381,7 @@ def _posterior_rows(
                 "variable": name,
                 "mean": mean,
                 "sd": sd,
-                f"{percent}% from": lower,
+                f"{prob:.0%} from": lower,
                 "to": upper,
                 "ESS, bulk": f"{bulk:.0f}" if math.isfinite(bulk) else NOTHING,
                 "ESS, tail": f"{tail:.0f}" if math.isfinite(tail) else NOTHING,
@@ -435,9 +390,6 @@ def _posterior_rows(
             }
         )
     return rows
-
-
-# -- comparison ------------------------------------------------------------------------------
 
 
 def comparison(m: Material) -> list[Section]:
@@ -459,8 +411,9 @@ def comparison(m: Material) -> list[Section]:
                     "result": label,
                     "estimate": estimate,
                     "sd": sd,
-                    f"{INTERVAL:.0%} from": lower,
-                    "to": upper,
+                    # The comparison has intervals of this probability alone
+                    f"{INTERVAL:.0%} from": lower if m.prob == INTERVAL else "",
+                    "to": upper if m.prob == INTERVAL else "",
                     "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
                 }
             )
@@ -468,7 +421,7 @@ def comparison(m: Material) -> list[Section]:
         f"The shift is the distance from the estimate of {labels[0]}, "
         "in standard deviations of the result in the row."
     )
-    sections = [Section("Comparison", about, rows_table(rows))]
+    sections = [Section("Comparison of results", about, rows_table(rows), level=3)]
     scores = [
         {"under the metric": str(key)} | dict(zip(labels, values.values.tolist(), strict=True))
         for key, values in table.data_vars.items()
@@ -483,119 +436,244 @@ def comparison(m: Material) -> list[Section]:
     return sections
 
 
-# -- decision --------------------------------------------------------------------------------
+# -- appendix: diagnostics -------------------------------------------------------------------
 
 
-def decision(m: Material) -> list[Section]:
-    """Return the answers for a decision, a table for each kind of question."""
-    if not m.decisions:
+def support(m: Material) -> list[Section]:
+    """Return the support of the results by stored responses, and the statistics of samplers."""
+    rows: list[dict[str, Any]] = []
+    for label, diagnosis in m.diagnoses.items():
+        table = None if diagnosis is None else diagnosis.support
+        if table is None or "weight_ess" not in table:
+            continue
+        for name in table["simulator"].values.tolist():
+            values = table.sel(simulator=name)
+            low, median = np.quantile(values["weight_ess"].values, [0.05, 0.5])
+            rows.append(
+                {
+                    "result": label,
+                    "simulator": name,
+                    "weight ESS, 5%": f"{low:.0f}",
+                    "median": f"{median:.0f}",
+                    "mean weight": f"{float(values['mean_weight'].median()):.3f}",
+                    "largest lost mass": number(float(values["lost_mass"].max())),
+                }
+            )
+    if not rows:
         return []
-    about = ["These answers include the uncertainty of the hyperparameters by the posterior."]
-    if m.rejected:
-        about.insert(
-            0,
-            "The calibrated model was rejected, see Validity: these answers are of a model that "
-            "data contradict. Do not rely on them.",
-        )
-    elif m.has_problems:
-        about.insert(0, "Remove the problems under Diagnostics before these answers are used.")
-    for label, table in m.decisions.items():
-        about += [f"{label}: {f}" for f in from_json(str(table.attrs.get("findings", "[]")))]
-    sections = [Section("Decision", about)]
-    for kind, (title, text, rows_of) in _KINDS.items():
-        rows = [
-            {"question": label} | _unanswered(row, m)
-            for label, table in m.decisions.items()
-            if kind_of_decision(table) == kind
-            for row in rows_of(table, m.labels)
-        ]
-        if rows:
-            sections.append(Section(title, text, rows_table(rows), level=3))
-    return sections
+    about = (
+        "Responses were computed once and are weighted. The effective sample size (ESS) is the "
+        "number of responses behind an answer; the mean weight is 1 where they cover the "
+        "population; lost mass is the probability of points without a response."
+    )
+    return [Section("Support by stored responses", about, rows_table(rows), level=3)]
 
 
-def _unanswered(row: dict[str, Any], m: Material) -> dict[str, Any]:
-    """Return a row without a verdict if the model must not be used."""
-    if row.get("requirement is") and not m.is_usable:
-        return row | {"requirement is": "not answered"}
-    return row
-
-
-def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the rows of a probability, one for each bound."""
-    values, errors = (np.atleast_1d(table[key].values) for key in ("probability", "error"))
-    bounds = table["bound"].values if "bound" in table.coords else [""]
-    beyond = "below" if table.attrs["below"] else "above"
-    required = verdict = ""
-    if "requirement" in table.attrs:
-        required = f"at most {table.attrs['requirement']:g}"
-        verdict = str(table.attrs["verdict"])
-    return [
-        {
-            "beyond": f"{beyond} {table.attrs['limit']:g}",
-            "bound": str(bound),
-            "probability": number(float(value), 2),
-            "its error": number(float(error), 1),
-            f"{percentage(table.attrs['prob'])} interval": interval_of(table),
-            "required": required,
-            "requirement is": verdict,
-        }
-        for bound, value, error in zip(bounds, values, errors, strict=True)
+def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
+    """Return the statistics of `sample_smc`; nothing of other samplers."""
+    if "sample_stats" not in tree or "stage" not in tree["sample_stats"].dims:
+        return []
+    # Chains have different numbers of stages: NaN from the end of a chain on.
+    stats = tree["sample_stats"].to_dataset()
+    stages = (~np.isnan(stats["beta"].values)).sum(axis=1)
+    last = (np.arange(stages.size), stages - 1)
+    accepted = stats["accept_rate"].values[last]
+    moves = accepted * stats["n_steps"].values[last]
+    sentences = [
+        f"The sampler went from the prior to the posterior in {span(stages, '.0f')} stages; "
+        f"in the last one it accepted {span(100 * accepted, '.0f')}% of the proposals, "
+        f"and each particle moved {span(moves, '.1f')} times on average."
     ]
+    attrs = tree["posterior"].attrs
+    if "log_marginal_likelihood" in attrs:
+        value = float(attrs["log_marginal_likelihood"])
+        spread = float(attrs["log_marginal_likelihood_sd"])
+        sentences.append(
+            f"Log marginal likelihood {plus_minus(value, spread)} (spread between chains); "
+            "comparable between models "
+            f"{'of the same data' if by_specimen else 'with the same metric and epsilon'} only."
+        )
+    return sentences
 
 
-def _indices(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the rows of sensitivity indices, one for each factor."""
-    value = plus_minus(float(table.attrs["value"]), float(table.attrs["sd"]))
-    quantity = f"{table.attrs['quantity']} = {value}"
-    response = str(table.attrs.get("of_inputs", "the response"))
+# -- appendix: tests -------------------------------------------------------------------------
+
+
+def validity(m: Material) -> list[Section]:
+    """Return the statistics of the validity tests."""
+    if not m.tests:
+        return []
+    n_tests = len(m.tests)
+    rows = [
+        {"test": label if n_tests > 1 else "area test"} | _test_row(test)
+        for label, test in m.tests.items()
+    ]
+    about = (
+        "The u-value of a measured response is its place in the predicted distribution, from 0 to "
+        "1. The statistic is the area between the distribution of the u-values and the uniform "
+        "one: a larger one than the critical value rejects the model. The area of u detects a "
+        "wrong mean, that of |2u - 1| a wrong spread."
+    )
+    if any(in_directions(test) for test in m.tests.values()):
+        about += (
+            " Several outputs are projected on directions of the predicted ones, in which a wrong "
+            "correlation is a wrong spread; the statistic is the mean of the areas over these."
+        )
+    nulls = dict.fromkeys(f"Null hypothesis: {test.null}." for test in m.tests.values())
+    return [Section("Test statistics", (about, *nulls), rows_table(rows), level=3)]
+
+
+def _test_row(test: ValidityTest) -> dict[str, Any]:
+    directions = len(in_directions(test))
+    values = "|2u - 1|" if test.folded else "u"
+    if directions and not test.folded:
+        values = "u and |2u - 1|"
+    # The verdict first: the end of a wide table is off a phone's screen.
+    return {
+        "verdict": "rejected" if test.rejected else "not rejected",
+        "values": test.u_values.size,
+        "specimens": np.unique(test.specimens).size,
+        "directions": str(directions) if directions else "",
+        "of": values,
+        "area": f"{test.statistic:.4f}",
+        "critical value": f"{test.critical_value:.4f}",
+        "p-value": f"{test.p_value:.2g}" if test.p_value >= 0.001 else "< 0.001",
+        "level": percentage(test.alpha),
+    }
+
+
+def specimens(m: Material) -> list[Section]:
+    """Return the measured values and u-values of each specimen of the test, a page of them."""
+    rows = _measured_rows(m)
+    if not rows:
+        return []
+    about = (
+        "u is the share of the predicted responses below the measured one: a specimen with a u "
+        "near 0 or 1 is at the edge of the prediction."
+    )
+    if len(rows) > 40:
+        about += f" The first 40 of {len(rows)} values are shown."
+    return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
+
+
+def _measured_rows(m: Material) -> list[dict[str, Any]]:
+    """Return a row for each specimen and output of the validation data."""
     rows = []
-    for i, (factor, kind) in enumerate(zip(table.factor.values, table.kind.values, strict=True)):
-        of = response if str(kind) == "input" else quantity
-        row = {"of": of, "factor": named(str(factor), labels)}
-        for key, title in (("first", "by itself"), ("total", "with all others known")):
-            index = float(table[key][i])
-            error = float(table[f"{key}_error"][i])
-            row[title] = f"{index:.2f} ± {error:.2f}" if np.isfinite(index) else ""
-        rows.append(row)
+    for condition, pair in validation_pairs(m):
+        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
+        values = alike(pair.measured.tolist(), sd)
+        us = u_values(pair.measured, pair.predicted).tolist()
+        name = named(pair.name, m.labels)
+        labels = _specimen_labels(condition, len(m.validation[condition][0]), m)
+        rows += [
+            {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
+            for label, value, u in zip(labels, values, us, strict=True)
+        ]
     return rows
 
 
-def _plan(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the rows of a plan, the present first."""
-    names = [str(name) for name in table.name.values]
-
-    def row(text: str, sd: xr.DataArray) -> dict[str, Any]:
-        sds = {name: number(float(sd.sel(name=name)), 3) for name in names}
-        return {"specimens": text, **sds}
-
-    rows = [row("none more", table.now)]
-    for candidate in table.candidate.values:
-        for k in table.k.values:
-            sd = table.sd.sel(candidate=candidate, k=k)
-            rows.append(row(f"{k} more, {candidate}", sd))
-    return rows
+def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
+    """Return the labels of a condition's n specimens in a test of them, or their numbers."""
+    for test in m.tests.values():
+        is_single = len(test.of_conditions) == 1 and len(m.validation) == 1
+        for name in test.of_conditions:
+            mask = [text.split(DIRECTION)[0] == name for text in test.conditions.tolist()]
+            labels = list(dict.fromkeys(test.specimens[mask].tolist()))
+            if (is_single or name == condition) and len(labels) == n:
+                return [_specimen_label(label, name) for label in labels]
+    return [str(i + 1) for i in range(n)]
 
 
-_Rows = Callable[[xr.Dataset, Mapping[str, str]], list[dict[str, Any]]]
-_KINDS: dict[str, tuple[str, str, _Rows]] = {
-    "risk": (
-        "Probability of exceedance",
-        "The probability is that of a new specimen; the interval is that of the share in a large "
-        "batch. A requirement is met if the whole interval is below it, not met if all of it is "
-        "above, with two errors of the computation on both sides, and else not decided.",
-        _risk,
-    ),
-    "sensitivity": (
-        "What moves it",
-        "The share of a variance that knowing a factor would remove, and that is left when all "
-        "others are known: of hyperparameters, in the uncertainty of the quantity; of inputs, in "
-        "the scatter of specimens.",
-        _indices,
-    ),
-    "plan": (
-        "What more data would change",
-        "Standard deviations that are expected after further specimens.",
-        _plan,
+def _specimen_label(label: str, condition: str) -> str:
+    """Return a label; the number from one on of a specimen that the test counts from zero."""
+    index = label.removeprefix(f"{condition}, ")
+    return str(int(index) + 1) if index != label and index.isdigit() else label
+
+
+# -- appendix: data --------------------------------------------------------------------------
+
+
+def measured_values(m: Material) -> list[Section]:
+    """Return correlations of outputs, and the values by which a calibration can be repeated."""
+    if not m.observed:
+        return []
+    sections = []
+    # At most half a page
+    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
+    values = [about]
+    for name, y in m.observed.items():
+        if y.ndim > 1 and y.shape[1] > 1:
+            sections.append(_correlations(name, m))
+        if y.size > 300:
+            values.append(f"{name}: {y.size} values, which are too many to print.")
+            continue
+        outputs = m.outputs.get(name, SINGLE_OUTPUT)
+        names = [name] if y.ndim == 1 else [f"{name}[{output}]" for output in outputs.names]
+        for element, column in zip(names, np.atleast_2d(y.T), strict=True):
+            texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
+            values.append(f"{element}: {', '.join(texts)}.")
+    return [*sections, Section("Measured values", values, level=3)]
+
+
+def _correlations(name: str, m: Material) -> Section:
+    """Return the correlations of outputs, each of the specimens that have both."""
+    pandas: Any = import_module("pandas")
+    columns = shown_outputs(m, name)
+    y = np.column_stack([column for *_, column in columns])
+    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
+    about = "Each of the specimens that have both outputs, without those that failed."
+    table = correlation_table([output for output, *_ in columns], r, 3)
+    return Section(f"Correlations of {name}", about, table, level=3)
+
+
+def origin(m: Material) -> list[Section]:
+    """Return versions, seeds, and the cost of the results."""
+    if not m.results:
+        return []
+    costs: list[tuple[str, str, Mapping[Any, Any], str]] = []
+    for label in m.results:
+        attrs = m.attrs(label)
+        by = str(attrs.get("sampler", "minimize" if label in m.optima else ""))
+        costs.append((label, by, attrs, "n_responses"))
+    for condition, (_, predicted) in m.validation.items():
+        label = f"prediction, {named(condition, m.labels)}"
+        costs.append((label, "predict", predicted.attrs, "responses"))
+    for label, table in m.decisions.items():
+        costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
+    rows = []
+    for label, by, record, responses in costs:
+        row: dict[str, Any] = {"result": label, "by": by}
+        row["responses"] = str(int(record[responses])) if responses in record else None
+        seconds = record.get("seconds")
+        if seconds is not None:  # to a tenth below ten
+            seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
+        seed = record.get("random_seed")
+        rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
+    text = [
+        "Responses are runs for one specimen; those of a common design are counted in each result."
+    ]
+    text += [f"{name}: {metric}." for name, metric in metrics_of(m).items()]
+    text += [f"{s['name']}: {s['propagation']}." for s in m.simulators]
+    packages = ", ".join(f"{name} {version}" for name, version in versions_of(m).items())
+    text += [f"Computed with {packages}."] if packages else []
+    return [Section("Cost and origin", text, rows_table(rows), level=3)]
+
+
+# -- order -----------------------------------------------------------------------------------
+
+
+# Chapters with their parts in order: a function of the material, or the name of a picture. The
+# first chapter is page one, and has the verdict as its title.
+_CHAPTERS: dict[str, tuple[Any, ...]] = {
+    "Verdict": (verdict, "front", population_in_units),
+    "Decision": (decision, "sensitivity", next_steps),
+    "Answer": (answer, "population"),
+    "Evidence": (data, "responses", "outputs", agreement),
+    "Method": (model, "graph", comparison_of_responses),
+    "Diagnostics": (diagnostics, failures),
+    "Appendix": (
+        *(metric, optima, "optimizer", "landscape"),
+        *(posteriors, "posterior", "stages", comparison, "comparison", support),
+        *(validity, "validity", specimens, measured_values, origin),
     ),
 }

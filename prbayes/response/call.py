@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
 from prbayes._validate import Floats, unmasked
 from prbayes.response.budget import BudgetError, budget
@@ -643,9 +643,14 @@ def _apply_policy(
 def inputs_text(settings: CallSettings, points: Points, row: int) -> str:
     """Return the inputs of a point as a text, with their names where these are known."""
     (inputs,) = points.at(np.array([row])).keys()
-    if len(settings.columns) != inputs.size or inputs.size > 12:
-        return numbers_text(inputs, 6)
-    pairs = zip(settings.columns, inputs, strict=True)
+    return named_numbers(settings.columns, inputs)
+
+
+def named_numbers(names: Sequence[str], numbers: Floats) -> str:
+    """Return few numbers with their names as a text, and many without."""
+    if len(names) != numbers.size or numbers.size > 12:
+        return numbers_text(numbers, 6)
+    pairs = zip(names, numbers, strict=True)
     return f"({', '.join(f'{name} = {value:.6g}' for name, value in pairs)})"
 
 
@@ -666,7 +671,7 @@ def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str
     if is_wrong_result(reason):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{settings.name}: the response failed at {len(raised)} point(s){place}: {reason}"
+        f"{settings.name}: the response failed at {counted(len(raised), 'point')}{place}: {reason}"
         f"{store_text}; {advice}"
     )
 

@@ -29,6 +29,7 @@ from prbayes.response.call import (
     computed_again,
     first_change,
     inputs_text,
+    named_numbers,
     numbers_text,
     respond,
     revealing_rows,
@@ -41,7 +42,7 @@ from prbayes.response.call import (
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
-from prbayes.response.inputs import Inputs, argument_names, broadcast_batch
+from prbayes.response.inputs import Inputs, aleatory_names, argument_names, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
 
@@ -308,7 +309,7 @@ class Responses:
         if changed is not None:
             raise ResponseError(
                 f"{self.caller}: got {numbers_text(again[changed])} from the response of "
-                f"{stored.name} {_place(selected, changed)}, expected "
+                f"{stored.name} {self._place(selected, changed)}, expected "
                 f"{numbers_text(values[rows[changed]])}, as in its runs: a variable that it reads "
                 "has changed since; build the model again for the response as it is now, or write "
                 "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
@@ -378,6 +379,12 @@ class Responses:
             n = len(values[0])
             return self._again([np.concatenate([x] * copies) for x in values])[:n]
 
+    def _place(self, points: Sequence[Floats], row: int) -> str:
+        """Return the aleatory inputs of a specimen as a text, with their names."""
+        sizes = [int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes]
+        names = column_names(aleatory_names(self.inputs, self.function), sizes)
+        return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
+
     @property
     def _one_system(self) -> float:
         """By how many standard deviations a solver that steps a batch as one system differs."""
@@ -419,8 +426,8 @@ class Responses:
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
-                    f"response {_place(selected, changed)}, expected the same: it has scatter of "
-                    "its own, or a state from one specimen to the next; fix its random seed or "
+                    f"response {self._place(selected, changed)}, expected the same: it has scatter "
+                    "of its own, or a state from one specimen to the next; fix its random seed or "
                     "state, model scatter as an input, such as pm.Normal.dist(0, 1), or take "
                     "prb.ProbabilityResidual() with prb.Fresh(), for random responses"
                 )
@@ -470,10 +477,11 @@ class Responses:
         if changed is not None:
             raise ResponseError(
                 f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
-                f"{_place(selected, changed)}, expected {numbers_text(then[changed])}, which it "
-                "gave when the simulator was written: a variable that it reads has changed since, "
-                "before or in its runs, which begin at the first use; write a function without a "
-                "state, and one for each condition, such as functools.partial(response, load=2.0)"
+                f"{self._place(selected, changed)}, expected {numbers_text(then[changed])}, which "
+                "it gave when the simulator was written: a variable that it reads has changed "
+                "since, before or in its runs, which begin at the first use; write a function "
+                "without a state, and one for each condition, such as "
+                "functools.partial(response, load=2.0)"
             )
 
 
@@ -503,11 +511,6 @@ def _accuracy(values: Floats, share: float = 0.0) -> Any:
     finite = values[np.isfinite(by_output(values)).all(axis=1)]
     spread = finite.std(axis=0) if len(finite) else 0.0
     return np.maximum(1e-6 * typical_size(values), share * spread)
-
-
-def _place(points: Sequence[Floats], row: int) -> str:
-    """Return the inputs of a specimen as a text."""
-    return f"at {numbers_text(np.concatenate([np.ravel(x[row]) for x in points]), 6)}"
 
 
 def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:

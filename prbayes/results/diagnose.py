@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view, without_constructor
-from prbayes._finding import Finding, from_json
+from prbayes._finding import Finding, counted, from_json
 from prbayes._validate import Floats
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
@@ -128,7 +128,7 @@ class Diagnosis:
             clear = self.all_clear.removesuffix(".")
             return view(f"Diagnosis: {clear[0].lower()}{clear[1:]}", sentences=sentences)
         count = len(self.findings)
-        return view(f"Diagnosis: {count} problem{'s' if count > 1 else ''}", sentences=sentences)
+        return view(f"Diagnosis: {counted(count, 'problem')}", sentences=sentences)
 
 
 @locked
@@ -361,8 +361,8 @@ def _failure_findings(
         inputs = rows["inputs"].values[0]
         point = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
         text = (
-            f"{name}: the response failed at {rows.sizes['failure']} point(s), the first at "
-            f"({point}): {rows['reason'].values[0]}; "
+            f"{name}: the response failed at {counted(rows.sizes['failure'], 'point')}, the first "
+            f"at ({point}): {rows['reason'].values[0]}; "
         )
         replacement = rows["instead"].values[0]
         share = np.nan  # a finite number in place of a failed response looks like any other

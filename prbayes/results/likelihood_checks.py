@@ -16,7 +16,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
 
-from prbayes._finding import Finding
+from prbayes._finding import Finding, counted
 from prbayes._validate import Floats
 from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
@@ -88,7 +88,7 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
     for likelihood in evaluator.likelihoods:
         emulation, points = prepared(likelihood).emulation, prepared(likelihood).points
         low, high = int(points.n_roots.min()), int(points.n_roots.max())
-        count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
+        count = counted(low, "root") if low == high else f"{low} to {high} roots"
         remarks.append(
             Finding(
                 "emulator-bias",

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._display import Tree, View
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress, shown
 from prbayes._stats import reached
 from prbayes._validate import (
@@ -204,7 +204,8 @@ def _read_data(data: object, name: str, minimum: int, event: tuple[int, ...]) ->
         if array.ndim != 1 + len(event) or array.shape[1:] != event or len(array) < minimum:
             raise ValueError(
                 f"{name}: {product}: got shape {array.shape}, expected {('N', *event)} with at "
-                f"least {minimum} specimen(s), in the form of the simulator's observed values"
+                f"least {counted(minimum, 'specimen')}, in the form of the simulator's "
+                "observed values"
             )
         arrays[str(product)] = array
     return arrays

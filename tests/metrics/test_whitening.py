@@ -31,7 +31,7 @@ def test_two_inputs_make_two_components_and_a_remainder_is_noise_or_structure() 
     np.testing.assert_allclose(found.axes.T @ found.axes, np.eye(2), atol=1e-12)
     scores = (curves(30) - found.center) @ found.axes
     np.testing.assert_allclose(found.center + scores @ found.axes.T, curves(30), atol=1e-10)
-    assert "40 outputs are compared by 2 principal component(s)" in found.summary
+    assert "40 outputs are compared by 2 principal components" in found.summary
     noisy = principal_components(curves(30, noise=0.2), EQUAL, ALL, 2)
     shifted = principal_components(curves(30, noise=0.2) - 70, EQUAL, ALL, 2)
     np.testing.assert_allclose(shifted.axes, noisy.axes, atol=1e-9)

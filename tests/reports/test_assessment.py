@@ -1,4 +1,4 @@
-"""What judges: comparison, diagnostics, validity, cost; the summary of it."""
+"""What a reader decides by: verdict, requirement, answer, evidence, next steps; and checks of it."""
 
 import dataclasses
 import re
@@ -11,9 +11,9 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes._finding import Finding, as_json
-from prbayes.reports.assessment import next_steps, summary, verdict
+from prbayes.reports.assessment import agreement, answer, next_steps
 from prbayes.reports.material import gather
-from prbayes.reports.numbers import cells
+from prbayes.reports.numbers import NOTHING, cells
 from prbayes.validation.conditions import DIRECTION
 
 
@@ -47,17 +47,18 @@ def test_diagnostics_are_those_of_diagnose(
     stats = calibrated.posterior["sample_stats"]
     stages = (~np.isnan(stats["beta"].values)).sum(axis=1)
     span = str(stages[0]) if stages[0] == stages[1] else f"{stages.min()} to {stages.max()}"
+    text = " ".join(section(report, "Posterior").text)
     assert f"in {span} stages" in text
     moves = (stats["accept_rate"] * stats["n_steps"]).values[np.arange(2), stages - 1]
     moved = re.findall(r"each particle moved ([\d.]+)(?: to ([\d.]+))? times", text)[0]
     assert float(moved[0]) == pytest.approx(moves.min(), abs=0.06)
     assert float(moved[1] or moved[0]) == pytest.approx(moves.max(), abs=0.06)
     evidence = calibrated.posterior["posterior"].attrs["log_marginal_likelihood"]
-    written = re.findall(r"log marginal likelihood (-?[\d.]+)", text)[0]
+    written = re.findall(r"Log marginal likelihood (-?[\d.]+)", text)[0]
     assert float(written) == pytest.approx(evidence, abs=0.06)
 
 
-def test_validity(calibrated: Any, page: Any, row: Any) -> None:
+def test_validity(calibrated: Any, page: Any, row: Any, section: Any) -> None:
     test = calibrated[3]
     found = row("area test", "verdict", page)
     assert float(found["area"]) == pytest.approx(test.statistic, abs=6e-5)
@@ -66,18 +67,21 @@ def test_validity(calibrated: Any, page: Any, row: Any) -> None:
     assert found["verdict"] == ("rejected" if test.rejected else "not rejected")
     rejected = dataclasses.replace(test, p_value=0.01, statistic=0.4)
     both = prb.Report("x", validity={"early": test, "late": rejected}, pictures=False)
-    summary, tested, specimens = both.sections
-    assert len(cells(specimens.table).rows) == test.u_values.size
-    found_by = [("is rejected" in p, p.split(":")[0]) for p in summary.text]
-    assert found_by == [(False, "early"), (True, "late")]
-    more_often = "rejected by one or more of these 2 tests in up to 10% of cases"
-    assert any(more_often in p for p in tested.text)
-    one = prb.Report("x", validity=test, pictures=False).sections[1]
-    assert not any("up to" in p for p in one.text)
-    rows = cells(tested.table).rows
+    front = both.sections[0]
+    assert (front.title, front.verdict) == ("Rejected", "bad")
+    assert front.text[1] == "Failed: late, of 2 tests."
+    in_words = section(both, "Test of the model").text
+    assert in_words[0].startswith("early: the measured values agree with the prediction. Of a r")
+    assert in_words[1].startswith("late: the measured values differ too much from the prediction.")
+    assert "1% of such tests differ at least as much; below 5% the model is" in in_words[1]
+    assert in_words[2] == "Together the tests reject a right model in up to 10% of cases."
+    one = prb.Report("x", validity=test, pictures=False)
+    assert not any("up to" in p for p in section(one, "Test of the model").text)
+    statistics = section(both, "Test statistics")
+    rows = cells(statistics.table).rows
     assert [r[0] for r in rows] == ["early", "late"]
     assert [r[1] for r in rows] == ["not rejected", "rejected"]
-    assert [p for p in tested.text if p.startswith("Null hypothesis: ")] == [
+    assert [p for p in statistics.text if p.startswith("Null hypothesis: ")] == [
         f"Null hypothesis: {test.null}."
     ], "one null, said once"
 
@@ -110,26 +114,20 @@ def later(calibrated: Any) -> xr.DataArray:
 
 
 def test_specimens_have_readings_beside_u_values(calibrated: Any, later: xr.DataArray) -> None:
-    rows = table(validity=calibrated.test)
-    assert [row["specimen"] for row in rows] == [str(i) for i in range(1, 13)]
-    us = [float(row["u"]) for row in rows]
-    np.testing.assert_allclose(us, calibrated.test.u_values, atol=6e-4)
-    assert "measured" not in rows[0]
+    assert table(validity=calibrated.test) == []
     data = {"hot": [1.5, 2.5], "cold": [2.0, np.inf, 1.0]}
     both = {"hot": later, "cold": later}
     tests = {
         "mean": prb.area_test(data, both, **NULL),
         "spread": prb.area_test(data, both, folded=True, **NULL),
     }
-    rows = table(validity=tests, labels={"hot": "300 K"})
+    validation = {name: (np.array(data[name]), later) for name in data}
+    rows = table(validity=tests, validation=validation, labels={"hot": "300 K"})
     assert [row["condition"] for row in rows] == ["300 K"] * 2 + ["cold"] * 3
     assert [row["specimen"] for row in rows] == ["1", "2", "1", "2", "3"]
     us = [float(row["u"]) for row in rows]
     np.testing.assert_allclose(us, tests["mean"].u_values, atol=6e-4)
-    validation = {name: (np.array(data[name]), later) for name in data}
-    rows = table(validity=tests, validation=validation)
     assert [row["measured"] for row in rows][3] == "\u221e"
-    assert [float(row["u"]) for row in rows] == us
     names = ["S0", "S1"]
     test = prb.area_test(data["hot"], later, specimens=names, **NULL)
     rows = table(validity=test, validation={"hot": validation["hot"]})
@@ -143,7 +141,7 @@ def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray) -> 
     fresh = np.random.default_rng(4).normal([2.0, 12.0], 0.6, (30, 2))
     fresh[7, 0] = np.inf
     given = {"validation": {"hot": (fresh, prediction)}}
-    row, other = table("Data of the test", **given)
+    row, other = table("Test of the model", **given)
     assert (other["condition"], other["failed"]) == ("hot[right]", "0")
     assert (row["condition"], row["N"], row["failed"]) == ("hot[left]", "30", "1")
     finite = np.delete(fresh[:, 0], 7)
@@ -156,32 +154,31 @@ def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray) -> 
     assert table(**given)[30]["condition"] == "hot[right]"
 
 
-# -- summary ---------------------------------------------------------------------------------
+# -- page one, and the answer -----------------------------------------------------------------
 
 
-def test_the_summary_has_the_answer(calibrated: Any, report: prb.Report) -> None:
+def test_the_answer_has_the_estimates(calibrated: Any, report: prb.Report, section: Any) -> None:
     _, _, posterior, _ = calibrated
-    text = " ".join(report.sections[0].text)
+    of_answer = section(report, "Answer")
+    rows = {row[0]: row[1:] for row in cells(of_answer.table).rows}
+    assert list(rows) == ["mu", "sigma"], "a deterministic is no parameter"
     for name in ("mu", "sigma"):
-        mean, sd = map(float, re.findall(rf"{name} = (-?[\d.]+) ± ([\d.]+)", text)[0])
         draws = posterior["posterior"][name].values
+        mean, sd, low, high = map(float, rows[name])
         assert sd == pytest.approx(draws.std(ddof=1), rel=0.06)
         assert mean == pytest.approx(draws.mean(), abs=0.06 * sd)
-    assert "cv =" not in text, "a deterministic is no hyperparameter"
-    assert (
-        "2 hyperparameters (mu, sigma) of the model were calibrated on 30 measured responses of y"
-        in text
-    )
-    assert "by the Kullback-Leibler divergence" in text
-    assert "not rejected at level 5%" in text
+        np.testing.assert_allclose([low, high], np.quantile(draws, [0.055, 0.945]), atol=0.06 * sd)
+    assert "is fitted to 30 measured values of y." in of_answer.text[0]
 
 
-def test_problems_are_counted_in_the_summary(calibrated: Any, section: Any) -> None:
+def test_problems_are_counted_on_page_one(calibrated: Any, section: Any) -> None:
     posterior = calibrated[2].copy(deep=True)
     posterior["posterior"]["mu"][0] += 5.0
-    bad = prb.Report("x", posterior=posterior, pictures=False)
+    bad = prb.Report("x", posterior=posterior, validity=calibrated.test, pictures=False)
     assert any("R-hat" in p for p in section(bad, "Diagnostics").text)
-    assert any("problem" in p and "found no problem" not in p for p in bad.sections[0].text)
+    front = bad.sections[0]
+    assert (front.title, front.verdict) == ("Not ready", "open")
+    assert re.fullmatch(r"The calculation has \d problems? \(see Diagnostics\)\..*", front.text[0])
     finding = Finding("not-identified", "The data do not see mu.")
     posterior["posterior"].attrs["findings"] = as_json([finding])
     again = prb.Report("x", posterior=posterior, pictures=False)
@@ -193,62 +190,48 @@ def draws(**values: Any) -> xr.DataTree:
     return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
 
 
-def test_one_hyperparameter_and_several_results() -> None:
+def test_many_parameters_are_in_the_appendix() -> None:
     first = draws(p=np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0]]))
-    second = draws(p=np.array([[4.0, 5.0, 6.0], [5.0, 5.0, 5.0]]))
-    text = " ".join(summary(gather(posterior={"a": first, "b": second})))
-    assert "1 hyperparameter (p) of the model was calibrated" in text
-    assert "The answer of a is p = 2.00 ± 0.63 (mean and standard deviation" in text
-    # (5 - 2) / .632
-    assert "The estimates of a and b differ by at most 4.7 standard deviations." in text
-    third = {"a": first, "b": second, "c": first}
-    assert "differ by" not in " ".join(summary(gather(posterior=third)))
-    fixed = {"a": draws(p=np.ones((1, 5))), "b": draws(p=np.full((1, 5), 2.0))}
-    assert "differ by" not in " ".join(summary(gather(posterior=fixed)))
-    many = {f"p{i}": np.random.default_rng(i).normal(size=(2, 20)) for i in range(7)}
-    text = " ".join(summary(gather(posterior=draws(**many))))
-    assert "7 hyperparameters of the model were calibrated" in text
-    assert "The answer is in the table of the posterior." in text
+    (section,) = answer(gather(posterior={"a": first, "b": first}))
+    assert cells(section.table).rows[0][:3] == ("p", "2.00", "0.63")
+    many = {f"p{i}": np.random.default_rng(i).normal(size=(2, 20)) for i in range(31)}
+    (section,) = answer(gather(posterior=draws(**many)))
+    assert section.text == ("The estimates are in the appendix.",)
+    assert section.table is None
 
 
-def test_an_unidentified_hyperparameter_has_no_estimate(calibrated: Any) -> None:
+def test_an_unidentified_parameter_has_no_standard_error(calibrated: Any) -> None:
     stderr = calibrated.optimum.stderr | {"sigma": np.inf}
     optimum = dataclasses.replace(calibrated.optimum, stderr=stderr)
     labels = {"mu": "mean of the exponent"}
-    text = " ".join(summary(gather(optimum=optimum, labels=labels, model=calibrated.model)))
-    assert "mean of the exponent = " in text
-    assert "hyperparameters (mean of the exponent, sigma)" in text
-    assert f"sigma = {optimum.point['sigma']:.2g}"[:11] in text
-    assert ", without a standard error (see the section on diagnostics)" in text
-    assert "inf" not in text
-    m = gather(optimum=optimum, posterior=calibrated.posterior, model=calibrated.model)
-    (far,) = re.findall(r"differ by at most ([\d.]+)", " ".join(summary(m)))
-    assert float(far) < 1.0  # that of mu
+    (section,) = answer(gather(optimum=optimum, labels=labels, model=calibrated.model))
+    mu, sigma = cells(section.table).rows
+    assert mu[:2] == ("mu", "mean of the exponent")
+    assert float(sigma[2]) == pytest.approx(optimum.point["sigma"], rel=1e-3)
+    assert sigma[3] == NOTHING
+    assert "The data do not identify a parameter without a standard error." in section.text
 
 
-def test_a_verdict_names_the_sign(calibrated: Any) -> None:
-    test = calibrated.test
-    above = dataclasses.replace(test, statistic=0.4, critical_value=0.2, p_value=0.012, folded=True)
-    m = gather(validity=above)
-    (text,) = summary(m)
-    assert "On the spread of the responses of 12 specimens (12 values)" in text
-    assert "is rejected at level 5% (area 0.400 > critical 0.200, p = 0.012)." in text
+def test_a_test_of_the_scatter_is_called_so(calibrated: Any) -> None:
+    above = dataclasses.replace(calibrated.test, statistic=0.4, p_value=0.0001, folded=True)
+    (section,) = agreement(gather(validity=above))
+    assert section.text[0].startswith(
+        "The scatter of the measured values differs too much from the prediction. Of a right model,"
+        " less than 0.1% of such tests"
+    )
     below = dataclasses.replace(above, statistic=0.1, p_value=0.4)
-    assert "is not rejected at level 5% (area 0.100 ≤ critical 0.200" in verdict("x", below, m)
+    (section,) = agreement(gather(validity=below))
+    assert "values agrees with the prediction. Of a right model, 40% of" in section.text[0]
 
 
-def test_a_verdict_on_several_outputs_counts_directions() -> None:
+def test_a_test_of_several_outputs_counts_directions(section: Any) -> None:
     rng = np.random.default_rng(1)
     predicted = rng.normal(rng.normal(0, 0.25, (50, 1, 2)), 1.0, (50, 100, 2))
     null = prb.validation.PosteriorNull(99)
     test = prb.area_test(rng.normal(size=(12, 2)), predicted, null=null)
-    text = verdict("a", test, gather(validity=test))
-    assert text.startswith(
-        "On the responses of 12 specimens (several outputs in 4 directions), the"
-    )
-    assert "(mean area 0." in text
     made = prb.Report("x", validity=test, pictures=False)
-    table = made.sections[-1].table
+    assert made.sections[0].text[0].startswith("Measurements of 12 specimens agree")
+    table = section(made, "Test statistics").table
     assert table["of"].tolist() == ["u and |2u - 1|"]
     assert table["directions"].tolist() == ["4"]
 
@@ -258,33 +241,34 @@ def test_next_steps_depend_on_the_results(calibrated: Any) -> None:
     optimum, posterior, test = calibrated.optimum, calibrated.posterior, calibrated.test
 
     def steps(**given: Any) -> str:
-        texts = next_steps(gather(model=calibrated.model, **given))
+        sections = next_steps(gather(model=calibrated.model, **given))
+        texts = [text for section in sections for text in section.text]
         assert [text.partition(". ")[0] for text in texts] == [
             str(i + 1) for i in range(len(texts))
         ]
         return " ".join(texts)
 
     assert steps() == ""
-    assert "prb.sample_smc" in steps(optimum=optimum)
-    assert "prb.area_test" in steps(optimum=optimum)
-    assert "prb.sample_smc" not in steps(posterior=posterior)
-    assert "folded=True" in steps(posterior=posterior, validity=test)
+    assert "Compute the posterior" in steps(optimum=optimum)
+    assert "Test the model on specimens" in steps(optimum=optimum)
+    assert "Compute the posterior" not in steps(posterior=posterior)
+    assert "Test the scatter as well" in steps(posterior=posterior, validity=test)
     names = np.array([f"later{DIRECTION}{k % 4 + 1}" for k in range(test.u_values.size)])
     several = dataclasses.replace(test, conditions=names)
-    assert "folded=True" not in steps(posterior=posterior, validity=several)
+    assert "Test the scatter" not in steps(posterior=posterior, validity=several)
     rejected = dataclasses.replace(test, p_value=0.001)
     text = steps(posterior=posterior, validity=rejected)
     assert text.startswith("1. Do not use the model beyond")
-    assert "folded=True" not in text
+    assert "Test the scatter" not in text
     bad = posterior.copy(deep=True)
     bad["posterior"]["mu"][0] += 5.0
-    assert steps(posterior=bad).startswith("1. Remove the problems")
+    assert steps(posterior=bad).startswith("1. Solve the problems")
     by_draw = xr.DataArray([[0.01, 0.2]], dims=("chain", "draw"))
     risk = xr.Dataset({"probability": 0.1, "by_draw": by_draw, "error": 0.01})
     for verdict_text, is_open in (("not decided", True), ("met", False)):
         decision = {"P": risk.assign_attrs(verdict=verdict_text)}
         text = steps(posterior=posterior, validity=test, decision=decision)
-        assert ("with prb.decision.Exceedance as its quantity" in text) == is_open
+        assert ("plan how many more would decide it" in text) == is_open
     rough = risk.assign_attrs(
         verdict="not decided", findings=as_json([Finding("rough-probability", "Pass points=.")])
     )

@@ -123,7 +123,7 @@ def test_both_writers_render_the_same_data(tmp_path: Path, report: prb.Report, p
     text = (folder / "report.md").read_text(encoding="utf-8")
     lines = [re.sub(r"\\(.)", r"\1", line) for line in text.splitlines()]
     assert [line.lstrip("# ") for line in lines if line.startswith("#")][1:] == [
-        s.title for s in report.sections
+        s.heading for s in report.sections
     ]
     table_rows = [line for line in lines if line.startswith("| ") and "---" not in line]
     shown = [[c.strip("\u2007\u2008") for c in r] for r in page.rows]
@@ -134,7 +134,7 @@ def test_both_writers_render_the_same_data(tmp_path: Path, report: prb.Report, p
     for name, source in zip(files, sources, strict=True):
         assert base64.b64decode(source.partition(",")[2]) == (folder / name).read_bytes()
     for paragraph in (p for s in report.sections for p in s.text):
-        assert paragraph in lines
+        assert paragraph in [line.removeprefix("> ") for line in lines]
         assert paragraph in page.text("p")
 
 
@@ -146,9 +146,9 @@ def test_a_section_of_the_users_own(
         "Al 2024-T3.",
         xr.Dataset({"E": ("batch", [70.1, 71.25])}, {"batch": ["A", "B"]}),
     )
-    more = report.with_section(mine, after="Data")
+    more = report.with_section(mine, after="Evidence")
     titles = [s.title for s in more.sections]
-    assert titles.index("Material") == titles.index("Metric and epsilon") - 1
+    assert titles.index("Material") == titles.index("Method") - 1
     assert len(more.sections) == len(report.sections) + 1
     assert more.date == report.date
     for text in (more._html(), more.to_markdown(tmp_path).read_text(encoding="utf-8")):
@@ -157,11 +157,11 @@ def test_a_section_of_the_users_own(
     assert row("B", "E", parse(more._html()))["E"] == "71.25"
     assert report.with_section(mine).sections[-1] is mine
     part = dataclasses.replace(mine, title="Part", level=3)
-    inside = report.with_section(part, after="Model").sections
-    beginning = ["Summary", "What to do next", "Population", "Model", "Part", "Simulators"]
-    assert [s.title for s in inside][:6] == beginning
+    inside = [s.title for s in report.with_section(part, after="Method").sections]
+    assert inside[inside.index("Method") :][:3] == ["Method", "Part", "Simulators"]
     few = dataclasses.replace(report, title="Two", sections=report.sections[:3])
-    assert [s.title for s in few.sections] == ["Summary", "What to do next", "Population"]
+    assert few.sections == report.sections[:3]
+    assert (few.note, few.date) == (report.note, report.date)
     with pytest.raises(KeyError, match="expected the title of a section"):
         report.with_section(mine, after="Nothing")
 
@@ -277,10 +277,69 @@ def test_the_layout_has_a_first_page_and_colours_for_the_dark(
 ) -> None:
     classes = [attrs["class"] or "" for tag, attrs in page.tags if tag == "section"]
     titles = dict(zip([section.title for section in report.sections], classes, strict=True))
-    first_page = ["Summary", "What to do next", "Population"]
+    first_page = ["Passed", "Measured and calibrated responses", "Population of the inputs"]
     assert [title for title, names in titles.items() if "lead" in names] == first_page
-    assert [title for title, names in titles.items() if "chapter" in names] == ["Model"]
+    assert [title for title, names in titles.items() if "chapter" in names] == ["Decision"]
     css = page.text("style")
+    assert "size: A4;" in css
     dark = css[css.index("prefers-color-scheme: dark") :]
-    names = set(re.findall(r"(--[a-z]+):", css))
-    assert names == set(re.findall(r"(--[a-z]+):", dark[: dark.index("figure")]))
+    light = css[: css.index("prefers-color-scheme: dark")]
+    names = set(re.findall(r"(--[a-z-]+):", light))
+    assert names == set(re.findall(r"(--[a-z-]+):", dark[: dark.index("figure")]))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "sign"), [("good", "\u2713"), ("bad", "\u2717"), ("open", "?")]
+)
+def test_a_verdict_has_a_sign_a_word_and_a_frame(
+    verdict: str, sign: str, tmp_path: Path, parse: Any
+) -> None:
+    """Colour is not all that distinguishes them, and Markdown has the sign as well."""
+    section = prb.reports.Section("Word", "Sentence.", verdict=verdict)
+    report = prb.Report("x", (section,))
+    page = parse(report._html())
+    (names,) = [attrs["class"] or "" for tag, attrs in page.tags if tag == "section"]
+    assert f"verdict {verdict}" in names
+    assert page.text("span") == sign
+    assert page.text("h2") == "Word"
+    markdown = report.to_markdown(tmp_path).read_text(encoding="utf-8")
+    assert f"## {sign} Word\n\n> Sentence." in markdown
+    with pytest.raises(ValueError, match='expected "good", "bad", "open" or nothing'):
+        prb.reports.Section("Word", verdict="green")
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of a colour (WCAG 2.1)."""
+    shares = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(shares <= 0.03928, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_verdicts_have_contrast_in_the_light_and_in_the_dark(page: Any) -> None:
+    light, dark = re.findall(r":root \{(.*?)\}", page.text("style"))[:2]
+    frames = set()
+    for block in (light, dark):
+        colours = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", block))
+        for verdict in ("good", "bad", "open"):
+            for text in (colours[verdict], colours["ink"]):
+                pair = sorted(map(luminance, (text, colours[f"{verdict}-tint"])))
+                assert (pair[1] + 0.05) / (pair[0] + 0.05) > 7  # AAA
+            frames.add(colours[verdict])
+    assert len(frames) == 6
+
+
+def test_date_and_software_are_those_of_the_results(calibrated: Any) -> None:
+    posterior = calibrated.posterior
+    attrs = posterior["posterior"].attrs
+    report = prb.Report("x", posterior=posterior, pictures=False)
+    assert report.date == attrs["created_at"][:10]
+    assert report.note == (
+        f"prbayes {attrs['prbayes_version']}, PyMC {attrs['pymc_version']}, "
+        f"ArviZ {attrs['arviz_version']}, intervals of 89% probability"
+    )
+    given = {"posterior": posterior, "pictures": False}
+    bare = prb.Report("x", date="", note="", **given)
+    assert (bare.date, bare.note) == ("", "")
+    damaged = posterior.copy(deep=True)
+    damaged["posterior"].attrs["created_at"] = "<script>"
+    assert prb.Report("x", posterior=damaged, pictures=False).date == ""

@@ -65,7 +65,8 @@ def test_a_picture_that_fails_leaves_a_sentence(
     monkeypatch.setitem(figures.ILLUSTRATIONS, "validity", illustration)
     before = plt.get_fignums()
     last = prb.Report("x", validity=calibrated.test).sections[-1]
-    assert last.text == ("This picture could not be made: three hyperparameters",)
+    assert last.title == "Pictures that could not be made"
+    assert last.text == ("Distribution of the u-values: three hyperparameters.",)
     assert last.picture is None
     assert plt.get_fignums() == before
 
@@ -76,7 +77,8 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
     # The others are for several outputs, a decision, and data of a test
     assert set(calls) == set(figures.ILLUSTRATIONS) - {"outputs", "sensitivity", "prediction"}
-    assert calls["responses"] == calls["population"] == ((posterior,), {"model": model})
+    assert calls["population"] == ((posterior,), {"model": model})
+    assert calls["responses"] == ((posterior,), {"model": model, "ecdf": True, "before": False})
     assert calls["posterior"] == (
         (posterior,),
         {"optimum": optimum, "model": model, "backend": "matplotlib"},
@@ -86,9 +88,10 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     assert calls["validity"] == ((test,), {})
     titles = [s.title for s in full.sections]
     for name in calls:
-        illustration = figures.ILLUSTRATIONS[name]
-        before = full.sections[: titles.index(illustration.title)]
-        assert [s.title for s in before if s.level == 2][-1] == illustration.after
+        before = full.sections[: titles.index(figures.ILLUSTRATIONS[name].title)]
+        chapter = [s.title for s in before if s.level == 2][-1]
+        expected = {"responses": "Passed", "population": "Answer"}  # on page one
+        assert chapter == expected.get(name, "Appendix")
     calls.clear()
     alone = prb.Report("x", posterior=posterior, optimum=optimum.to_datatree())
     assert set(calls) == {"posterior", "stages", "comparison"}
@@ -98,10 +101,10 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     assert calls == {"validity": (({"early": test, "late": test},), {})}
 
 
-def test_a_report_computes_no_response(
-    calls: Calls, section: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("seconds", [0.01, 900.0])
+def test_a_report_computes_responses_only_if_they_are_cheap(
+    seconds: float, calls: Calls, section: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tests of the family compute responses only where these are cheap."""
     count = 0
 
     def response(x: Any) -> Any:
@@ -116,17 +119,19 @@ def test_a_report_computes_no_response(
             "y", response, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0], propagation=once
         )
     optimum = prb.minimize(model)
+    optimum = replace(optimum, search=replace(optimum.search, seconds=seconds))
     before = count, optimum.evaluator.n_responses
     monkeypatch.setattr("prbayes.results.diagnose._seconds_of_test", lambda _: 31.0)
     made = prb.Report("x", model=model, optimum=optimum)
     assert (count, optimum.evaluator.n_responses) == before
-    assert "responses" not in calls
+    assert ("responses" in calls) == (seconds < 1)
     assert "Graph" not in [s.title for s in made.sections]
-    text = section(made, "Measured and calibrated responses").text
-    assert text == (
-        "This picture could not be made: it would recompute responses; "
-        "call prb.plots.plot_responses",
-    )
+    if seconds > 1:
+        text = section(made, "Pictures that could not be made").text
+        assert text == (
+            "Measured and calibrated responses: it would recompute responses; "
+            "call prb.plots.plot_responses.",
+        )
 
 
 @pytest.mark.parametrize(
@@ -213,10 +218,10 @@ def pair_of(a: Any, b: Any) -> Any:
 
 def test_pairs_of_outputs_are_drawn_where_responses_are_stored(calls: Calls) -> None:
     """Otherwise one sentence reports that all pictures of responses are missing."""
+    title = ["Pictures that could not be made"]
     data = np.random.default_rng(1).normal(size=(10, 2))
     draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 20)))})
     posterior = xr.DataTree.from_dict({"posterior": draws})
-    titles = ["Measured and calibrated responses", "Pairs of outputs"]
     for propagation, count in ((prb.Reweighted(256), 2), (prb.Resimulated(64), 0)):
         with pm.Model() as model:
             a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
@@ -224,9 +229,10 @@ def test_pairs_of_outputs_are_drawn_where_responses_are_stored(calls: Calls) -> 
             b = pm.Normal.dist(0.0, 1.0)
             prb.Simulator("y", pair_of, a, b, observed=data, **given)
         calls.clear()
-        made = figures.illustrate((prb.reports.Section("Data"),), gather(model, None, posterior))
-        assert len(calls) == count
-        assert [section.title for section in made[1:]] == titles[: max(count, 1)]
+        drawn, missing = figures.pictures_of(gather(model, None, posterior))
+        assert len({"responses", "outputs"} & set(calls)) == count
+        assert ("outputs" in drawn, bool(drawn["front"])) == (count == 2, count == 2)
+        assert [section.title for section in missing] == title[: 1 - count // 2]
 
 
 def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: Any) -> None:
@@ -238,8 +244,25 @@ def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: An
     results = {"model": model, "optimum": optimum, "posterior": posterior}
     prb.Report("x", **results, validation={"hot": (warm, later)}, labels=labels)
     given = {name: keywords.get("labels") for name, (_, keywords) in calls.items()}
+    assert not {keywords.get("prob") for _, keywords in calls.values()} - {None}
     assert given["responses"] == given["landscape"] == {"mu": "mean", "y": "stiffness (N/mm)"}
     assert given["comparison"] == {"mu": "mean"}
     assert given["prediction"] == {"hot": "at 200 °C"}
     with pytest.raises(KeyError, match="labels: got 'nu'"):
         prb.Report("x", model=model, optimum=optimum, labels={"nu": "typing error"})
+
+
+def test_all_intervals_have_the_probability_of_the_decision(calls: Calls, calibrated: Any) -> None:
+    model, optimum, posterior, _ = calibrated
+    numbers = {"probability": 0.1, "error": 0.01, "lower": 0.05, "upper": 0.2}
+    risk = xr.Dataset(numbers | {"by_draw": ("draw", [0.1])})
+    risk = risk.assign_attrs(prob=0.8, limit=4.0, below=0)
+    results = {"model": model, "optimum": optimum, "posterior": posterior}
+    report = prb.Report("x", **results, decision={"above": risk})
+    with_prob = ("population", "responses", "posterior")
+    assert {name: calls[name][1]["prob"] for name in with_prob} == dict.fromkeys(with_prob, 0.8)
+    assert "comparison" not in calls, "its intervals contain 89%"
+    text = report._html()
+    assert "intervals of 80% probability" in text
+    assert "80% from" in text
+    assert "89%" not in text

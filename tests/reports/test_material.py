@@ -27,15 +27,15 @@ def test_files_alone_tell_the_same(tmp_path: Path, calibrated: Any, section: Any
     trees = [xr.open_datatree(tmp_path / f, engine="h5netcdf").load() for f in ("p.nc", "o.nc")]
     alone = prb.Report("Shaft", posterior=trees[0], optimum=trees[1], pictures=False)
     full = prb.Report("Shaft", posterior=posterior, optimum=optimum, model=model, pictures=False)
-    titles = ["Summary", "Model", "Simulators", "Data", "Optimum", "Posterior", "Comparison"]
-    for title in [*titles, "Cost and origin"]:
+    titles = ["Not tested", "Answer", "Evidence", "Method", "Simulators", "Optimum", "Posterior"]
+    for title in [*titles, "Comparison of results", "Cost and origin"]:
         a, b = section(alone, title), section(full, title)
         assert a.text == b.text, title
         if a.table is not None:
             assert cells(a.table) == cells(b.table), title
     del trees[0]["posterior"].attrs["model"]
     without = prb.Report("Shaft", posterior=trees[0], pictures=False)
-    assert "Model" not in [s.title for s in without.sections]
+    assert "Simulators" not in [s.title for s in without.sections]
     assert "Posterior" in [s.title for s in without.sections]
 
 
@@ -51,7 +51,7 @@ def test_damaged_descriptions_are_ignored(text: str, calibrated: Any) -> None:
     posterior = calibrated[2].copy()
     posterior["posterior"].attrs["model"] = text
     titles = [s.title for s in prb.Report("x", posterior=posterior, pictures=False).sections]
-    assert "Model" not in titles
+    assert "Simulators" not in titles
     assert "Posterior" in titles
 
 
@@ -115,7 +115,7 @@ def test_validation_data_are_those_of_the_test(calibrated: Any) -> None:
         prb.area_test({"a": fresh, "b": 2 * fresh}, {"a": later, "b": 2 * later}, **fewer),
     ):
         report = prb.Report("x", validity=test, validation={"hot": (fresh, later)}, **given)
-        named = "(24 values: a and b)" in " ".join(report.sections[0].text)
+        named = "of 24 specimens (a and b) agree" in report.sections[0].text[0]
         assert named == (len(test.of_conditions) == 2)
         prb.Report("x", validity=test, validation={"hot": (fresh.round(2), later)}, **given)
         for wrong in (fresh[:7], fresh + 1.0, fresh[::-1]):
@@ -240,3 +240,21 @@ def test_what_is_wrong_is_told(case: str) -> None:
 @pytest.mark.parametrize("make", [posterior, optimum, validity])
 def test_nothing_is_told_of_what_is_sound(make: Callable[[], xr.DataTree]) -> None:
     assert not list(complaints(make()))
+
+
+def test_statistics_of_a_data_sheet_are_no_measured_responses() -> None:
+    sheet = prb.Summary(n=40, mean=3.1, sd=0.9)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("load", np.positive, x, observed=sheet, propagation=prb.Reweighted(256))
+    optimum = prb.minimize(model)
+    for given in ({"model": model, "optimum": optimum}, {"optimum": optimum.to_datatree()}):
+        material = gather(**given)
+        assert material.observed == {}
+        assert material.sheets == {"load": "n = 40, mean = 3.1, sd = 0.9"}
+        report = prb.Report("x", **given, pictures=False)
+        text = "The model was fitted to a data sheet of load (n = 40, mean = 3.1, sd = 0.9)"
+        assert report.sections[0].text[0].startswith(text)
+        (evidence,) = [s for s in report.sections if s.title == "Evidence"]
+        assert evidence.table is None
+        assert "Measured values" not in [s.title for s in report.sections]

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from prbayes._finding import counted
 from prbayes.reports.numbers import (
     alike,
     cells,
-    counted,
     number,
     percentage,
     places,

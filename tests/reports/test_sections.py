@@ -1,6 +1,7 @@
-"""The sections on model, data, metric, optima and posteriors, and their order."""
+"""The chapters of a report in order: data, method, decision, and the appendix."""
 
 import dataclasses
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,16 @@ from decisions import normal, optimum, same
 import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.optimize.convergence import Result
-from prbayes.reports.material import gather
+from prbayes.reports.assessment import data, population_in_units
+from prbayes.reports.material import gather, metrics_of
 from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import (
+    _labelled_inputs,
     _other_optimum,
-    data,
+    _runs,
+    measured_values,
     metric,
     optima,
-    population_in_units,
     posteriors,
 )
 from prbayes.response.outputs import Outputs
@@ -35,13 +38,14 @@ def test_model_and_data(
     assert row("cv", "distribution", page) == {
         "variable": "cv", "role": "deterministic", "distribution": "computed from sigma, mu",
     }  # fmt: skip
-    assert row("y", "inputs", page)["inputs"] == "Normal(mu, sigma)"
+    assert row("y", "inputs", page)["inputs"] == "x ~ Normal(mu, sigma)"
+    assert row("y", "runs", page)["runs"] == "256 runs, once; weighted for each population"
     data = row("y", "smallest", page)
     assert data["N"] == "30"
     found = [float(data[key]) for key in ("smallest", "largest", "mean", "sd")]
     expected = [observed.min(), observed.max(), observed.mean(), observed.std(ddof=1)]
     np.testing.assert_allclose(found, expected, atol=5.1e-4)
-    assert "y: 30 specimens: 100, 101" in " ".join(section(report, "Data").text)
+    assert "y: 30 specimens: 100, 101" in " ".join(section(report, "Evidence").text)
 
 
 def number_row(row: dict[str, str], *keys: str) -> list[float]:
@@ -59,8 +63,11 @@ def test_metric_optimum_and_posterior(
     np.testing.assert_allclose(of_posterior, expected, rtol=1e-3)
     of_optimum = float(row("optimum", "epsilon", page)["discrepancy"])
     assert of_optimum == pytest.approx(optimum.discrepancy, rel=1e-3)
-    text = section(report, "Metric and epsilon").text
+    text = section(report, "Cost and origin").text
     assert any(line.startswith("y: KullbackLeibler(") for line in text)
+    assert any(line.startswith("y: Reweighted(n=256, ") for line in text)
+    text = section(report, "Measured against simulated responses").text
+    assert "Here it is the Kullback-Leibler divergence." in text
     evaluations = f"after {optimum.search.n_evaluations} evaluations"
     assert evaluations in " ".join(section(report, "Optimum").text)
     summary = az.summary(posterior, ci_prob=0.89, ci_kind="eti", round_to="none")
@@ -84,11 +91,11 @@ def test_results_under_different_metrics(calibrated: Any) -> None:
     changed = first.copy(deep=True)
     table = changed["calibration"].to_dataset()
     changed["calibration"] = table.assign(metric=("simulator", ["Other()"]))
-    (same,) = metric(gather(optimum={"a": first, "b": first}))
-    assert [p.split(": ")[0] for p in same.text[1:]] == ["y"]
-    (different,) = metric(gather(optimum={"a": first, "b": changed}))
-    assert different.text[2] == "b, y: Other()."
-    assert different.text[1].startswith("a, y: KullbackLeibler(")
+    assert list(metrics_of(gather(optimum={"a": first, "b": first}))) == ["y"]
+    m = gather(optimum={"a": first, "b": changed})
+    assert list(metrics_of(m)) == ["a, y", "b, y"]
+    assert metrics_of(m)["b, y"] == "Other()"
+    (different,) = metric(m)
     assert "Epsilon" not in different.text[0], "optima have none"
     assert "epsilon" not in cells(different.table).header
 
@@ -99,9 +106,9 @@ def test_few_values_and_many_outputs() -> None:
     assert row == ("y", "1", "2.500", "2.500", "2.500", "\u2013")
     curve = np.random.default_rng(1).normal(size=(5, 40))
     outputs = {"y": Outputs(tuple(np.arange(40) / 2), "hour")}
-    about, correlations, values = data(
-        dataclasses.replace(m, observed={"y": curve}, outputs=outputs)
-    )
+    m = dataclasses.replace(m, observed={"y": curve}, outputs=outputs)
+    (about,) = data(m)
+    correlations, values = measured_values(m)
     rows = cells(about.table).rows
     assert len(rows) == len(cells(correlations.table).rows) == 12
     assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
@@ -142,10 +149,12 @@ def frame(measured: Any) -> pm.Model:
 
 
 def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured: Any) -> None:
-    about, correlations, values = data(gather(frame))
+    m = gather(frame)
+    (about,) = data(m)
+    correlations, values = measured_values(m)
     table = cells(about.table)
     assert table.header == (
-        *("simulator", "output", "units", "N", "failed", "missing"),
+        *("measured", "output", "units", "N", "failed", "missing"),
         *("smallest", "largest", "mean", "sd"),
     )
     first, second = table.rows
@@ -165,14 +174,17 @@ def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured:
 
 def test_outputs_and_units_are_those_of_the_model_in_a_result_alone(frame: Any) -> None:
     optimum = prb.minimize(frame)
-    stored = data(gather(optimum=optimum.to_datatree()))
-    for section, of_model in zip(stored, data(gather(frame)), strict=True):
+
+    def sections(m: Any) -> list[Any]:
+        return [*data(m), *measured_values(m)]
+
+    stored = sections(gather(optimum=optimum.to_datatree()))
+    for section, of_model in zip(stored, sections(gather(frame)), strict=True):
         assert section.text == of_model.text
         if section.table is not None:
             assert cells(section.table) == cells(of_model.table)
     report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
-    data_of = "on 20 specimens with 2 outputs of frame, by the joint probability residual"
-    assert data_of in report.sections[0].text[1]
+    assert "fitted to 20 specimens with 2 outputs of frame, and" in report.sections[0].text[0]
     values = xr.DataArray([1.0, 2.0, 4.0], dims="specimen", attrs={"units": "N/mm"})
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
@@ -180,7 +192,7 @@ def test_outputs_and_units_are_those_of_the_model_in_a_result_alone(frame: Any) 
         prb.Simulator("k", np.positive, x, observed=values, **given)
     optimum = prb.minimize(model)
     for material in (gather(model), gather(optimum=optimum.to_datatree())):
-        about, listed = data(material)
+        about, listed = sections(material)
         assert listed.text[1] == "k: 1.000, 2.000, 4.000."
         assert about.table["units"].tolist() == ["N/mm"]
     assert prb.plots.plot_responses(optimum).axes[0].get_xlabel() == "k (N/mm)"
@@ -276,24 +288,55 @@ def test_a_covariance_is_shown_by_standard_deviations_and_correlations(calibrate
         assert [row[0] for row in cells(section.table).rows] == expected
 
 
+CHAPTERS = ["Decision", "Answer", "Evidence", "Method", "Diagnostics", "Appendix"]
+
+
 def test_sections_depend_on_the_results_and_come_in_order(
     calibrated: Any, report: prb.Report, page: Any
 ) -> None:
     def chapters(report: prb.Report) -> list[str]:
         return [section.title for section in report.sections if section.level == 2]
 
-    of_model = ["Summary", "Model", "Data", "Metric and epsilon"]
-    results = ["Optimum", "Posterior", "Comparison", "Diagnostics", "Validity", "Cost and origin"]
-    assert chapters(report) == [*of_model, *results]
+    assert chapters(report) == ["Passed", *CHAPTERS]
     assert page.text("h1") == "Shaft"
     assert "2 May 2024" in page.text("p")
     alone = prb.Report("x", model=calibrated.model, pictures=False)
-    assert chapters(alone) == of_model
-    assert "No result of a calibration was given." in alone.sections[0].text[0]
+    assert chapters(alone) == ["Not calibrated", "Evidence", "Method", "Appendix"]
+    assert alone.sections[0].text == ("No result of a calibration was given.",)
     tested = prb.Report("x", validity=calibrated.test, pictures=False)
-    assert chapters(tested) == ["Summary", "Validity"]
+    assert chapters(tested) == ["Passed", "Evidence", "Appendix"]
     optimum = prb.Report("x", optimum=calibrated.optimum, pictures=False)
-    assert {"Posterior", "Comparison", "Validity"}.isdisjoint(chapters(optimum))
+    assert chapters(optimum) == ["Not tested", *CHAPTERS]
+    titles = {section.title for section in optimum.sections}
+    assert {"Posterior", "Comparison of results", "Test of the model"}.isdisjoint(titles)
+
+
+def test_inputs_and_runs_are_in_words() -> None:
+    labels = {"k": "stiffness (kN/mm)", "load": "load (kN)", "mean": "never"}
+    text = "k (N/m) ~ Normal(mean, sd), load = 10"
+    assert _labelled_inputs(text, labels) == (
+        "stiffness (kN/mm) ~ Normal(mean, sd), load (kN) = 10"
+    )
+    assert _labelled_inputs(text, {}) == text
+    assert _runs("Resimulated(n=512, random_seed=0)") == "512 runs for each population"
+    assert _runs("Own(a=3)") == "Own"
+    assert _runs("emulator of 64 runs") == "emulator of 64 runs"
+
+
+def test_labels_of_numbers_among_the_inputs_are_taken(section: Any) -> None:
+    with pm.Model() as model:
+        k = pm.Normal.dist(pm.Normal("mu", 3, 1), 0.3)
+        given: Any = {"metric": prb.AreaMetric(), "observed": [3.0, 3.3, 3.6]}
+        prb.Simulator("y", bending, k, 10.0, units={"k": "kN/mm"}, **given)
+    optimum = prb.minimize(model)
+    for labels, expected in (({}, "load = 10"), ({"load": "load (kN)"}, "load (kN) = 10")):
+        report = prb.Report("x", model=model, optimum=optimum, labels=labels, pictures=False)
+        (inputs,) = section(report, "Simulators").table["inputs"]
+        assert inputs == f"k (kN/mm) ~ Normal(mu, 0.3), {expected}"
+
+
+def bending(k: Any, load: float) -> Any:
+    return load / k
 
 
 @pytest.mark.long
@@ -311,16 +354,14 @@ def test_several_simulators_and_vectors(tmp_path: Path, section: Any, parse: Any
         )
     optimum = prb.minimize(model)
     made = prb.Report("x", model=model, optimum=optimum, pictures=False)
-    data = cells(section(made, "Data").table)
+    data = cells(section(made, "Evidence").table)
     assert [r[:2] for r in data.rows] == [("first", "4"), ("second", "3")]
     assert [r[0] for r in cells(section(made, "Optimum").table).rows] == [
         "mu[shaft]",
         "mu[disk]",
         "k",
     ]
-    assert [
-        p for p in section(made, "Metric and epsilon").text if p.startswith("first: AreaMetric(")
-    ]
+    assert [p for p in section(made, "Cost and origin").text if p.startswith("first: AreaMetric(")]
     parse(made._html())
     made.to_markdown(tmp_path)
 
@@ -349,7 +390,7 @@ def test_each_kind_of_question_has_a_table() -> None:
     titles = [section.title for section in sections]
     at = titles.index("Decision")
     assert titles[at + 1 : at + 4] == [
-        "Probability of exceedance",
+        "Probability beyond a limit",
         "What moves it",
         "What more data would change",
     ]
@@ -371,45 +412,100 @@ def test_each_kind_of_question_has_a_table() -> None:
 
 def test_sensitivities_have_a_picture_and_no_question_no_section() -> None:
     sections = decided(decision=questions()["influence"], pictures=True).sections
-    (picture,) = [s for s in sections if s.title == "Shares of hyperparameters and inputs"]
+    (picture,) = [s for s in sections if s.title == "Shares of parameters and inputs"]
     assert picture.picture
-    assert "Decision" not in [section.title for section in decided().sections]
+    assert "Probability beyond a limit" not in [section.title for section in decided().sections]
 
 
-def test_the_summary_has_the_probability_and_whether_it_is_accepted() -> None:
-    said = decided(decision=questions()).sections[0].text
-    (risk,) = [line for line in said if line.startswith("risk: ")]
-    assert risk.startswith("risk: probability 0.0069 (89% interval 0.00")
-    assert risk.endswith("; the requirement, at most 0.1, is met.")
+def test_page_one_has_the_probability_and_whether_it_is_accepted() -> None:
+    front, requirement, *_ = decided(decision=questions()).sections
+    (bounds,) = [line for line in front.text if line.startswith("bounds: ")]
+    assert re.search(r"[\d.]+% to [\d.]+% of the specimens are expected \(interval ", bounds)
+    assert (requirement.title, requirement.verdict) == ("Requirement met", "good")
+    (text,) = requirement.text
+    assert re.match(r"risk: 0\.\d+% of the specimens are expected \(interval 0\.\d+% to \d", text)
+    assert text.endswith("; allowed: at most 10%.")
 
 
-def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
+@pytest.mark.parametrize(
+    ("answer", "mark"), [("met", "good"), ("not met", "bad"), ("not decided", "open")]
+)
+def test_requirements_look_different(answer: str, mark: str) -> None:
+    table = questions()["risk"].assign_attrs(verdict=answer)
+    box = decided(decision={"risk": table}).sections[1]
+    assert (box.title, box.verdict) == (f"Requirement {answer}", mark)
+
+
+def refuted() -> prb.validation.ValidityTest:
+    """A test that rejects the model."""
     model, x = normal()
     predicted = prb.predict(optimum(), same, x, model=model)
     far = np.random.default_rng(0).normal(4.0, 0.5, 20)
     test = prb.area_test({"far": far}, {"far": predicted})
     assert test.rejected
-    sections = decided(decision=questions(), validity=test).sections
-    assert not [line for line in sections[0].text if "probability 0" in line]
-    assert "The questions of a decision are not answered by it." in sections[0].text
+    return test
+
+
+def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
+    sections = decided(decision=questions(), validity=refuted()).sections
+    front, requirement, *_ = sections
+    assert (front.title, front.verdict) == ("Rejected", "bad")
+    assert len(front.text) == 1, "no probability"
+    assert (requirement.title, requirement.verdict) == ("Requirement not answered", "open")
+    assert requirement.text == (
+        "risk; allowed: at most 10% of the specimens. There is no answer: the model is rejected.",
+    )
     (decision,) = [section for section in sections if section.title == "Decision"]
-    assert decision.text[0].startswith("The calibrated model was rejected")
-    (risks,) = [s.table for s in sections if s.title == "Probability of exceedance"]
+    assert decision.text[0].startswith("Measurements contradict the model")
+    (risks,) = [s.table for s in sections if s.title == "Probability beyond a limit"]
     assert risks["requirement is"].tolist() == ["not answered", "", ""]
-    asked = decided(validity=test).sections
-    assert not [s for s in asked for line in s.text if "prb.exceedance" in line]
+    asked = decided(validity=refuted()).sections
+    assert not [s for s in asked for line in s.text if "Ask for the probability" in line]
 
 
 def test_a_requirement_is_not_answered_before_problems_are_removed() -> None:
     finding = Finding("not-converged", "The optimiser did not converge.")
     unfinished = dataclasses.replace(optimum(), findings=(finding,))
     sections = prb.Report("x", optimum=unfinished, decision=questions(), pictures=False).sections
-    (risk,) = [line for line in sections[0].text if line.startswith("risk: ")]
-    assert risk.endswith("; the requirement, at most 0.1, is not answered.")
-    (risks,) = [s.table for s in sections if s.title == "Probability of exceedance"]
+    front, requirement, *_ = sections
+    assert (front.title, front.verdict) == ("Not ready", "open")
+    assert requirement.title == "Requirement not answered"
+    assert requirement.text[0].endswith("There is no answer: solve the problems first.")
+    (risks,) = [s.table for s in sections if s.title == "Probability beyond a limit"]
     assert risks["requirement is"].tolist()[0] == "not answered"
     (decision,) = [section for section in sections if section.title == "Decision"]
-    assert decision.text[0].startswith("Remove the problems")
+    assert decision.text[0].startswith("Solve the problems")
+
+
+def test_the_first_chapters_have_no_names_of_functions(calibrated: Any) -> None:
+    """Page one, decision, answer and evidence are for a reader who decides."""
+    model, best, posterior, test = calibrated
+    rejected = dataclasses.replace(test, p_value=0.001)
+    bad = posterior.copy(deep=True)
+    bad["posterior"]["mu"][0] += 5.0
+    results: dict[str, Any] = {"model": model, "optimum": best}
+    titles = []
+    for made in (
+        prb.Report("x", **results, posterior=posterior, validity={"a": test, "b": test}),
+        prb.Report("x", **results, pictures=False),
+        prb.Report("x", posterior=bad, validity=rejected, pictures=False),
+        prb.Report("x", posterior=bad, pictures=False),
+        decided(decision=questions(), pictures=True),
+        decided(decision=questions(), validity=refuted()),
+    ):
+        titles.append(made.sections[0].title)
+        assert made.sections[0].verdict
+        for section in made.sections:
+            if section.title == "Method":
+                break
+            table = () if section.table is None else sum(cells(section.table).rows, ())
+            for text in (section.title, *section.text, section.caption, section.alt, *table):
+                words = (
+                    r"prb\.|\w\(\w*=|random_seed|[Hh]yperparameter|[Ll]og-density|u-value|epsilon"
+                )
+                assert not re.search(words, text), text
+                assert not re.search(r"\w\(s\)", text), text
+    assert titles == ["Passed", "Not tested", "Rejected", "Not ready", "Not tested", "Rejected"]
 
 
 def test_what_is_no_decision_or_another_problem_s_is_refused() -> None:
@@ -432,7 +528,10 @@ def test_the_population_is_in_units_near_the_answer(calibrated: Any) -> None:
     assert part.level == 3
     table = prb.population(posterior, model=model)
     cells = dict(zip(part.table[""], part.table["stiffness (kN/mm)"], strict=True))
-    assert list(cells) == [q.replace("cv", "cv, %") for q in table["quantity"].values.tolist()]
+    assert list(cells)[:5] == [
+        *("mean", "standard deviation", "coefficient of variation", "5% quantile", "median")
+    ]
+    assert cells["coefficient of variation"].split(" (")[0].endswith("%")
     lower = float(table.lower.sel(quantity="mean")[0])
     assert cells["mean"].split("(")[1].startswith(f"{lower:.2f}")
     assert cells["A-basis"] == f"{float(table.estimate.sel(quantity='A-basis')[0]):.4g}"

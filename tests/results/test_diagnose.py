@@ -326,7 +326,7 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
     assert f"y: {share:.1%} of specimens fail" in repr(best)
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, **QUIET)
     assert 0 <= tree["calibration"]["failed_mass_at_best"].item() < 0.3
-    text = r"y: the response failed at \d+ point\(s\), the first at \(\d.*license server"
+    text = r"y: the response failed at \d+ points?, the first at \(\d.*license server"
     for result in (best, best.to_datatree(), tree):
         (message,) = [m for m in prb.diagnose(result).messages if "failed" in m]
         assert re.search(text, message)
@@ -353,7 +353,7 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     # A finite number in place of a failed response looks like any other.
     expected = ([], ["harmless-failures"]) if share < 0.1 and value else (["failed-responses"], [])
     assert ([f.code for f in findings], [f.code for f in harmless]) == expected
-    text = "y: the response failed at 2 point(s), the first at (3.5): it broke; "
+    text = "y: the response failed at 2 points, the first at (3.5): it broke; "
     assert str([*findings, *harmless][0]).startswith(text)
 
 
@@ -383,7 +383,7 @@ def test_components_of_curves_are_reported(components: int | None) -> None:
             "crack", grown, *inputs, metric=metric, observed=observed, propagation=propagation
         )
     best = prb.minimize(model, starts=0)
-    note = f"crack: 12 outputs are compared by {components or 2} principal component(s)"
+    note = f"crack: 12 outputs are compared by {components or 2} principal component"
     for result in (best, best.to_datatree()):
         diagnosis = prb.diagnose(result)
         assert any(line.startswith(note) for line in diagnosis.notes)
