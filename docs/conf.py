@@ -92,6 +92,7 @@ numpydoc_xref_aliases = PUBLIC | {
 }
 default_role = "py:obj"
 nitpicky = True
+nitpick_ignore = [("py:obj", "matplotlib.pyplot.figure")]
 
 # Names of other projects that these pages refer to, in files kept here: the documentation builds
 # without a network.

@@ -19,6 +19,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 from arviz_plots.plot_collection import PlotCollection
 from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.backends.base import MultiTrace
@@ -33,15 +34,18 @@ from pymc.model.fgraph import clone_model
 from pymc.printing import str_for_dist
 from pymc.pytensorf import join_nonshared_inputs
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
+from pymc.stats.convergence import log_warnings, run_convergence_checks
 from pytensor import shared
 from pytensor.compile import function
 from pytensor.compile.mode import Mode, optdb
+from pytensor.compile.ops import ViewOp
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_not_implemented
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
-from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
+from pytensor.graph.replace import _vectorize_node, clone_replace, graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
+from pytensor.graph.rewriting.utils import rewrite_graph
 from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.blockwise import Blockwise
@@ -53,6 +57,8 @@ from pytensor.tensor.shape import Shape
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorConstant, TensorVariable
+from pytensor.xtensor.basic import xtensor_from_tensor
+from pytensor.xtensor.vectorization import XRV
 
 
 def test_the_collection_of_arviz_is_that_of_its_plots() -> None:
@@ -126,6 +132,33 @@ def test_variables_of_models_and_of_their_clones() -> None:
     assert set(RandomVariable.__props__) == {"name", "signature", "dtype", "inplace"}
     mu.owner.op = type(op)(**op._props_dict())
     assert mu.owner.op == op
+
+
+def test_graphs_of_pymc_dims_are_lowered_to_tensors() -> None:
+    import pymc.dims as pmd
+
+    with pm.Model(coords={"part": ["u", "v"]}) as model:
+        mu = pmd.Normal("mu", 0, 1, dims="part")
+        double = pmd.Deterministic("double", 2 * mu)
+    assert isinstance(double.owner.op, ViewOp)
+    symbol = pt.dvector("mu")
+    assert xtensor_from_tensor(symbol, dims=mu.type.dims).type.dims == ("part",)
+    x = pmd.LogNormal.dist(mu.isel(part=0), 1)
+    assert isinstance(x.owner.op, XRV)
+    (drawn,) = rewrite_graph(clone_replace([x.values]), include=("lower_xtensor",))
+    assert isinstance(drawn.owner.op, RandomVariable)
+    assert isinstance(x.owner.op, XRV)
+    assert not any(hasattr(v.type, "dims") for v in [drawn, *drawn.owner.inputs])
+    assert model.rvs_to_values[model["mu"]].type.dims == ("part",)
+
+
+def test_convergence_checks_take_any_draws(caplog: pytest.LogCaptureFixture) -> None:
+    draws = np.random.default_rng(0).normal([[0.0], [9.0]], size=(2, 200))
+    groups = {"mu": (("chain", "draw"), draws), "sigma": (("chain", "draw"), draws)}
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(groups)})
+    warnings = run_convergence_checks(tree, two_normals())
+    log_warnings(warnings)
+    assert "rhat" in caplog.text
 
 
 def test_walk_and_ancestors() -> None:

@@ -499,6 +499,23 @@ def test_a_number_says_why() -> None:
 
 # Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
+    "posterior.sampler": {
+        "pymc.stats.convergence.log_warnings",
+        "pymc.stats.convergence.run_convergence_checks",
+    },
+    "response.dims": {
+        "pymc.distributions.distribution.SymbolicRandomVariable",
+        "pytensor.tensor.random.op.RandomVariable",
+        "pytensor.compile.ops.ViewOp",
+        "pytensor.graph.basic.Constant",
+        "pytensor.graph.basic.Variable",
+        "pytensor.graph.replace.clone_replace",
+        "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.rewriting.utils.rewrite_graph",
+        "pytensor.graph.traversal.ancestors",
+        "pytensor.xtensor.basic.xtensor_from_tensor",
+        "pytensor.xtensor.vectorization.XRV",
+    },
     "plots.posterior": {"arviz_plots.plot_collection.PlotCollection"},
     "posterior.results": {
         "pymc.backends.base.MultiTrace",
@@ -618,7 +635,6 @@ INNER = {
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.inputs": {
-        "pymc.distributions.distribution.SymbolicRandomVariable",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import arviz as az
+import matplotlib.pyplot as plt
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods
@@ -353,6 +354,24 @@ def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:
 
 
 @pytest.mark.usefixtures("no_run")
+def test_loo_pit_is_the_predictive_distribution_function_without_the_specimen() -> None:
+    y = np.random.default_rng(0).normal(6, 2, 40)
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 10), pm.HalfNormal("sigma", 5))
+        prb.Simulator("y", lambda x: 2 * x, x, observed=y)
+        idata = prb.sample(progressbar=False)
+    pit = az.loo_pit(idata)["y"].values
+    exact = []
+    for i in range(len(y)):
+        rest = np.delete(y, i)
+        scale = rest.std(ddof=1) * np.sqrt(1 + 1 / len(rest))
+        exact.append(t.cdf((y[i] - rest.mean()) / scale, len(rest) - 1))
+    # Five standard errors of 4000 draws, and the difference between the priors.
+    assert np.abs(pit - exact).max() < 0.05
+    az.plot_loo_pit(idata)
+    plt.close("all")
+
+
 def test_what_has_no_meaning_is_refused(optimum: prb.Optimum) -> None:
     fresh = build(np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N)))
     calls: list[tuple[Callable[[], Any], str]] = [
@@ -462,6 +481,11 @@ def test_two_inputs_and_outputs() -> None:
     assert prb.diagnose(optimum).ok
     table = prb.compare({"optimum": optimum}, model=model)
     assert "Joint(AreaMetric)" in table
+    idata = prb.sample(200, model=model, optimum=optimum, progressbar=False)
+    for output in range(2):
+        pit = az.loo_pit(idata.isel(output=output))["y"]
+        assert pit.shape == (N,)
+        assert 0.2 < float(pit.mean()) < 0.8
 
 
 @pytest.mark.long

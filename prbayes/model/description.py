@@ -23,7 +23,8 @@ from prbayes.model.measurement import Measurement
 from prbayes.model.random_variable import Node, nodes, response_name
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.response.inputs import argument_names, is_random, unit_of
+from prbayes.response.dims import is_random
+from prbayes.response.inputs import argument_names, unit_of
 from prbayes.response.outputs import Outputs
 
 # Fields of the description of a variable, and of a simulator.

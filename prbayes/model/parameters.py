@@ -30,6 +30,7 @@ from prbayes.response.compile import (
     with_leading_axis,
 )
 from prbayes.response.condition import is_condition
+from prbayes.response.dims import values_of, with_dims, without_dims
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 
@@ -97,7 +98,7 @@ class Hyperparameters:
     def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
         """Return graphs of the value variables as graphs of one vector theta, and that vector."""
         outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
-        return list(outputs), theta
+        return without_dims(outputs), theta
 
     def compile(self, graphs: Sequence[Any]) -> Any:
         """Compile graphs of the value variables into a function of thetas, shape (P, d).
@@ -117,12 +118,13 @@ class Hyperparameters:
         model = self.model
         with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
+        terms = [values_of(term) for term in terms]
         jacobian: Any = np.float64(0.0)
         for rv in model.free_RVs:
             transform = model.rvs_to_transforms[rv]
             if transform is not None:
                 value = model.rvs_to_values[rv]
-                jacobian += transform.log_jac_det(value, *rv.owner.inputs).sum()
+                jacobian += values_of(transform.log_jac_det(value, *rv.owner.inputs)).sum()
         graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
         return self.compile([*(term.sum() for term in terms), *graphs])
 
@@ -202,10 +204,10 @@ class Hyperparameters:
             rv = self.model.values_to_rvs[value_variable]
             transform = self.model.rvs_to_transforms[rv]
             value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
-            columns.append(pt.atleast_1d(value).ravel())
-        symbols = [rv.type() for rv in self.model.free_RVs]
-        swap = dict(zip(self.model.free_RVs, symbols, strict=True))
-        theta = graph_replace(pt.concatenate(columns), swap, strict=False)
+            columns.append(pt.atleast_1d(values_of(value)).ravel())
+        symbols = [values_of(rv).type() for rv in self.model.free_RVs]
+        swap = {v: with_dims(s, v) for v, s in zip(self.model.free_RVs, symbols, strict=True)}
+        (theta,) = without_dims(graph_replace([pt.concatenate(columns)], swap, strict=False))
         batched = with_leading_axis(symbols)
         graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
         return compiled(batched, [graph], allow_input_downcast=True)

@@ -62,6 +62,7 @@ from prbayes.response.condition import (
     refuse_covariates,
     refuse_vectors_of_specimens,
 )
+from prbayes.response.dims import values_of
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -529,7 +530,7 @@ def _measurement_variables(
                 f"{name}: metric: {role}: got {value}, expected a named variable of the model, "
                 "such as pm.HalfNormal('error', 0.1), or a number"
             )
-        extras[role] = value
+        extras[role] = values_of(value)
     return extras
 
 

@@ -67,7 +67,7 @@ def plot_optimizer(
         Labels of hyperparameters by name, with units.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------
@@ -157,7 +157,7 @@ def plot_stages(
         Labels of statistics or simulators by name.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------

@@ -60,7 +60,7 @@ def plot_individuals(
         Labels of inputs, conditions and simulators by name, with units.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------

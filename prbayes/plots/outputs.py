@@ -82,7 +82,7 @@ def plot_outputs(
         Labels of outputs by name, with units.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------

@@ -72,7 +72,7 @@ def plot_population(
         Labels of inputs by name, with units.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------

@@ -108,7 +108,7 @@ def plot_responses(
         Labels of simulators or outputs by name, with units: ``{"crack": "relative length"}``.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
-        `matplotlib.pyplot.figure`.
+        ``matplotlib.pyplot.figure``.
 
     Returns
     -------

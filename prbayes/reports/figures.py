@@ -48,14 +48,12 @@ ILLUSTRATIONS = {
         title="Measured and calibrated responses",
         alt="Distribution function of the measured responses with that of the calibrated "
         "population, one panel per simulator or output.",
-        caption="Measured responses and the calibrated population, as shares of the specimens.",
     ),
     "outputs": Illustration(
         plot_outputs,
         title="Pairs of outputs",
         alt="Measured specimens as points, one panel per pair of outputs, with outlines of the "
         "calibrated population.",
-        caption="Measured specimens, and regions of the calibrated population.",
     ),
     "optimizer": Illustration(
         plot_optimizer,
@@ -194,8 +192,8 @@ def _computes_responses(model: pm.Model) -> bool:
 # -- drawing ---------------------------------------------------------------------------------
 
 
-def pictures_of(m: Material) -> tuple[dict[str, list[Section]], list[Section]]:
-    """Return the pictures by name, and a section on those that could not be made.
+def pictures_of(m: Material) -> dict[str, list[Section]]:
+    """Return the pictures by name, and under "missing" a section on those that could not be made.
 
     The one of measured values beside predicted ones, or else beside the calibrated population, is
     called "front".
@@ -212,15 +210,12 @@ def pictures_of(m: Material) -> tuple[dict[str, list[Section]], list[Section]]:
     graph = None if m.model is None else _graph(m.model)
     if graph is not None:
         names = ", ".join(variable["name"] for variable in (m.description or {})["variables"])
-        graph_section = Section(
-            "Graph",
-            picture=graph,
-            alt=f"Graph of the model: arrows from its variables ({names}) to the simulators.",
-            caption="Variables of the model; filled: compared with measured responses.",
-            level=3,
-        )
-        drawn["graph"] = [graph_section]
-    return drawn, [Section("Pictures that could not be made", missing, level=3)] if missing else []
+        alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
+        caption = "Variables of the model; filled: compared with measured responses."
+        drawn["graph"] = [Section("Graph", picture=graph, alt=alt, caption=caption, level=3)]
+    if missing:
+        drawn["missing"] = [Section("Pictures that could not be made", missing, level=3)]
+    return drawn
 
 
 def _picture(illustration: Illustration, request: Request) -> Section | str:

@@ -65,14 +65,12 @@ from prbayes.validation.conditions import DIRECTION
 
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
     """Return the sections that the material allows, with or without pictures."""
-    drawn, missing = pictures_of(m) if pictures else ({}, [])
+    drawn = pictures_of(m) if pictures else {}
     sections: list[Section] = []
     for title, parts in _CHAPTERS.items():
         chapter: list[Section] = []
         for part in parts:
             chapter += part(m) if callable(part) else drawn.get(part, [])
-        if title == "Appendix":
-            chapter += missing
         if chapter and chapter[0].level == 3:
             chapter.insert(0, Section(title))
         sections += chapter
@@ -649,9 +647,7 @@ def origin(m: Material) -> list[Section]:
             seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
         seed = record.get("random_seed")
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
-    text = [
-        "Responses are runs for one specimen; those of a common design are counted in each result."
-    ]
+    text = ["Responses are runs for one specimen; those of a common design are counted in each."]
     text += [f"{name}: {metric}." for name, metric in metrics_of(m).items()]
     text += [f"{s['name']}: {s['propagation']}." for s in m.simulators]
     packages = ", ".join(f"{name} {version}" for name, version in versions_of(m).items())
@@ -674,6 +670,6 @@ _CHAPTERS: dict[str, tuple[Any, ...]] = {
     "Appendix": (
         *(metric, optima, "optimizer", "landscape"),
         *(posteriors, "posterior", "stages", comparison, "comparison", support),
-        *(validity, "validity", specimens, measured_values, origin),
+        *(validity, "validity", specimens, measured_values, origin, "missing"),
     ),
 }

@@ -20,7 +20,8 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import Floats
 from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
 from prbayes.response.condition import is_condition
-from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
+from prbayes.response.dims import is_random, without_dims
+from prbayes.response.inputs import Inputs, event_shape, quiet_logp
 
 # Operations of distributions, for `isinstance`.
 MVNORMAL = type(MvNormal.rv_op)
@@ -227,9 +228,13 @@ class PriorSampler:
     @interpreted()
     def __init__(self, drawn: Sequence[TensorVariable]) -> None:
         self._names = ", ".join([str(v.name) for v in drawn])
+        copies = without_dims(drawn)
+        is_copied = any(x is not y for x, y in zip(copies, drawn, strict=True))
+        drawn = copies
         self._shapes = [event_shape(v) for v in drawn]
-        # PyMC gives a `str_repr` to the variables of a model.
-        parents = [v for v in ancestors(drawn) if hasattr(v, "str_repr") and is_random(v)]
+        # PyMC gives a `str_repr` to the variables of a model, which copies do not have.
+        random = list(filter(is_random, ancestors(drawn)))
+        parents = [v for v in random if is_copied or hasattr(v, "str_repr")]
         variables = dict.fromkeys([*drawn, *parents])
         n = pt.iscalar("n")
         try:
@@ -269,6 +274,7 @@ class PriorPoints:
 
     @interpreted()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
+        variables = without_dims(variables)
         self._shapes = [event_shape(v) for v in variables]
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
         self.size = sum(self._sizes)

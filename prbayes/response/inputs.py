@@ -21,6 +21,13 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import NO_POPULATION, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
+from prbayes.response.dims import (
+    foreign_variable,
+    has_dims,
+    input_without_dims,
+    is_random,
+    values_of,
+)
 
 
 class Inputs:
@@ -64,7 +71,8 @@ class Inputs:
         self.data: dict[str, Any] = {
             str(variable.name or f"shared variable {i}"): variable
             for i, variable in enumerate(_ancestry([*self.aleatory, *self.epistemic]))
-            if hasattr(variable, "get_value") and isinstance(variable, TensorVariable)
+            if hasattr(variable, "get_value")
+            and (isinstance(variable, TensorVariable) or has_dims(variable))
         }
 
     def parents_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
@@ -151,7 +159,8 @@ def read_inputs(
 
     ``fixed`` is whether they may depend on no hyperparameter.
     """
-    model_variables: set[Variable] = set(model.basic_RVs)
+    tensors = {v: values_of(v) for v in model.basic_RVs}
+    model_variables: set[Variable] = {*tensors, *tensors.values()}
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
     parents: dict[TensorVariable, None] = {}
@@ -160,9 +169,8 @@ def read_inputs(
         label = f"{name}: input {i + 1}"
         x = argument
         if isinstance(x, Variable):
-            ancestry = _ancestry([x])
-            has_dims = any(hasattr(v.type, "dims") for v in ancestry)
-            if not has_dims and all(hasattr(v, "data") for v in ancestry if v.owner is None):
+            x = input_without_dims(x, tensors)
+            if all(hasattr(v, "data") for v in _ancestry([x]) if v.owner is None):
                 x = x.eval(mode=PLAIN)  # of constants alone
         if not isinstance(x, Variable):
             try:
@@ -191,7 +199,8 @@ def read_inputs(
         ancestry = _ancestry([x], ends)
         parents.update(dict.fromkeys([v for v in ancestry if v in ends]))
         latent = [v for v in ancestry if v not in ends and is_random(v)]
-        _refuse_foreign_variables(x, ancestry, latent, label)
+        foreign = foreign_variable(argument, model_variables)
+        _refuse_foreign_variables(x, ancestry, latent if foreign is None else [foreign], label)
         if x in ends or not latent:
             arguments.append(x)
             continue
@@ -254,14 +263,7 @@ def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
 def _refuse_foreign_variables(
     x: Variable, ancestry: Sequence[Variable], latent: Sequence[Variable], label: str
 ) -> None:
-    """Refuse variables of `pymc.dims`, loose symbols, and variables of another model."""
-    for variable in ancestry:
-        if hasattr(variable.type, "dims"):
-            raise TypeError(
-                f"{label}: got {variable} of pymc.dims, expected variables of PyMC itself, since "
-                "populations are evaluated in batches of plain arrays; write "
-                "pm.Normal(..., dims=...) and pm.Normal.dist(...) for all that simulators depend on"
-            )
+    """Refuse loose symbols, and variables of another model."""
     # Constants, shared variables and generators have a value.
     loose = [
         v
@@ -269,7 +271,7 @@ def _refuse_foreign_variables(
         if v.owner is None and not hasattr(v, "data") and not hasattr(v, "get_value")
     ]
     # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
-    foreign = [v for v in latent if hasattr(v, "str_repr")]
+    foreign = [v for v in latent if hasattr(v, "str_repr") or has_dims(v)]
     if loose or foreign:
         raise TypeError(
             f"{label}: got {x} which depends on {[*loose, *foreign][0]}, expected a `.dist()`, a "
@@ -286,17 +288,6 @@ def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
         return pm.logp(dist, x, warn_rvs=False)
-
-
-def is_random(variable: Variable) -> bool:
-    """Return whether a variable of a graph is a random one: drawn, not computed."""
-    if variable.owner is None:
-        return False
-    op = variable.owner.op
-    return (
-        isinstance(op, RandomVariable | pm.distributions.distribution.SymbolicRandomVariable)
-        and variable is variable.owner.outputs[op.default_output or 0]
-    )
 
 
 def event_shape(dist: TensorVariable) -> tuple[int, ...]:

@@ -229,10 +229,10 @@ def test_pairs_of_outputs_are_drawn_where_responses_are_stored(calls: Calls) -> 
             b = pm.Normal.dist(0.0, 1.0)
             prb.Simulator("y", pair_of, a, b, observed=data, **given)
         calls.clear()
-        drawn, missing = figures.pictures_of(gather(model, None, posterior))
+        drawn = figures.pictures_of(gather(model, None, posterior))
         assert len({"responses", "outputs"} & set(calls)) == count
         assert ("outputs" in drawn, bool(drawn["front"])) == (count == 2, count == 2)
-        assert [section.title for section in missing] == title[: 1 - count // 2]
+        assert [section.title for section in drawn.get("missing", [])] == title[: 1 - count // 2]
 
 
 def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: Any) -> None:
@@ -242,7 +242,11 @@ def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: An
     warm = np.array([1.0, 2.0, 2.5])
     labels = {"mu": "mean", "y": "stiffness (N/mm)", "hot": "at 200 °C"}
     results = {"model": model, "optimum": optimum, "posterior": posterior}
-    prb.Report("x", **results, validation={"hot": (warm, later)}, labels=labels)
+    made = prb.Report("x", **results, validation={"hot": (warm, later)}, labels=labels)
+    titles = [section.title for section in made.sections]
+    assert titles[1] == "Measured and predicted responses", "on page one"
+    evidence = titles[titles.index("Evidence") :]
+    assert evidence[1] == "Measured and calibrated responses"
     given = {name: keywords.get("labels") for name, (_, keywords) in calls.items()}
     assert not {keywords.get("prob") for _, keywords in calls.values()} - {None}
     assert given["responses"] == given["landscape"] == {"mu": "mean", "y": "stiffness (N/mm)"}

@@ -202,16 +202,6 @@ def test_a_graph_of_constants_is_a_constant(graph: Any, value: Any) -> None:
     np.testing.assert_allclose(inputs.arguments[1], value)
 
 
-def test_variables_of_pymc_dims_are_refused_by_a_sentence() -> None:
-    import pymc.dims as pmd
-
-    with pm.Model(coords={"a": [1, 2]}) as model:
-        mu = pmd.Normal("mu", 0.0, 1.0, dims="a")
-        for given in (pm.Normal.dist(mu.values[0], 1.0), pmd.Normal.dist(mu, 1.0)):
-            with pytest.raises(TypeError, match=r"y: input 1: got .* of pymc\.dims"):
-                read_inputs("y", [given], model)
-
-
 # -- batches ----------------------------------------------------------------------------------
 
 X, PAIRS = np.arange(3.0), np.arange(8.0).reshape(4, 1, 2)
