@@ -62,7 +62,11 @@ def tests() -> dict[str, float]:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     (passed,) = re.findall(r"(\d+) passed", last)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"passed": int(passed), "seconds": time.monotonic() - start, "CPU seconds": cpu}
+    return {
+        "tests of the default run": int(passed),
+        "their seconds": round(time.monotonic() - start),
+        "their CPU seconds": round(cpu),
+    }
 
 
 def study(name: str, *options: str) -> dict[str, Any]:

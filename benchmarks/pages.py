@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
+from benchmarks.figures import FOLDER as FIGURES
 from benchmarks.metrics import METRICS
 from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
@@ -619,32 +620,34 @@ def _scoreboard(problem: str) -> Iterator[Row]:
 
 
 # Where the rows of each table are from; the first two lines of it are the page's.
+def figures(step: str) -> dict[str, Any]:
+    """Return the figures of a step of `benchmarks.figures`; none before it was run."""
+    stored: dict[str, Any] = record.load(FIGURES / f"{step}.json", {})
+    return stored
+
+
 def all_figures() -> Iterator[Row]:
     """Yield figures of the structure of the code, and of its tests."""
-    for name, value in found("figures/structure").items():
+    for name, value in (figures("structure") | figures("tests")).items():
         yield [name, f"{value:,.6g}"]
-    tests = found("figures/tests")
-    yield ["tests of the default run", f"{tests['passed']:,.0f}"]
-    yield ["their CPU seconds", f"{tests['CPU seconds']:.0f}"]
-    yield ["their seconds on two cores", f"{tests['seconds']:.0f}"]
 
 
 def all_coverage() -> Iterator[Row]:
     """Yield coverage of 89 % intervals: fleets by specimen, then posteriors with a metric."""
-    figures = found("figures/coverage")
-    for cell, fleet in figures["fleets"].items():
+    stored = figures("coverage")
+    for cell, fleet in stored.get("fleets", {}).items():
         for name in (key for key in fleet if key.startswith(("mean_", "spread_"))):
             error = np.sqrt(fleet[name] * (1 - fleet[name]) / 1000)
             shown = f"{short(fleet[name], 3)} ± {short(float(error), 3)}"
             yield [f"likelihood by specimen, {cell}: `{name}`", shown, "1,000"]
-    for name, group in figures["posteriors"].items():
+    for name, group in stored.get("posteriors", {}).items():
         shown = f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}"
         yield [f"posterior given the estimate, {name}", shown, f"{group['intervals']:,}"]
 
 
 def all_scores() -> Iterator[Row]:
     """Yield errors and widths of the worst hyperparameter, runs and CPU seconds."""
-    for problem, sizes in found("figures/scoreboard").items():
+    for problem, sizes in figures("scoreboard").items():
         for size, cell in sizes.items():
             for rival, one in cell.items():
                 if not one.get("data sets"):
@@ -667,7 +670,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "figures, structure": all_figures,
     "figures, coverage": all_coverage,
     "figures, scoreboard": all_scores,
-    "figures, speed": lambda: speed(found("figures/speed")),
+    "figures, speed": lambda: speed(figures("speed")),
     "posterior coverage": posterior_coverage,
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,

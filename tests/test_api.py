@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ def signature(value: Any) -> str:
     except ValueError:  # of built-in exceptions
         return "(...)"
     plain = [p.replace(annotation=inspect.Parameter.empty) for p in parameters]
-    return str(inspect.Signature(plain))
+    # A default that is a function has an address.
+    return re.sub(r" at 0x[0-9a-f]+", "", str(inspect.Signature(plain)))
 
 
 def members(cls: type) -> dict[str, str]:
