@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
+from benchmarks.figures import FOLDER as FIGURES
 from benchmarks.metrics import METRICS
 from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
@@ -384,11 +385,11 @@ def joint() -> Iterator[Row]:
         yield [str(size), f"{schools[school]}, {metric}", sets, *columns]
 
 
-def speed() -> Iterator[Row]:
+def speed(jobs: dict[str, Any] | None = None) -> Iterator[Row]:
     """Yield CPU seconds, memory and import beside their aims."""
     from benchmarks.speed import rows
 
-    for c, value, ratio in rows(single("speed")):
+    for c, value, ratio in rows(single("speed") if jobs is None else jobs):
         shown = f"{value:.0f}" if value >= 20 else short(value)
         aim = short(c.aim) if c.aim < 1 else f"{c.aim:g}"
         met = "yes" if ratio <= c.aim else "no"
@@ -619,7 +620,57 @@ def _scoreboard(problem: str) -> Iterator[Row]:
 
 
 # Where the rows of each table are from; the first two lines of it are the page's.
+def figures(step: str) -> dict[str, Any]:
+    """Return the figures of a step of `benchmarks.figures`; none before it was run."""
+    stored: dict[str, Any] = record.load(FIGURES / f"{step}.json", {})
+    return stored
+
+
+def all_figures() -> Iterator[Row]:
+    """Yield figures of the structure of the code, and of its tests."""
+    for name, value in (figures("structure") | figures("tests")).items():
+        yield [name, f"{value:,.6g}"]
+
+
+def all_coverage() -> Iterator[Row]:
+    """Yield coverage of 89 % intervals: fleets by specimen, then posteriors with a metric."""
+    stored = figures("coverage")
+    for cell, fleet in stored.get("fleets", {}).items():
+        for name in (key for key in fleet if key.startswith(("mean_", "spread_"))):
+            error = np.sqrt(fleet[name] * (1 - fleet[name]) / 1000)
+            shown = f"{short(fleet[name], 3)} ± {short(float(error), 3)}"
+            yield [f"likelihood by specimen, {cell}: `{name}`", shown, "1,000"]
+    for name, group in stored.get("posteriors", {}).items():
+        shown = f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}"
+        yield [f"posterior given the estimate, {name}", shown, f"{group['intervals']:,}"]
+
+
+def all_scores() -> Iterator[Row]:
+    """Yield errors and widths of the worst hyperparameter, runs and CPU seconds."""
+    for problem, sizes in figures("scoreboard").items():
+        for size, cell in sizes.items():
+            for rival, one in cell.items():
+                if not one.get("data sets"):
+                    continue
+                error, width = scoreboard.worst(one, "rms"), scoreboard.worst(one, "width")
+                shown = ["" if v is None else short(v) for v in (error, width)]
+                sets = str(one["data sets"])
+                yield [
+                    problem,
+                    size,
+                    rival,
+                    *shown,
+                    f"{one['runs']:,.0f}",
+                    f"{one['cpu']:.2g}",
+                    sets,
+                ]
+
+
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
+    "figures, structure": all_figures,
+    "figures, coverage": all_coverage,
+    "figures, scoreboard": all_scores,
+    "figures, speed": lambda: speed(figures("speed")),
     "posterior coverage": posterior_coverage,
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,

@@ -94,28 +94,27 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     units: Mapping[str, str] | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
-    r"""Add an observed node whose log-density is -discrepancy / epsilon to the current model.
+    r"""Add an observed variable that compares simulated and measured responses to the model.
 
     Parameters
     ----------
     name : str
-        Name of the node.
+        Name of the variable.
     response : callable or Runs
         A table of runs, or ``response(*inputs)``, a NumPy-style function. Each input is an array of
         any leading batch shape; a multivariate input has its event axis last. The function returns
         an array of the batch shape, in units of the observed values; for m outputs of a specimen an
         array with them in a last axis, or a mapping of arrays with the keys of ``observed``. Labels
         of a DataArray or DataFrame are matched to those of ``observed``. NaN, or a masked number,
-        is a point
-        without response, +inf a specimen that failed; -inf is refused. The response of a specimen
-        depends on the inputs of that specimen alone: three of the first ones are computed again, by
-        themselves, and a difference is refused, and so is a function that takes one number of
-        specimens. Where inputs repeat, as discrete ones do, a design computes the response once.
-        Model random scatter of the response as an input, such as ``pm.Normal.dist(0, 1)``, or use
-        `Fresh`. Simulators with the same response object, inputs and propagation, and metrics of
-        distributions, share runs. Variables that the response reads have to stay as they are: a few
-        runs are computed again where runs serve another simulator or function, and a difference is
-        refused.
+        is a point without response, +inf a specimen that failed; -inf is refused. The response of a
+        specimen depends on the inputs of that specimen alone: three of the first ones are computed
+        again, by themselves, and a difference is refused, and so is a function that takes one
+        number of specimens. Where inputs repeat, as discrete ones do, a design computes the
+        response once. Model random scatter of the response as an input, such as ``pm.Normal.dist(0,
+        1)``, or use `Fresh`. Simulators with the same response object, inputs and propagation, and
+        metrics of distributions, share runs. Variables that the response reads have to stay as they
+        are: a few runs are computed again where runs serve another simulator or function, and a
+        difference is refused.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
