@@ -273,7 +273,8 @@ class Interval:
         low = finite_number(self.low, "Interval: low")
         if finite_number(self.high, "Interval: high") <= low:
             raise ValueError(
-                f"Interval: high: got {self.high} with low = {self.low}, expected more than that"
+                f"Interval: high: got {self.high} with low = {self.low}, expected a number above "
+                "low"
             )
 
 

@@ -523,9 +523,9 @@ def _report(
     optimum = optimum_of(search, fit, record, problem.n_previous)
     if stopped:
         text = (
-            f"{stopped} before the minimisation was finished, so that this is no answer yet; "
-            f"{kept(evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-            "built again, to go on."
+            f"{stopped} before the minimisation was finished, so that the result is not an "
+            f"optimum; {kept(evaluator.model)}; build the model again and call prb.minimize with a "
+            "larger budget to continue."
         )
         finding = Finding("budget-spent", text, "expensive.md#a-night-is-not-enough")
         return replace(optimum, findings=report(finding))

@@ -505,8 +505,8 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     if findings:
         reasons = " ".join(map(str, findings))
         raise ValueError(
-            f"{caller}: got an optimum around which nothing is known: {reasons} "
-            "prb.sample_smc(epsilon=..., adjustment=None) makes no use of it"
+            f"{caller}: got an optimum without standard errors or curvature: {reasons} Use "
+            "prb.sample_smc(epsilon=..., adjustment=None), which needs no optimum"
         )
     return optimum
 

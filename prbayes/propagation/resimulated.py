@@ -87,9 +87,9 @@ class Resimulated(Propagation):
         enough = per_observation * target.n_effective
         if self.n < enough:
             text = (
-                f"{name}: the log-likelihood of {self.n} resimulated responses sees too little of "
-                "the tails: its standard errors and posterior come out too narrow, expected at "
-                f"least {enough:.0f} responses, {per_observation} for each observation; use "
+                f"{name}: got {self.n} resimulated responses for a log-likelihood, expected at "
+                f"least {enough:.0f}, {per_observation} for each observation: the tails are "
+                "undersampled, and the standard errors and the posterior are too narrow; use "
                 "prb.Reweighted(n), prb.KullbackLeibler() or a larger n."
             )
             report(Finding("few-responses", text, "choose.md#how-many-responses"))

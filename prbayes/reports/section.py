@@ -109,7 +109,8 @@ class Section:
         if picture is not None:
             if not alt.strip():
                 raise ValueError(
-                    f"Section {title!r}: alt: got nothing, expected a sentence on the picture"
+                    f"Section {title!r}: alt: got nothing, expected a sentence that describes the "
+                    "picture"
                 )
             picture = image(picture)
         vars(self).update(

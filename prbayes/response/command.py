@@ -125,7 +125,7 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
     path = shutil.which(program)
     if path is None:
         raise FileNotFoundError(
-            f"command: got the program {program!r}, which is not there or cannot be run, expected "
+            f"command: got the program {program!r}, which is missing or not executable, expected "
             "one on the path, or its whole path"
         )
     return (os.path.abspath(path), *rest)  # it runs in another folder

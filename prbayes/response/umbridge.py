@@ -259,19 +259,22 @@ class RemoteModel:
                 n_lost, give_up_at, pause, reason = n_lost + 1, 0.0, 0.1, str(error)
                 if n_lost == 3:
                     raise ConnectionError(
-                        f"{self.model}: the server at {self.address} was lost 3 times while it "
-                        f"was at work on this specimen ({reason})"
+                        f"{self.model}: the connection to the server at {self.address} was lost 3 "
+                        f"times during this specimen ({reason})"
                     ) from None
             except (HTTPError, OSError) as error:
                 reason = f"{type(error).__name__}: {error}"
             if not give_up_at:
                 give_up_at = time.monotonic() + self.patience
-                text = f"{self.model}: the server at {self.address} is away ({reason}); waiting."
+                text = (
+                    f"{self.model}: the server at {self.address} does not answer ({reason}); "
+                    "waiting."
+                )
                 report(Finding("server-away", text))
             if time.monotonic() > give_up_at:
                 raise ConnectionError(
-                    f"{self.model}: the server at {self.address} is away for more than patience = "
-                    f"{self.patience:g} s ({reason})"
+                    f"{self.model}: the server at {self.address} has not answered for more than "
+                    f"patience = {self.patience:g} s ({reason})"
                 )
             time.sleep(pause)
             pause = min(2 * pause, 2.0)
@@ -301,9 +304,9 @@ class RemoteModel:
                 return
             reason = f"input {int(is_cut.argmax()) + 1} would be cut in two"
         raise ValueError(
-            f"{name}: got inputs of {', '.join(map(str, sizes))} numbers, expected such as fill "
-            f"vectors of sizes {list(self.inputs)} one after the other ({reason}), which the model "
-            f"{self.model!r} at {self.address} has; pass other inputs, or in another order"
+            f"{name}: got inputs of {', '.join(map(str, sizes))} numbers, expected inputs that "
+            f"fill vectors of sizes {list(self.inputs)} one after the other ({reason}), as the "
+            f"model {self.model!r} at {self.address} requires; pass other inputs, or another order"
         )
 
 

@@ -701,7 +701,7 @@ def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.Mo
         ([None], "pass a larger n or max_points to prb.Reweighted (now 300 runs)"),
         ([16384], "pass a larger n"),
         ([SIZES.largest, None], "pass a larger n"),
-        ([SIZES.largest, SIZES.largest], "between its 300 runs are 65536 emulated points, the most"),
+        ([SIZES.largest, SIZES.largest], "the 300 runs have the largest number of emulated points"),
     ],
 )  # fmt: skip
 def test_a_large_error_of_the_design_is_reported(sizes: list[int | None], advice: str) -> None:

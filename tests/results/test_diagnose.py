@@ -281,7 +281,7 @@ def test_draws_that_lose_too_much_are_counted() -> None:
     assert calibration["lossy_draws"].item() == share
     assert 0 <= calibration["lost_mass_at_best"].item() < 0.9
     (message,) = [m for m in prb.diagnose(tree).messages if "lost mass" in m]
-    assert message.startswith(f"y: lost mass: of {share:.0%} of the draws more than")
+    assert message.startswith(f"y: lost mass: in {share:.0%} of the draws more than")
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_draws_given_the_estimate_lose_responses(sampler: Any, limit: float) -> 
     share = np.mean(lost[~np.isnan(lost)] > 0.05)
     assert 0.1 < share < 0.5
     assert calibration["lossy_draws"].item() == share
-    assert f"y: lost mass: of {share:.0%} of the draws more than" in str(prb.diagnose(tree))
+    assert f"y: lost mass: in {share:.0%} of the draws more than" in str(prb.diagnose(tree))
 
 
 def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
