@@ -99,7 +99,7 @@ def refuse_lost_share(
 
 
 class Bound(ABC):
-    """A propagation at work for one simulator.
+    """A propagation that is prepared for one simulator.
 
     Attributes
     ----------

@@ -24,7 +24,7 @@ _BEGINNINGS = (
 
 @dataclass(frozen=True, eq=False, init=False)
 class Section:
-    """One section of a `Report`: paragraphs, a table and a picture, each where given.
+    """One section of a `Report`: paragraphs, a table and a picture, each optional.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from prbayes._validate import Floats, called, flag, positive_integer
 
 
 class ResponseError(RuntimeError):
-    """The user's response raised, or returned something that is no response."""
+    """The user's response raised, or returned an invalid value."""
 
 
 @dataclass(frozen=True, eq=False)

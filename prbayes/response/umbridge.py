@@ -1,4 +1,4 @@
-"""Models behind an UM-Bridge server as responses.
+"""Models behind a UM-Bridge server as responses.
 
 The protocol: https://um-bridge-benchmarks.readthedocs.io, version 1.0.
 """
@@ -38,7 +38,7 @@ def umbridge(
     timeout: float | None = None,
     patience: float = 60.0,
 ) -> scalar:
-    """Turn a model behind an UM-Bridge server into a response, of one output or several.
+    """Turn a model behind a UM-Bridge server into a response, of one output or several.
 
     The names and sizes of the server's models are requested at once. A `Simulator` compares them
     with its inputs and with ``observed`` before anything is computed.

@@ -81,6 +81,17 @@ class Diagnosis:
         misfit.
     untested : tuple of str
         Tests of the log-likelihood by specimen that were not run, and why.
+
+    Examples
+    --------
+    >>> import pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
+    >>> [finding.code for finding in prb.diagnose(prb.minimize(model)).findings]
+    ['few-specimens']
     """
 
     findings: tuple[Finding, ...]

@@ -1,4 +1,4 @@
-"""A model behind an UM-Bridge server: a real one, and one that does to requests what it is told."""
+"""A model behind a UM-Bridge server: a real one, and one that does to requests what it is told."""
 
 from __future__ import annotations
 
