@@ -286,6 +286,11 @@ class Joint(LiftedMetric):
     random_seed : int
         Of the directions of three or more outputs.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If the metric is not one of a single output, or another argument is not as described.
+
     Notes
     -----
     Outputs of fewer inputs are on a surface, or a curve. Only as many coordinates are compared as

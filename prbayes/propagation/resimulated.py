@@ -58,6 +58,11 @@ class Resimulated(Propagation):
     executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
+
     Examples
     --------
     >>> Resimulated(512)
@@ -214,6 +219,11 @@ class Fresh(Propagation):
         Largest share of a population whose response is NaN, at the answer.
     executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
 
     Examples
     --------

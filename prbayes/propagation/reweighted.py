@@ -115,6 +115,11 @@ class Reweighted(Propagation):
         them, as nothing else ends a response that hangs. What hangs outside Python ends with its
         worker, half as long again and a second later; Dask then tries it on other workers.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
+
     References
     ----------
     .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance

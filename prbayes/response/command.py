@@ -59,6 +59,11 @@ def command(
     keep : bool
         Whether folders are kept. With ``folder``, those of failed runs are kept in any case.
 
+    Returns
+    -------
+    callable
+        The response, to be passed to `Simulator`, `Surrogate.fit` or `predict`.
+
     Raises
     ------
     TypeError, ValueError

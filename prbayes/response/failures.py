@@ -47,6 +47,11 @@ class Abort(OnFailure):
         By default NaN is a result: a point that could not be computed keeps its weight, which is
         reported as lost mass.
 
+    Raises
+    ------
+    TypeError
+        If ``on_nan`` is not True or False.
+
     Examples
     --------
     >>> Abort(on_nan=True)

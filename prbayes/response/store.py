@@ -31,7 +31,7 @@ _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be read or written, or belongs to something else; it is never overwritten."""
+    """A store that cannot be read or written, or of something else; it is never overwritten."""
 
 
 @dataclass(eq=False)

@@ -58,6 +58,11 @@ def umbridge(
     patience : float
         Seconds to wait for a server that went away before the response fails.
 
+    Returns
+    -------
+    callable
+        The response, to be passed to `Simulator`, `Surrogate.fit` or `predict`.
+
     Raises
     ------
     TypeError, ValueError

@@ -115,6 +115,11 @@ class PosteriorNull(Null):
     replicates : int
     random_seed : int
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
     Examples
     --------
     >>> PosteriorNull(1999)
