@@ -557,7 +557,7 @@ def _report(
 def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
-    sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
+    sentences = [f"{', '.join(at_edge)} reached the edge of the support."] if at_edge else []
     designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
     emulated = [design.summary(name) for name, design in designs.items() if design.is_emulated]
     if emulated and np.isfinite(fit.design_error):

@@ -243,7 +243,7 @@ def second_is_reversed(x: Any) -> Any:
     ],
 )
 def test_a_response_that_mixes_its_specimens_is_refused(response: Any, batches: Any) -> None:
-    said = r"y: the response of a specimen depends on .* by itself, and .* among 64, expected"
+    said = r"y: the response of a specimen depends on .* alone, and .* among 64, expected"
     with pytest.raises(ResponseError, match=said):
         call(response, *batches)
 

@@ -341,7 +341,7 @@ def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCapture
         assert prb.umbridge(server.url)(7.0, 1.0)[1] == 49
     assert len(server.asked) == 4
     (record,) = caplog.records
-    assert "is away (it answered 503); waiting" in record.getMessage()
+    assert "does not answer (it answered 503); waiting" in record.getMessage()
 
 
 @pytest.mark.parametrize(

@@ -156,7 +156,7 @@ def test_a_stored_optimum_has_the_findings_of_the_optimum() -> None:
     assert "did not converge (The minimiser failed. It stopped)" in diagnosis.messages[2]
     assert diagnosis.support.sizes == {"simulator": 1, "sample": 1}
     # An edge is reported once.
-    edge_finding = Finding("flat-edge", "mu ran to the edge.")
+    edge_finding = Finding("flat-edge", "mu reached the edge.")
     search = replace(optimum().search, result=Result.AT_EDGE, at_edge=("mu",))
     edge = replace(optimum(), search=search, findings=(edge_finding,))
     for result in (edge, edge.to_datatree()):
@@ -264,7 +264,7 @@ def test_an_answer_is_refused_if_most_draws_lose_too_much(
     with pytest.raises(DesignError, match=r"got 30\.0% of the") if is_refused else nullcontext():
         chains = Chains(np.zeros((1, 50, 1)), {}, xr.Dataset(), lost=lost)
         (finding,) = _lost_findings(Evaluator.of(model), chains)
-        assert "y: lost mass: of 40% of the draws more than max_lost = 5.0%" in finding.text
+        assert "y: lost mass: in 40% of the draws more than max_lost = 5.0%" in finding.text
 
 
 def test_draws_that_lose_too_much_are_counted() -> None:

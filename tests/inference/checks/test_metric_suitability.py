@@ -212,7 +212,7 @@ def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
     bias = (INPUTS.std() - sigma) / stderr
     assert bool(lines) == (bias > 0.5)
     for line in lines:
-        number = float(line.split("off by about ")[1].split()[0])
+        number = float(line.split("by about ")[1].split()[0])
         assert number == pytest.approx(bias, abs=0.1)
         proposed = float(line.split("GaussianKDE(")[1].split(")")[0])
         assert proposed == pytest.approx(width * np.sqrt(0.1 / number), rel=0.03)
