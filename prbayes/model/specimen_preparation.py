@@ -404,7 +404,8 @@ def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
     if not np.isfinite(log_weights).any():
         raise ValueError(
             "log-likelihood: got no population of the prior that reaches the specimens, expected "
-            "one at least; look at the priors and at the data's units"
+            "one at least; look at the priors and at the data's units, and pass "
+            "prb.LogLikelihood(error=...) if readings have an error"
         )
     temper = 1.0
     while True:

@@ -402,7 +402,7 @@ def test_data_of_another_shape_and_two_samples_are_refused() -> None:
         ),
         (
             {"inputs": lambda: [*normal(), pm.Normal("c")]},
-            "got c, which goes into the response as a model variable.*prb.ProbabilityResidual",
+            "got c, which goes into the response as a model variable.*scatter.*ProbabilityResidual",
         ),
     ],
 )
