@@ -117,8 +117,8 @@ def points_of_tables(
                 raise
             raise DesignError(
                 f"{likelihood.name}: got runs that do not cover the populations of the data: the "
-                f"likeliest inputs of {outside.sum()} of {len(outside)} specimens are outside their "
-                f"ranges, expected none: about {_asked(likelihood, likely, ranges)}; "
+                f"likeliest inputs of {outside.sum()} of {len(outside)} specimens are outside "
+                f"their ranges, expected none: about {_asked(likelihood, likely, ranges)}; "
                 "prb.propose_runs(model) returns a table of runs to add"
             ) from error
     draws: Draws = posterior(points.z, points.log_a)
