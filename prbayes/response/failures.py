@@ -88,7 +88,8 @@ class Replace(OnFailure):
         if np.isneginf(self.value):
             raise ValueError(
                 "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "
-                "specimen failed)"
+                "specimen failed); pass a number below the data for specimens that fail at the "
+                "low end"
             )
 
 

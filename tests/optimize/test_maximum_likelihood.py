@@ -275,6 +275,8 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     narrow, wide = monte_carlo_error(likelihood, values)
     assert narrow > 2
     assert wide < 0.2
+    values["s1"] = np.array([1e-80, 0.2])  # the square of the difference overflows: no warning
+    assert monte_carlo_error(likelihood, values).tolist() == [np.inf, pytest.approx(wide)]
 
 
 def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(

@@ -252,6 +252,11 @@ def test_retried_in_vain(kind: str, tmp_path: Path) -> None:
         run(fails_above_two, kind, on_failure=Retry(2, then=Abort()))
 
 
+def test_specimens_that_fail_at_the_low_end_have_a_number() -> None:
+    with pytest.raises(ValueError, match="got -inf, .*; pass a number below the data for"):
+        Replace(-np.inf)
+
+
 def test_a_failure_says_where() -> None:
     def root(x: float, y: float) -> float:
         return math.sqrt(x) + y
