@@ -88,8 +88,8 @@ class Replace(OnFailure):
         if np.isneginf(self.value):
             raise ValueError(
                 "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "
-                "specimen failed); pass a number below the data for specimens that fail at the "
-                "low end"
+                "specimen failed); for specimens that fail at the low end calibrate minus the "
+                "response against minus the data, with +inf"
             )
 
 

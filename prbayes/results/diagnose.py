@@ -416,8 +416,8 @@ def _lost_mass(optimum: Optimum | None, lost: Mapping[str, float]) -> list[Findi
     text = (
         f"Specimens without response (NaN) matter: if they counted as far from the data, the "
         f"optimum would move {shifts} standard errors. It is right if such specimens cannot be "
-        "measured; otherwise repair the response there, or return +inf for specimens that fail, or "
-        "a number below the data if they fail at the low end."
+        "measured; otherwise repair the response there, or return +inf for specimens that fail "
+        "(of minus the response and minus the data, if they fail at the low end)."
     )
     return [Finding("lost-mass-matters", text, "distributed.md#when-a-response-fails")]
 

@@ -199,7 +199,7 @@ def test_the_shift_is_that_of_specimens_far_from_the_data() -> None:
     np.testing.assert_allclose(counted, far.theta, atol=0.05 * stderr.min())
     assert shift[1] < -0.5
     texts = {finding.code: finding.text for finding in prb.diagnose(kld).findings}
-    assert "or a number below the data if they fail at the low end" in texts["lost-mass-matters"]
+    assert "minus the data, if they fail at the low end" in texts["lost-mass-matters"]
 
 
 def test_a_tiny_lost_share_does_not_matter() -> None:
