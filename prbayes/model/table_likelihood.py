@@ -220,11 +220,11 @@ def _require_cover(
         if low < least or high > most
     ]
     raise DesignError(
-        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs "
-        f"of {int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
-        f"and {outside.mean():.0%} of those of all, expected none and {MAX_LOST:.0%}: about "
-        f"{'; '.join(parts) or 'the corners of the ranges'}; prb.propose_runs(model) returns a "
-        "table of runs to add"
+        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs of "
+        f"{int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
+        f"expected none, and {outside.mean():.0%} of the likelihood of all, expected at most "
+        f"{MAX_LOST:.0%}: about {'; '.join(parts) or 'the corners of the ranges'}; "
+        "prb.propose_runs(model) returns a table of runs to add"
     )
 
 
