@@ -28,7 +28,7 @@ def propose_runs(
     runs: Runs | None = None,
     random_seed: Seed = 0,
 ) -> Any:
-    """Return points at which more runs of a table are needed, to hand to whoever computes them.
+    """Return inputs of runs that a table needs.
 
     Specimens of the prior predictive population whose response is near a measured one: those
     outside the ranges of the runs if there are any, and else those far from all runs. The response

@@ -209,7 +209,8 @@ class _Objective:
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Return value and gradient at theta; +inf outside the support."""
-        value, gradient = self.function(theta, np.empty(0))
+        with np.errstate(over="ignore", invalid="ignore"):  # +inf far from the data
+            value, gradient = self.function(theta, np.empty(0))
         value = float(value) if np.isfinite(value) else np.inf
         self.thetas.append(theta.copy())
         self.values.append(value)
@@ -397,9 +398,9 @@ def _findings(
         findings.append(
             Finding(
                 "support-edge",
-                "The likelihood jumps at the optimum, as it does where the end of an input's "
-                "support meets a specimen; no standard errors follow from its curvature. Sample "
-                "with prb.sample_smc.",
+                "The likelihood jumps at the optimum, where the end of an input's support meets a "
+                "specimen, so that its curvature gives no standard errors. Sample with "
+                "prb.sample_smc.",
                 "likelihood.md#moving-supports",
             )
         )

@@ -222,7 +222,7 @@ def predict(
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
-    missing = _check_responses(label, drawn, max_lost, responses.remedy)
+    missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -359,8 +359,8 @@ def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> st
     is_named = hasattr(inner, "__name__") and name != "<lambda>"
     if calling.get("store") is not None and not is_named:
         raise ValueError(
-            f"store: got a function called {name}, expected a name to keep its responses by; "
-            f"{advice}"
+            f"store: got a function called {name}, expected a name under which its responses are "
+            f"stored; {advice}"
         )
     return name
 
@@ -542,6 +542,18 @@ def with_known_conditions(
     return changed, stacked_values(values)
 
 
+def _remedy(response: Any, responses: Responses) -> str:
+    """Return what to do where a predicted response is NaN."""
+    if not isinstance(response, Runs):
+        return responses.remedy
+    # propose_runs(model) returns runs near the data, and not under another condition.
+    parts = [
+        f"{name} from {np.min(low):.4g} to {np.max(high):.4g}"
+        for name, (low, high) in response.ranges.items()
+    ]
+    return f"the runs have {', '.join(parts)}: add runs at the inputs of the prediction"
+
+
 def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
     """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
@@ -549,18 +561,18 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
     missing = int(is_nan.sum())
     if missing == is_nan.size:
         raise ResponseError(
-            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
-            "that fails"
+            f"{label}: got NaN at all {missing} specimens, expected numbers; {remedy}, or return "
+            "+inf for specimens that fail"
         )
     if missing > max_lost * is_nan.size:
         raise DesignError(
             f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
-            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            f"the specimens that have a response; {remedy}, return +inf for specimens that fail, "
-            "or pass a larger max_lost"
+            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would describe "
+            f"only the specimens that have a response; {remedy}, return +inf for specimens that "
+            "fail, or pass a larger max_lost"
         )
     if missing:
-        text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN."
+        text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN; {remedy}."
         report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)
