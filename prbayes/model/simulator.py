@@ -553,8 +553,9 @@ def _refuse_by_specimen(
         names = ", ".join(str(e.name or e) for e in inputs.epistemic)
         raise TypeError(
             f"{name}: got {names}, which goes into the response as a model variable, expected "
-            "aleatory inputs and constants for prb.LogLikelihood(); use "
-            "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
+            "aleatory inputs and constants for prb.LogLikelihood(); let it scatter a little, as in "
+            "pm.Normal.dist(c, 0.01) with a known scatter, or use metric=prb.ProbabilityResidual() "
+            "with propagation=prb.Resimulated()"
         )
     discrete = [x for x in inputs.aleatory if not x.dtype.startswith("float")]
     if discrete:
