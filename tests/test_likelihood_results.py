@@ -172,7 +172,7 @@ def test_area_test(problem: Problem, posterior: xr.DataTree) -> None:
     assert not prb.area_test(problem.later, predicted).rejected
     assert prb.area_test(3 * problem.later, predicted).rejected
     own = prb.predict(posterior, problem.growth, problem.x, model=problem.model)
-    with pytest.raises(ValueError, match="the very data of the calibration"):
+    with pytest.raises(ValueError, match="the data of the calibration"):
         prb.area_test(problem.observed, own)
 
 

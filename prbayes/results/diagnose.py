@@ -382,7 +382,7 @@ def _failure_findings(
         elif np.isposinf(replacement):
             share = failed.get(name, np.nan)
         if share < SMALLEST_SHARE:
-            text += "the populations of the answer have next to no specimens there."
+            text += "the calibrated populations have next to no specimens there."
             harmless.append(Finding("harmless-failures", text))
             continue
         text += (
