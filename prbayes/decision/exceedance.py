@@ -382,8 +382,8 @@ def _rare_probability(
             "prb.decision.Interval"
         )
     evaluator = populations.evaluator
-    values = evaluator.hyperparameters.constrained(populations.thetas)
-    center = evaluator.hyperparameters.constrained(populations.center[None])
+    values = evaluator.hyperparameters.variables(populations.thetas)
+    center = evaluator.hyperparameters.variables(populations.center[None])
     names = [str(rv.name) for rv in responses.inputs.parents]
     transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
     sign = -1.0 if quantity.below else 1.0

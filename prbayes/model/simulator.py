@@ -17,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, counted, report
 from prbayes._validate import (
+    NO_POPULATION,
     Floats,
     called,
     flag,
@@ -572,7 +573,7 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
     if values.ndim not in (1, 2) or len(values) < 2:
         raise ValueError(
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
-            "2 specimens"
+            f"2 specimens; {NO_POPULATION}"
         )
     rows = values.reshape(len(values), -1)
     if np.isnan(rows).all(axis=1).any():
@@ -689,7 +690,8 @@ def _prepared_metric(
             observed = observed_sample(observed, minimum=least, failures=metric.counts_failures)
         elif len(observed) < 2:
             raise ValueError(
-                f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of them"
+                f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of "
+                f"them; {NO_POPULATION}"
             )
         target = metric.against(observed, weights)
         if not metric.symbolic:

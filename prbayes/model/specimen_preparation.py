@@ -310,7 +310,7 @@ class Populations:
         result = np.empty((len(thetas), n))
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
-        values = self.hyperparameters.constrained(thetas)
+        values = self.hyperparameters.variables(thetas)
         contexts = likelihood.by_group if smoothing is None else likelihood.by_context
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
@@ -334,7 +334,7 @@ class Populations:
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
-        values = self.hyperparameters.constrained(thetas)
+        values = self.hyperparameters.variables(thetas)
         return log_shares(self.likelihood, values, share).sum(axis=1)
 
     def _normal_log_density(
@@ -436,7 +436,7 @@ class PopulationDraws:
         populations, likelihood = self.populations, self.populations.likelihood
         rng = np.random.default_rng([0, 3])
         parts = []
-        values = populations.hyperparameters.constrained(self.thetas)
+        values = populations.hyperparameters.variables(self.thetas)
         for group, rows in likelihood.by_group:
             if likelihood.inputs.covariates:
                 rows = rng.choice(rows, (len(self.thetas), n_of_each))

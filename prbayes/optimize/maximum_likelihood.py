@@ -161,7 +161,7 @@ def _supported(
     size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     largest = max(largest, of_specimen * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
-    values = evaluator.hyperparameters.constrained(thetas)
+    values = evaluator.hyperparameters.variables(thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
     return np.asarray(np.sqrt(variance) <= largest)
 
@@ -611,7 +611,7 @@ class SpecimenRefits:
         """Yield estimates of simulated data sets, whether they converged, and the data."""
         evaluator = self.evaluator
         rng = np.random.default_rng([seed, 21])
-        values = evaluator.hyperparameters.constrained(self.theta[None])
+        values = evaluator.hyperparameters.variables(self.theta[None])
         pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):

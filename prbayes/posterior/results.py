@@ -280,7 +280,7 @@ def _emulated_responses(
     """Return emulated responses of new specimens at thetas, (chains, draws, d)."""
     chains, draws, d = thetas.shape
     responses = {}
-    values = evaluator.hyperparameters.constrained(thetas.reshape(-1, d))
+    values = evaluator.hyperparameters.variables(thetas.reshape(-1, d))
     for likelihood in evaluator.likelihoods:
         for measurement in likelihood.measurements:
             n = len(measurement.observed)

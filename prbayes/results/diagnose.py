@@ -44,6 +44,7 @@ from prbayes.optimize.optimum import (
     SMALLEST_SHARE,
     Optimum,
     compared_in,
+    refuse_model,
     require_of_model,
 )
 from prbayes.response.inputs import model_on_context
@@ -183,6 +184,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
+    refuse_model(result, "diagnose: result")
     optimum = result if isinstance(result, Optimum) else None
     tree = result.to_datatree() if isinstance(result, Optimum) else result
     groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
@@ -206,7 +208,9 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         by_specimen = not evaluator.nodes
         every_draw = tree["posterior"].sizes["chain"] * tree["posterior"].sizes["draw"]
         points, _ = populations_of(tree, model, every_draw, "prb.diagnose")
-        thetas = evaluator.hyperparameters.thetas_of(list(points.values()))
+        thetas = evaluator.hyperparameters.thetas_of(
+            [points[str(rv.name)] for rv in model.free_RVs]
+        )
     coverage: _Coverage = {}
     if has_draws and calibration:
         coverage = _stored_coverage(calibration)

@@ -261,7 +261,7 @@ def scored_specimens(
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
     result = []
-    at_theta = evaluator.hyperparameters.constrained(theta[None])
+    at_theta = evaluator.hyperparameters.variables(theta[None])
     for likelihood, functions, (points, log_a) in zip(
         evaluator.likelihoods, scores, data, strict=True
     ):
@@ -445,7 +445,7 @@ def _complete_covariance(
     """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
     step = 1e-3 * evaluator.hyperparameters.prior_sd
     around = cross(theta, step)
-    values = evaluator.hyperparameters.constrained(around)
+    values = evaluator.hyperparameters.variables(around)
     information = np.zeros((theta.size, theta.size))
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
