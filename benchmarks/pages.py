@@ -641,6 +641,8 @@ def all_coverage() -> Iterator[Row]:
             shown = f"{short(fleet[name], 3)} ± {short(float(error), 3)}"
             yield [f"likelihood by specimen, {cell}: `{name}`", shown, "1,000"]
     for name, group in stored.get("posteriors", {}).items():
+        if "," in name or group["intervals"] < 150:  # too few of a single problem
+            continue
         shown = f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}"
         yield [f"posterior given the estimate, {name}", shown, f"{group['intervals']:,}"]
 

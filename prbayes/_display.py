@@ -1,4 +1,4 @@
-"""HTML of results in a notebook: a heading, a table, sentences.
+"""Results as sentences, tables of a notebook and data frames.
 
 Also the same as text, and numbers as a DataFrame.
 """

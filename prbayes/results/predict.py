@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._display import ShownArray, View
-from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._finding import Finding, as_json, counted, from_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import (
@@ -263,16 +263,23 @@ class Prediction(ShownArray, xr.DataArray):
         for index in np.ndindex(*shape):
             x = values[index][~np.isnan(values[index])]
             labels = [self[d].values[i] for d, i in zip(rows_of, index, strict=True)]
-            with np.errstate(invalid="ignore"):  # of failures, +inf
-                numbers = [x.mean(), x.std(), *np.quantile(x, [0.05, 0.5, 0.95])]
+            finite = x[np.isfinite(x)]
+            moments = [finite.mean(), finite.std()] if finite.size else [np.nan, np.nan]
+            with np.errstate(invalid="ignore"):  # between two failures, +inf
+                numbers = [*moments, *np.quantile(x, [0.05, 0.5, 0.95])]
             rows.append([element_name(str(self.name), labels), *(f"{n:.4g}" for n in numbers)])
         size = self.sizes[drawn[-1]]
-        n_populations = self.sizes["chain"] * self.sizes["draw"]
+        populations = counted(self.sizes["chain"] * self.sizes["draw"], "population")
         heading = (
-            f"Predicted {self.name}: {size} specimens of each of {n_populations} population(s), "
+            f"Predicted {self.name}: {size} specimens of each of {populations}, "
             f"from {self.attrs['source']}"
         )
         sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        failed = float(np.mean(np.isposinf(values)))
+        if failed:
+            sentences.append(
+                f"{failed:.2g} of the specimens fail (+inf): mean and sd are those of the others."
+            )
         sentences.append(f"{self.attrs['responses']} responses computed.")
         header = ["", "mean", "sd", "5% quantile", "median", "95% quantile"]
         return View(heading, header, rows, sentences)

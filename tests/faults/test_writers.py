@@ -38,7 +38,7 @@ def in_child(store: Store) -> None:
     inherited.connection.execute("PRAGMA user_version")
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning", "ignore:os.fork:RuntimeWarning")
 def test_a_store_survives_a_fork(tmp_path: Path) -> None:
     store = Store(tmp_path, "y", columns=1)
     store.add(np.array([[1.0]]), np.array([10.0]))

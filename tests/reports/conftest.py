@@ -30,6 +30,11 @@ def observed() -> Any:
     return OBSERVED
 
 
+def same(x: Any) -> Any:
+    """Return the input; NumPy's own functions have no names of arguments before NumPy 2.4."""
+    return np.positive(x)
+
+
 @pytest.fixture(scope="session")
 def calibrated() -> Calibrated:
     with pm.Model() as model:
@@ -39,7 +44,7 @@ def calibrated() -> Calibrated:
         x = pm.Normal.dist(mu, sigma)
         prb.Simulator(
             "y",
-            np.positive,
+            same,
             x,
             metric=prb.KullbackLeibler(),
             observed=OBSERVED,
@@ -50,7 +55,7 @@ def calibrated() -> Calibrated:
     posterior = prb.sample_smc(
         150, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
-    later = prb.predict(posterior, np.positive, x, model=model, random_seed=1)
+    later = prb.predict(posterior, same, x, model=model, random_seed=1)
     fresh = np.random.default_rng(4).normal(2.0, 0.6, 12)
     test = prb.area_test(fresh, later, null=prb.validation.PosteriorNull(199))
     return Calibrated(model, optimum, posterior, test)

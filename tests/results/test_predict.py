@@ -388,3 +388,17 @@ def test_an_array_of_values_of_specimens_is_no_population() -> None:
     load = np.linspace(1, 2, 100)
     with pytest.raises(ResponseError, match="takes 600 specimens, and neither one nor 2"):
         predict(lambda x: x * load, n_samples=100, stored=False)
+
+
+def test_a_prediction_with_failures_shows_moments_of_the_others() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        prb.Simulator("y", lambda x: x + 1, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.5])
+
+    def breaks(x):  # type: ignore[no-untyped-def]
+        return np.where(x < 2, x, np.inf)
+
+    shown = str(prb.predict(prb.minimize(model), breaks, x, model=model))
+    assert "each of 1 population," in shown
+    assert "of the specimens fail (+inf)" in shown
+    assert "inf  nan" not in shown
