@@ -6,6 +6,7 @@ It says as well whether a design supports the populations at theta, and where it
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 

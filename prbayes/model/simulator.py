@@ -35,7 +35,7 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import SummaryLikelihood
 from prbayes.model.conditions import observed_at_conditions, stacked_values
-from prbayes.model.data_checks import duplicate_findings
+from prbayes.model.data_checks import duplicate_findings, outlier_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -698,7 +698,10 @@ def _prepared_metric(
             try_function(target)
         return target
     except (TypeError, ValueError) as error:
-        raise type(error)(f"{name}: {error}") from None
+        values = np.asarray(observed, dtype=np.float64)
+        causes = outlier_findings(name, values, np.empty(0), ()) if values.ndim == 1 else ()
+        cause = "".join(f" {finding.text}" for finding in causes)
+        raise type(error)(f"{name}: {error}{cause and f'.{cause}'}") from None
 
 
 def try_function(target: Discrepancy) -> None:

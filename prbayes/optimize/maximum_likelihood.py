@@ -514,7 +514,8 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
-    points = draw_points(emulation, readings, roots, options, seed=1)
+    has_gross_errors = likelihood.measurements[0].gross_errors is not False
+    points = draw_points(emulation, readings, roots, options, gross_errors=has_gross_errors, seed=1)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)
 

@@ -123,13 +123,15 @@ class Diagnosis:
         return pd.DataFrame(rows, columns=["kind", "code", "text"])
 
     def _repr_html_(self) -> str:
-        """Show the sentences in a notebook, findings first."""
-        sentences = (*self.messages, *self.notes, *self.untested)
+        """Show a table of the findings and remarks in a notebook, and what was not tested."""
+        heading = f"Diagnosis: {counted(len(self.findings), 'problem')}"
         if self.ok:
             clear = self.all_clear.removesuffix(".")
-            return view(f"Diagnosis: {clear[0].lower()}{clear[1:]}", sentences=sentences)
-        count = len(self.findings)
-        return view(f"Diagnosis: {counted(count, 'problem')}", sentences=sentences)
+            heading = f"Diagnosis: {clear[0].lower()}{clear[1:]}"
+        rows = [(f.code, "problem", str(f)) for f in self.findings]
+        rows += [(f.code, "remark", str(f)) for f in self.remarks]
+        header = ("code", "kind", "text")
+        return view(heading, header=header, rows=rows, sentences=self.untested, align="left")
 
 
 @locked
