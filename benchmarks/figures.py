@@ -82,12 +82,17 @@ def coverage() -> dict[str, Any]:
     """Return coverage of fleets by specimen, and of posteriors with a metric."""
     from benchmarks.posterior import groups, pooled
 
-    fleets = study("fleet", "--cells", "one input", "two inputs*")["rows"]
+    fleets = study("fleet", "--cells", "one input", "two inputs*", "--data-sets", "2")["rows"]
     posteriors = study("posterior", "--data-sets", "1")["summary"]
     return {
-        "fleets": {cell: rows[0] for cell, rows in fleets.items()},
+        "fleets": {cell: _means(rows) | {"fleets": len(rows)} for cell, rows in fleets.items()},
         "posteriors": {name: pooled(posteriors, has) for name, has in groups().items()},
     }
+
+
+def _means(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each figure."""
+    return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
 def scoreboard() -> dict[str, Any]:

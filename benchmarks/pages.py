@@ -637,9 +637,10 @@ def all_coverage() -> Iterator[Row]:
     stored = figures("coverage")
     for cell, fleet in stored.get("fleets", {}).items():
         for name in (key for key in fleet if key.startswith(("mean_", "spread_"))):
-            error = np.sqrt(fleet[name] * (1 - fleet[name]) / 1000)
+            n = 1000 * int(fleet.get("fleets", 1))
+            error = np.sqrt(fleet[name] * (1 - fleet[name]) / n)
             shown = f"{short(fleet[name], 3)} ± {short(float(error), 3)}"
-            yield [f"likelihood by specimen, {cell}: `{name}`", shown, "1,000"]
+            yield [f"likelihood by specimen, {cell}: `{name}`", shown, f"{n:,}"]
     for name, group in stored.get("posteriors", {}).items():
         if "," in name or group["intervals"] < 150:  # too few of a single problem
             continue

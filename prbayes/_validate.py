@@ -97,8 +97,8 @@ def observed_sample(
     array = real_array(values, name)
     if array.ndim != 1:
         raise ValueError(
-            f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
-            "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each; "
+            f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); for "
+            "several outputs of a specimen, (N, m), use prb.Joint(metric), or one Simulator each; "
             f"{NO_POPULATION}"
         )
     n_failed = int(np.isposinf(array).sum())
@@ -111,7 +111,7 @@ def observed_sample(
             advice = "; a specimen that failed, +inf, takes a metric that counts it"
         raise ValueError(
             f"{name}: got {n_invalid} NaN or infinite among {array.size} values, expected finite "
-            f"ones; leave missing specimens, NaN or masked, out{advice}"
+            f"ones; leave out missing specimens (NaN or masked){advice}"
         )
     _refuse_huge(array, name)
     n_finite = array.size - n_failed
@@ -162,7 +162,7 @@ def _refuse_huge(array: Floats, name: str) -> None:
     if largest > _LARGEST:
         raise ValueError(
             f"{name}: got values of up to {largest:.3g}, expected at most {_LARGEST:g} in size; "
-            "look at what they are, or take another unit"
+            "check them, or use another unit"
         )
 
 
@@ -179,8 +179,8 @@ def simulated_sample(
         )
     if np.isnan(array).any() or np.isneginf(array).any():
         raise ValueError(
-            f"{name}: got NaN or -inf, expected numbers; a specimen that failed is +inf, "
-            "other points are to be left out with weight"
+            f"{name}: got NaN or -inf, expected numbers; +inf is a specimen that failed; leave out "
+            "other points with their weights"
         )
     return array
 
@@ -214,8 +214,8 @@ def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:
         is_number = isinstance(label, int | float | np.number) and not isinstance(label, bool)
         if not (np.isfinite(label) if is_number else isinstance(label, str | np.datetime64)):
             raise ValueError(
-                f"{name}: got {called(label)} as a label, expected texts or numbers; give a "
-                "specimen that has no label one of its own"
+                f"{name}: got {called(label)} as a label, expected texts or numbers; give each "
+                "specimen without a label a new one"
             )
     return np.asarray(values)
 

@@ -120,7 +120,7 @@ def _report(options: argparse.Namespace) -> list[Path]:
 def _refuse_to_replace(options: argparse.Namespace, html: Path | None) -> None:
     """Raise if the documents would replace results, or without --force any file."""
     if html is not None and any(html.resolve() == path.resolve() for path in options.files):
-        raise UserError(f"{html}: got the path of results, expected one for the report")
+        raise UserError(f"{html}: got the path of results, expected another path for the report")
     if options.force:
         return
     taken = [html] if html is not None and html.is_file() else []
@@ -129,8 +129,8 @@ def _refuse_to_replace(options: argparse.Namespace, html: Path | None) -> None:
             taken += sorted(options.markdown.glob(pattern))
     if taken:
         raise UserError(
-            f"{taken[0]}: there is such a file, expected a new one; pass --out or --markdown with "
-            "another path, or --force to replace it"
+            f"{taken[0]}: got a file that exists, expected a new one; pass --out or --markdown "
+            "with another path, or --force to replace it"
         )
 
 
@@ -164,7 +164,7 @@ def _results(files: Sequence[Path]) -> dict[str, Any]:
 def _opened(path: Path) -> xr.DataTree:
     """Return the contents of a file, or raise if they are not results of prbayes."""
     if not path.is_file():
-        raise UserError(f"{path}: there is no such file")
+        raise UserError(f"{path}: got no such file, expected saved results")
     import xarray as xr
 
     from prbayes.reports.material import complaints, kind_of_decision

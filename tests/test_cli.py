@@ -113,7 +113,7 @@ def test_no_file_is_replaced_without_force(
         path.write_text("old")
         is_free = name == "results.svg"
         assert main(asked) == (0 if is_free else 2)
-        assert is_free or f"{Path(name)}: there is such a file" in capsys.readouterr().err
+        assert is_free or f"{Path(name)}: got a file that exists" in capsys.readouterr().err
         assert path.read_text(encoding="utf-8") == "old"
         assert main([*asked, "--force"]) == 0
         if name.endswith(("html", "md")):
@@ -200,8 +200,8 @@ def test_mistakes_get_one_line_and_exit_code_2(
     for name, posterior in (("nodims.nc", xr.Dataset({"mu": 1.0})), ("stranger.nc", stranger)):
         write(name, xr.DataTree.from_dict({"posterior": posterior}))
     cases = [
-        (["missing.nc"], "missing.nc: there is no such file"),
-        (["."], "there is no such file"),
+        (["missing.nc"], "missing.nc: got no such file"),
+        (["."], "got no such file"),
         (["text.nc"], "no netCDF file that can be read"),
         (["cut.nc"], "no netCDF file that can be read"),
         (["other.nc"], "expected results of prbayes"),

@@ -327,7 +327,7 @@ def test_chains_in_different_modes_take_the_place_of_r_hat(chains: xr.DataTree) 
 
 def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) -> None:
     errors = np.sqrt(np.diag(optimum.covariance))
-    for pull, text in ((0.1, "less than a conflict"), (1.0, "no hyperparameter is in conflict")):
+    for pull, text in ((0.1, "too little to matter"), (1.0, "no hyperparameter is in conflict")):
         checked = check_conflict(optimum, (optimum.theta + pull * errors)[None])
         assert text in str(checked.remarks[0])
         assert not checked.findings

@@ -257,13 +257,13 @@ TRAPS = {
     "rounded": Trap("rounded-data", partial(rounded, response=line), clean_line),
     "rounded, folded": Trap("rounded-data", partial(rounded, response=fold), clean_fold),
     "copies": Trap("identical-specimens", copied, clean_line),
-    "noise": Trap("scatter of its own", lambda rng: of_response(rng, noisy(0.3)), clean_line),
+    "noise": Trap("it is random", lambda rng: of_response(rng, noisy(0.3)), clean_line),
     "noise of a thousandth": Trap(
-        "scatter of its own", lambda rng: of_response(rng, noisy(0.001)), clean_line
+        "it is random", lambda rng: of_response(rng, noisy(0.001)), clean_line
     ),
-    "state": Trap("scatter of its own", lambda rng: of_response(rng, Memory()), clean_line),
+    "state": Trap("it is random", lambda rng: of_response(rng, Memory()), clean_line),
     "state of one by one": Trap(
-        "scatter of its own",
+        "it is random",
         lambda rng: of_response(rng, prb.scalar(Memory().of_number)),
         lambda rng: of_response(rng, prb.scalar(line)),
     ),

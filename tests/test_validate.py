@@ -75,15 +75,15 @@ OBSERVED: list[tuple[Any, str]] = [
     (np.ones((2, 3)), r"shape \(2, 3\), expected one dimension.*one Simulator each"),
     ([], "got no values, expected at least 2"),
     ([1.0], "got one value, expected at least 2"),
-    ([1.0, None, 2.0], "got 1 NaN or infinite among 3 values.*leave missing"),
-    ([INF, -INF, 2.0, NAN], "got 3 NaN or infinite among 4 values.*leave missing specimens, NaN"),
-    (np.ma.masked_equal([1.0, -9.0, 2.0], -9.0), "got 1 NaN .*, NaN or masked, out"),
+    ([1.0, None, 2.0], "got 1 NaN or infinite among 3 values.*leave out missing"),
+    ([INF, -INF, 2.0, NAN], "got 3 NaN or infinite among 4 values.*leave out missing specimens"),
+    (np.ma.masked_equal([1.0, -9.0, 2.0], -9.0), r"got 1 NaN .* \(NaN or masked\)"),
 ]
 SIMULATED: list[tuple[Any, str]] = [
     (1.0, r"shape \(\), expected \(..., n\)"),
     (np.ones((3, 0)), r"shape \(3, 0\)"),
-    ([[0.0, 1.0], [NAN, 1.0]], r"NaN or -inf.*failed is \+inf"),
-    ([0.0, -INF], "NaN or -inf.*left out with weight"),
+    ([[0.0, 1.0], [NAN, 1.0]], r"NaN or -inf.*\+inf is a specimen that failed"),
+    ([0.0, -INF], "NaN or -inf.*leave out other points"),
 ]
 WEIGHTS: list[tuple[Any, str]] = [
     (0.5, r"shape \(\), expected \(..., 3\)"),

@@ -350,8 +350,8 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
         if metric is not None:
             raise ValueError(
                 f"prb.plan: {sample.responses.name}: metric: got {metric!r} of a simulator with "
-                "the log-likelihood by specimen, whose posterior takes all the information of the "
-                "response; leave metric= out"
+                "the log-likelihood by specimen, whose posterior uses the whole information of "
+                "the response; leave metric= out"
             )
         return fisher_information(sample)
     node = evaluator.nodes[sample.k]

@@ -299,9 +299,8 @@ class ResponseSample:
         caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
             raise ValueError(
-                f"{caller}: {quantity!r}: got specimens that failed (+inf), of "
-                "which there is none, expected finite responses; ask for a Quantile or an "
-                "Exceedance"
+                f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
+                "responses; ask for a Quantile or an Exceedance"
             )
         (value,) = self.evaluate(quantity, center)
         # With the responses that are equal to a quantile, such as the largest.
@@ -325,7 +324,7 @@ class ResponseSample:
         if error > 0.3 * share:
             text = (
                 f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
-                f"of {error:.2g}, and the quantity is no better known; {advice}."
+                f"of {error:.2g}, which limits the accuracy of the quantity; {advice}."
             )
             findings = report(Finding("rough-probability", text))
         if not isinstance(quantity, Quantile):
@@ -495,8 +494,8 @@ def output_column(responses: Responses, values: Floats, output: Any) -> int | No
     if values.ndim == 1:
         if output is not None:
             raise ValueError(
-                f"{responses.name}: output: got {output!r} of a response that has one number, "
-                "expected None"
+                f"{responses.name}: output: got {output!r} of a response with one output, expected "
+                "None; leave output= out"
             )
         return None
     outputs = responses.outputs or Outputs(tuple(range(values.shape[1])))

@@ -39,6 +39,11 @@ class Quantity(ABC):
         Whether `of_specimen` has derivatives where the response has.
     of_inputs : str
         Description of the number that `of_specimen` returns.
+
+    Raises
+    ------
+    TypeError
+        If the response is not callable.
     """
 
     needs_finite = False
@@ -137,6 +142,11 @@ class Quantile(Quantity):
     probability : float
         Between 0 and 1.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
@@ -195,6 +205,11 @@ class Exceedance(Quantity):
         In units of the response.
     below : bool
         Whether to look below the limit.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
 
     Examples
     --------
@@ -273,7 +288,8 @@ class Interval:
         low = finite_number(self.low, "Interval: low")
         if finite_number(self.high, "Interval: high") <= low:
             raise ValueError(
-                f"Interval: high: got {self.high} with low = {self.low}, expected more than that"
+                f"Interval: high: got {self.high} with low = {self.low}, expected a number above "
+                "low"
             )
 
 

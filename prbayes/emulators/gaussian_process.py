@@ -81,7 +81,7 @@ class GaussianProcess(Surface):
         if (self.lengths is None) != (self.nugget is None):
             raise ValueError(
                 f"GaussianProcess: got lengths {self.lengths} and nugget {self.nugget}, expected "
-                "both, or neither, which are then the likeliest"
+                "both or neither; leave both out to estimate them"
             )
         if self.lengths is None:
             return

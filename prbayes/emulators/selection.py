@@ -39,6 +39,12 @@ class CrossValidation:
     population_sd : float or ndarray, shape (m,)
         Standard deviation of the response, of each output where there are several: over the prior
         predictive distribution where an input is a ``.dist()``, and else over the ranges.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> prb.surrogate.CrossValidation(np.array([0.1, -0.1, 0.1]), 2.0).relative
+    0.05
     """
 
     residuals: Floats = field(repr=False)

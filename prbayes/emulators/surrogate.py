@@ -106,7 +106,8 @@ class FittedSurface:
                 Finding(
                     "coarse-without-number",
                     f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
-                    "the surface goes on without it.",
+                    "the surface is used without it; repair the coarse response if there are "
+                    "many.",
                 )
             )
         return np.asarray(self.surface(unit, coarse))
@@ -615,7 +616,7 @@ class Surrogate(Shown):
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
-                f"settings (and a fixed seed of its own){and_coarse}"
+                f"settings (and a fixed random seed){and_coarse}"
             )
         return cls(**fields, model=model, coarse=coarse, _surface=surface)
 

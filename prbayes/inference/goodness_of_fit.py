@@ -212,9 +212,9 @@ def population_misfit(
         return []
     if p_spread_out >= UNLIKELY:
         text = (
-            f"The measured values are rounded, or copied: {ties}. They are farther from the "
-            f"best population than {1 - p_value:.1%} of data sets. Spread evenly over the rounding "
-            f"steps they are not (p = {p_spread_out:.2g}): there is no sign of another "
+            f"The measured values are rounded, or copied: {ties}. They are farther from the best "
+            f"population than {1 - p_value:.1%} of data sets, but not if they are spread evenly "
+            f"over the rounding steps (p = {p_spread_out:.2g}): there is no sign of another "
             "family. Pass values with more digits, or remove copies; prb.LogLikelihood() takes "
             "rounded=."
         )
@@ -228,10 +228,10 @@ def population_misfit(
         )
         return [Finding("prior-misfit", text)]
     text = (
-        f"The data are farther from the best population than {1 - p_value:.1%} or more of data "
-        "sets that the model draws there are from theirs: the inputs probably have another family, "
-        "or the response an error; look at prb.plots.plot_responses, at outliers, and at other "
-        "families, by prb.rank."
+        f"The data are farther from their best population than {1 - p_value:.1%} or more of data "
+        "sets drawn from it are from theirs: the inputs probably have another family, or the "
+        "response has an error; look at prb.plots.plot_responses, at outliers, and at other "
+        "families with prb.rank."
     )
     if ties:
         text += f" Rounding does not explain it ({ties})."

@@ -363,7 +363,8 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
             if is_observable.sum() < total:
                 raise ValueError(
                     f"{node.name}: got {is_observable.sum()} responses that can be observed of "
-                    f"{is_observable.size}, expected at least {total}"
+                    f"{is_observable.size}, expected at least {total}; use more responses, or "
+                    "repair those that are NaN"
                 )
             drawn = column[is_observable][numbers[k]]
             data[node.name] = np.where(np.isnan(node.target.observed), np.nan, drawn)

@@ -47,6 +47,11 @@ class MarginalCorrelation(LiftedMetric):
     weights : tuple of two floats
         w_1, of each marginal discrepancy, and w_2, of each residual of a correlation.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
     Notes
     -----
     A specimen that failed (+inf) counts as the largest observed value of that output plus the

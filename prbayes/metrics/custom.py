@@ -59,8 +59,8 @@ class FunctionMetric(Metric):
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
             raise ValueError(
-                "observed weights: got unequal ones, expected none; "
-                "a FunctionMetric has no use for them"
+                "observed weights: got unequal ones, expected none; a FunctionMetric takes no "
+                "weights of observed values"
             )
         return FunctionDiscrepancy(self, observed, weights, observed.size)
 
@@ -136,9 +136,9 @@ class FunctionDiscrepancy(Discrepancy):
             if np.abs(counts - whole).max() < 1e-6:
                 return np.repeat(self.observed, whole.astype(int))
         raise ValueError(
-            "observed weights: got weights that are no counts, expected repeated values; a "
-            "FunctionMetric takes no weights of observed values; use "
-            "prb.bootstrap(optimum, parametric=True)"
+            "observed weights: got weights that are not counts, expected whole numbers: a "
+            "FunctionMetric repeats values instead of weighting them; use prb.bootstrap(optimum, "
+            "parametric=True)"
         )
 
     def outer(self, *features: Any, xp: Any) -> Any:

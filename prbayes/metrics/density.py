@@ -195,6 +195,11 @@ class Histogram(DensityEstimator):
         Number of bins over the observed range; by default ceil(range / (2 s N^(-1/3))), the
         Freedman-Diaconis rule with s = min(1.34 sd, IQR), at least five.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If ``bins`` is not as described.
+
     References
     ----------
     .. [1] Oh et al. (2019), eq. 7 and 8, doi:10.1007/s00158-019-02288-6.

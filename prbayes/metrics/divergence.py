@@ -129,6 +129,11 @@ class KullbackLeibler(Metric):
     density : GaussianKDE or Histogram
     reverse : bool
 
+    Raises
+    ------
+    TypeError
+        If ``density`` is no density estimator, or ``reverse`` is not True or False.
+
     References
     ----------
     .. [1] Oh et al. (2019), eq. 4, doi:10.1007/s00158-019-02288-6.

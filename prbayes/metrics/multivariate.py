@@ -76,9 +76,9 @@ class CompositeDiscrepancy(Discrepancy):
             parts.append(replace(part, target=part.target.with_observed(values, part_weights)))
         if not has_specimens.any(axis=-1).all():
             raise ValueError(
-                "observed: got specimens that lack outputs which every part of the metric needs, "
-                f"expected some that have those of {self.members[0].label!r} or another part; "
-                "prepare the metric against them by Metric.against"
+                "observed: got a sample without specimens that have all outputs of a component, "
+                f"expected some with those of {self.members[0].label!r} or of another component; "
+                "prepare the metric for this sample with Metric.against"
             )
         nominal = np.array([part.share for part in parts])
         if has_specimens.all():
@@ -285,6 +285,11 @@ class Joint(LiftedMetric):
         outputs must have one unit.
     random_seed : int
         Of the directions of three or more outputs.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the metric is not one of a single output, or another argument is not as described.
 
     Notes
     -----

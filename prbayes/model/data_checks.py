@@ -51,10 +51,9 @@ def warn_out_of_range(
             report(
                 Finding(
                     "data-out-of-reach",
-                    f"{label}: got observed values from {low:.4g} to {high:.4g}, all {side} "
-                    f"the first {finite.size} responses, from {lowest:.4g} to {highest:.4g}: "
-                    "look at the units, and at whether the priors reach that far, before more "
-                    "runs are made.",
+                    f"{label}: got observed values from {low:.4g} to {high:.4g}, all {side} the "
+                    f"first {finite.size} responses, from {lowest:.4g} to {highest:.4g}: check the "
+                    "units, and whether the priors reach the data, before more runs are made.",
                 )
             )
             return
@@ -227,10 +226,9 @@ def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
     return (
         Finding(
             "duplicated-data",
-            f"{name}: got {len(rows)} observed values of which only {len(distinct)} are "
-            "different, each at least twice: if these are repeated readings of a specimen, say "
-            "so by specimens=, and leave out what is there twice by mistake; else every "
-            "specimen counts, and the uncertainty is too small.",
+            f"{name}: got {len(rows)} observed values of which only {len(distinct)} are different, "
+            "each at least twice: every specimen counts, so that copies make the uncertainty too "
+            "small. Pass specimens= for repeated readings of a specimen, and leave out copies.",
         ),
     )
 

@@ -342,7 +342,10 @@ class SpecimenLikelihood:
             return evaluated
         model = self.model()
         if model is None:
-            raise RuntimeError("got a simulator whose model is gone; build the model again")
+            raise RuntimeError(
+                "got a simulator whose model was deleted, expected one with its "
+                "model; build the model again"
+            )
         return Hyperparameters.of(model)
 
     def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:

@@ -31,7 +31,7 @@ def propose_runs(
     runs: Runs | None = None,
     random_seed: Seed = 0,
 ) -> ProposedRuns:
-    """Return points at which more runs of a table are needed, to hand to whoever computes them.
+    """Return inputs of runs that a table needs.
 
     Specimens of the prior predictive population whose response is near a measured one: those
     outside the ranges of the runs if there are any, and else those far from all runs. The response
@@ -110,7 +110,7 @@ def propose_runs(
     return proposed
 
 
-class ProposedRuns(Shown, pd.DataFrame):
+class ProposedRuns(Shown, pd.DataFrame):  # type: ignore[misc]  # pandas has no types
     """Points at which more runs of a table are needed; parts of it are plain DataFrames."""
 
     def to_dataframe(self) -> pd.DataFrame:

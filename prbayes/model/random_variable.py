@@ -347,7 +347,10 @@ class ObservedRV(RandomVariable):
         """The record that applications of the operation reference."""
         record = self.reference()
         if record is None:
-            raise RuntimeError(f"{self}: got an operation of a model that is gone")
+            raise RuntimeError(
+                f"{self}: got an operation of a model that was deleted, expected one with its "
+                "model; build the model again"
+            )
         return record
 
     @property
@@ -423,10 +426,9 @@ class SimulatorRV(ObservedRV):
             report(
                 Finding(
                     "independent-draws",
-                    f"{self.simulator.name} has inputs that {names} has too, the same "
-                    "specimens; PyMC's predictive sampling draws each variable by itself, and so "
-                    "as independent of the others: use prb.predict for responses of the same "
-                    "specimens.",
+                    f"{self.simulator.name} and {names} have the inputs of the same specimens, but "
+                    "PyMC's predictive sampling draws each variable independently: use "
+                    "prb.predict for responses of the same specimens.",
                 )
             )
         *params, size = arguments

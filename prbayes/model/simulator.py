@@ -437,9 +437,9 @@ def _with_common_specimens(
         if common(simulator):
             raise ValueError(
                 f"{name}: specimens: got {common(simulator)[0]!r}, which {simulator.name} has too "
-                f"with {called(simulator.target.metric)}, expected each specimen by one kind of "
-                f"metric: pass metric=prb.LogLikelihood() to {simulator.name}, or the same metric "
-                f"to {name}"
+                f"with {called(simulator.target.metric)}, expected one kind of metric for each "
+                f"specimen: pass metric=prb.LogLikelihood() to {simulator.name}, or the same "
+                f"metric to {name}"
             )
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
     return [joint for joint in likelihoods if any(map(common, joint.measurements))]
@@ -498,9 +498,9 @@ def _joint_likelihood(
         functions = m.responses.function, measurement.responses.function
         if isinstance(functions[0], Runs) != isinstance(functions[1], Runs):
             raise ValueError(
-                f"{name}: response: got a table of runs in one, and a function in the other, of "
-                f"it and {m.name}, which has the same specimens, expected the same kind in both; "
-                "make a table of both"
+                f"{name}: response: got a table of runs in one and a function in the other of "
+                f"{name} and {m.name}, which have the same specimens, expected the same kind in "
+                "both; make a table of both"
             )
         if m.gross_errors != measurement.gross_errors:
             raise ValueError(
@@ -724,10 +724,9 @@ def _warn_shared_specimens(
             report(
                 Finding(
                     "shared-specimens",
-                    f"{second.name} and {simulator.name} share specimens, and each epsilon "
-                    "counts them: under pm.sample they count twice, and the posterior comes "
-                    "out too narrow; call "
-                    "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "
+                    f"{second.name} and {simulator.name} share specimens, and each epsilon counts "
+                    "them: under pm.sample they count twice, and the posterior is too narrow; "
+                    "call prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "
                     "before, or use prb.sample, whose posterior counts them once.",
                 )
             )

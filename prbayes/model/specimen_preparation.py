@@ -120,9 +120,9 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if share is not None and likelihood.inputs.conditions:
             raise DesignError(
                 f"{likelihood.name}: got NaN from the response for a share of the specimens that "
-                "matters, expected a response of all specimens with prb.response.condition, since "
-                "the share depends on the condition; return a number there, such as the limit of "
-                "what can be measured, or narrow the priors"
+                "is not negligible, expected a response of all specimens with "
+                "prb.response.condition, since the share depends on the condition; return a "
+                "number there, such as the limit of the measurement, or narrow the priors"
             )
         if likelihood.has_table:
             refined = emulation

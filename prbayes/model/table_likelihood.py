@@ -108,7 +108,12 @@ def points_of_tables(
         emulation = _with_bias(problem, likelihood, emulation, likely, ranges)
         _require_accurate(likelihood, problem, emulation)
         points = draw_points(
-            emulation, readings, roots, options, error_is_known=likelihood.error_is_known
+            emulation,
+            readings,
+            roots,
+            options,
+            error_is_known=likelihood.error_is_known,
+            gross_errors=likelihood.measurements[0].gross_errors is not False,
         )
     draws: Draws = posterior(points.z, points.log_a)
     specimens = draws.specimens()
@@ -220,11 +225,11 @@ def _require_cover(
         if low < least or high > most
     ]
     raise DesignError(
-        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs "
-        f"of {int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
-        f"and {outside.mean():.0%} of those of all, expected none and {MAX_LOST:.0%}: about "
-        f"{'; '.join(parts) or 'the corners of the ranges'}; prb.propose_runs(model) returns a "
-        "table of runs to add"
+        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs of "
+        f"{int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
+        f"expected none, and {outside.mean():.0%} of the likelihood of all, expected at most "
+        f"{MAX_LOST:.0%}: about {'; '.join(parts) or 'the corners of the ranges'}; "
+        "prb.propose_runs(model) returns a table of runs to add"
     )
 
 

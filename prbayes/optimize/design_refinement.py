@@ -385,9 +385,9 @@ def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
     if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
         advice = (
-            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
-            "more runs help as far as it is by the emulator, whose error is in optimum.message; "
-            "add the rest to the standard errors"
+            f"the {runs} runs have the largest number of emulated points, {SIZES.largest}: more "
+            "runs reduce only the part of the error that is due to the emulator, stated in "
+            "optimum.message; add the rest to the standard errors"
         )
     text = (
         f"The optimum of another design would differ by about {error:.2f} standard errors, "
@@ -404,8 +404,8 @@ def rough_emulators(evaluator: Evaluator) -> list[Finding]:
         if emulator is not None and emulator.error > _POOR_EMULATOR:
             text = (
                 f"{name}: between its runs the emulator has an error of {emulator.error_text}, "
-                f"expected at most {_POOR_EMULATOR}. The optimum has few errors by it if there is "
-                "no finding design-error, but predictions of this output have; pass more runs."
+                f"expected at most {_POOR_EMULATOR}. Without the finding design-error it hardly "
+                "affects the optimum, but it affects predictions of this output; pass more runs."
             )
             page = "expensive.md#several-inputs-from-a-few-dozen-runs"
             findings.append(Finding("rough-emulator", text, page))

@@ -42,9 +42,9 @@ class LocalOptimum:
         """Report that the data could as well come from here."""
         return Finding(
             "second-mode",
-            f"The data could as well come from {point_text(evaluator, self.theta)}: another "
-            "optimum, or mirror solution, whose discrepancy differs by no more than sampling "
-            "noise; state a prior that excludes one, or report both.",
+            f"Another optimum fits about as well, {point_text(evaluator, self.theta)}: its "
+            "discrepancy differs by no more than sampling noise; state a prior that excludes one, "
+            "or report both.",
             "optimum_or_abc.md#two-answers",
         )
 

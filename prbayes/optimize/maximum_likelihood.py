@@ -397,9 +397,9 @@ def _findings(
         findings.append(
             Finding(
                 "support-edge",
-                "The likelihood jumps at the optimum, as it does where the end of an input's "
-                "support meets a specimen; no standard errors follow from its curvature. Sample "
-                "with prb.sample_smc.",
+                "The likelihood jumps at the optimum, where the end of an input's support meets a "
+                "specimen, so that its curvature gives no standard errors. Sample with "
+                "prb.sample_smc.",
                 "likelihood.md#moving-supports",
             )
         )

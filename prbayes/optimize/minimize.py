@@ -523,9 +523,9 @@ def _report(
     optimum = optimum_of(search, fit, record, problem.n_previous)
     if stopped:
         text = (
-            f"{stopped} before the minimisation was finished, so that this is no answer yet; "
-            f"{kept(evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-            "built again, to go on."
+            f"{stopped} before the minimisation was finished, so that the result is not an "
+            f"optimum; {kept(evaluator.model)}; build the model again and call prb.minimize with a "
+            "larger budget to continue."
         )
         finding = Finding("budget-spent", text, "expensive.md#a-night-is-not-enough")
         return replace(optimum, findings=report(finding))
@@ -557,7 +557,7 @@ def _report(
 def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
-    sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
+    sentences = [f"{', '.join(at_edge)} reached the edge of the support."] if at_edge else []
     designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
     emulated = [design.summary(name) for name, design in designs.items() if design.is_emulated]
     if emulated and np.isfinite(fit.design_error):

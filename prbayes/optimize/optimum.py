@@ -223,6 +223,18 @@ class Optimum:
         What is not identified, and what else to know of the answer; also logged.
     search : SearchRecord
         How the minimisation went, and what it cost.
+
+    Examples
+    --------
+    >>> import pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
+    >>> optimum = prb.minimize(model)
+    >>> optimum.converged, list(optimum.point), list(optimum.stderr)
+    (True, ['mu'], ['mu'])
     """
 
     point: dict[str, Any]
@@ -514,8 +526,8 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     if findings:
         reasons = " ".join(map(str, findings))
         raise ValueError(
-            f"{caller}: got an optimum around which nothing is known: {reasons} "
-            "prb.sample_smc(epsilon=..., adjustment=None) makes no use of it"
+            f"{caller}: got an optimum without standard errors or curvature: {reasons} Use "
+            "prb.sample_smc(epsilon=..., adjustment=None), which needs no optimum"
         )
     return optimum
 

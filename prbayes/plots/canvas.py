@@ -212,6 +212,6 @@ def refuse_labels(
     if unknown and (evaluator is not None or len(unknown) == len(labels)):
         more = ", ..." if len(names) > 12 else ""
         raise KeyError(
-            f"labels: got {unknown[0]!r:.60}, which is no name of what is shown; expected some of "
+            f"labels: got {unknown[0]!r:.60}, expected names that the picture shows, some of "
             f"{', '.join(names[:12])}{more}"
         )

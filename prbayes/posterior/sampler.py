@@ -129,8 +129,8 @@ class Sampler(_BASE):  # type: ignore[misc]
         ):
             if not any(value is default or value == default for default in defaults):
                 raise ValueError(
-                    f"{name}: got {value!r}, expected {defaults[0]!r}: {self!r} tunes nothing and "
-                    "finds its own start; leave it out, or pass optimum= to the Sampler"
+                    f"{name}: got {value!r}, expected {defaults[0]!r}: {self!r} has no tuning and "
+                    "no initial values; leave it out, or pass optimum= to the Sampler"
                 )
         model = model_on_context(model, repr(self))
         with threadpool_limits(cores if blas_cores == "auto" else blas_cores):

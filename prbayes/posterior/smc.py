@@ -401,10 +401,10 @@ def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
             findings.append(
                 Finding(
                     "lost-mass",
-                    f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
-                    f"{limit:.1%} of the population has no response (NaN), and they rest on the "
-                    "specimens that have one; repair the response, return +inf for specimens "
-                    "that fail, or narrow the priors.",
+                    f"{node.name}: lost mass: in {share:.0%} of the draws more than max_lost = "
+                    f"{limit:.1%} of the population has no response (NaN), and the draws describe "
+                    "only the specimens that have one; repair the response, return +inf for "
+                    "specimens that fail, or narrow the priors.",
                     "expensive.md#when-a-run-fails",
                 )
             )

@@ -91,15 +91,15 @@ def refuse_lost_share(
     """Raise DesignError if a larger share of the population than the limit has no response."""
     if share > limit:
         raise DesignError(
-            f"{name}: lost mass: got {share:.1%} of the population without a response (NaN) at "
-            f"the answer, expected at most max_lost = {limit:.1%}: it would rest on the specimens "
-            f"that have one; {remedy}, return +inf for specimens that fail, or pass a "
+            f"{name}: lost mass: got {share:.1%} of the population without a response (NaN) at the "
+            f"answer, expected at most max_lost = {limit:.1%}: the answer would describe only the "
+            f"specimens that have one; {remedy}, return +inf for specimens that fail, or pass a "
             "larger max_lost, as in propagation=prb.Reweighted(n, max_lost=...)"
         )
 
 
 class Bound(ABC):
-    """A propagation at work for one simulator.
+    """A propagation that is prepared for one simulator.
 
     Attributes
     ----------

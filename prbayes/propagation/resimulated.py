@@ -58,6 +58,11 @@ class Resimulated(Propagation):
     executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
+
     Examples
     --------
     >>> Resimulated(512)
@@ -87,9 +92,9 @@ class Resimulated(Propagation):
         enough = per_observation * target.n_effective
         if self.n < enough:
             text = (
-                f"{name}: the log-likelihood of {self.n} resimulated responses sees too little of "
-                "the tails: its standard errors and posterior come out too narrow, expected at "
-                f"least {enough:.0f} responses, {per_observation} for each observation; use "
+                f"{name}: got {self.n} resimulated responses for a log-likelihood, expected at "
+                f"least {enough:.0f}, {per_observation} for each observation: the tails are "
+                "undersampled, and the standard errors and the posterior are too narrow; use "
                 "prb.Reweighted(n), prb.KullbackLeibler() or a larger n."
             )
             report(Finding("few-responses", text, "choose.md#how-many-responses"))
@@ -214,6 +219,11 @@ class Fresh(Propagation):
         Largest share of a population whose response is NaN, at the answer.
     executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
 
     Examples
     --------

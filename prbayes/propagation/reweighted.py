@@ -115,6 +115,11 @@ class Reweighted(Propagation):
         them, as nothing else ends a response that hangs. What hangs outside Python ends with its
         worker, half as long again and a second later; Dask then tries it on other workers.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not as described.
+
     References
     ----------
     .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance
@@ -206,17 +211,16 @@ class Reweighted(Propagation):
             kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in inputs.aleatory)
             raise TypeError(
                 f"{name}: emulator: got {type(self.emulator).__name__} for aleatory inputs "
-                f"({kinds}), expected several continuous numbers for each specimen; of one number "
-                "the runs are a quadrature rule, and discrete ones are computed: leave emulator= "
-                "out"
+                f"({kinds}), expected several continuous numbers for each specimen: one number or "
+                "discrete ones need no emulator; leave emulator= out"
             )
         if self.coarse is not None:
             if not self.emulates(inputs):
                 raise TypeError(
                     f"{name}: coarse: got a coarse response for "
                     f"{counted(inputs.dimensions, 'aleatory number')} and n = {self.n}, expected "
-                    "several continuous numbers for each specimen and at most "
-                    f"{MOST_RUNS} runs, between which something is emulated: leave coarse= out"
+                    f"several continuous numbers for each specimen and at most {MOST_RUNS} runs, "
+                    "so that there is an emulator to support; leave coarse= out"
                 )
             refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 
@@ -451,10 +455,9 @@ class ReweightedBound(Bound):
         share = 1.0 if emulator is None else emulator.run_share
         if emulator is None or share > most + design.emulator.run_share:
             raise PoorEmulatorError(
-                f"{self.name}: the design is of {self.n_runs} runs, between which its own response "
-                "is emulated; another response of the same specimens is not predicted by the runs: "
-                f"got an emulator that would leave {share:.0%} of a population to them, expected "
-                f"at most {most:.0%} more than of its own; calibrate with "
+                f"{self.name}: got a response of the same specimens whose emulator would leave "
+                f"{share:.0%} of a population to the {self.n_runs} runs alone, expected at most "
+                f"{most:.0%} more than for the response of the design; calibrate with "
                 "prb.Reweighted(n, emulator=None), or let one response return both outputs"
             )
         return emulator
@@ -564,8 +567,7 @@ def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> Non
     if dimensions <= 4:
         level = logging.INFO  # refinement follows in most calls
         advice = (
-            "prb.minimize and prb.sample_smc refine it themselves, "
-            "before pm.sample call prb.refine(model)"
+            "prb.minimize and prb.sample_smc refine it; before pm.sample call prb.refine(model)"
         )
     else:
         by_default = replace(bound.config, emulator="auto")
@@ -577,8 +579,8 @@ def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> Non
         )
     text = (
         f"{bound.name}: the design of {bound.config.n} runs supports a typical population of the "
-        f"prior with a weight effective sample size of {ess:.0f}, where {bound.required_ess:.0f} "
-        f"make its error small; {advice}."
+        f"prior with a weight effective sample size of {ess:.0f}, expected at least "
+        f"{bound.required_ess:.0f} for a small error; {advice}."
     )
     report(Finding("thin-design", text), level=level)
 

@@ -328,9 +328,8 @@ def _fit_components(
             ranked = _given_population(ranked, mean, 4 * covariance)
         is_wide = (_sd(ranked) > share * scatter).any(axis=1)
         sd = subset.readings.comparison_sd(sampler.emulation.error)
-        is_noisy = (
-            sd > share * subset.readings.rows(typical).spread()
-        ) & subset.readings.is_measured
+        spread = subset.readings.rows(np.flatnonzero(typical)).spread()
+        is_noisy = (sd > share * spread) & subset.readings.is_measured
         is_uncertain = (is_noisy | subset.readings.is_censored).any(axis=1)
         has_mass = ~(is_wide | is_uncertain[ranked.specimen])
         if is_pulled and has_mass.any():

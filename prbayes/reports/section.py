@@ -24,7 +24,7 @@ _BEGINNINGS = (
 
 @dataclass(frozen=True, eq=False, init=False)
 class Section:
-    """One section of a `Report`: paragraphs, a table and a picture, each where given.
+    """One section of a `Report`: paragraphs, a table and a picture, each optional.
 
     Parameters
     ----------
@@ -109,7 +109,8 @@ class Section:
         if picture is not None:
             if not alt.strip():
                 raise ValueError(
-                    f"Section {title!r}: alt: got nothing, expected a sentence on the picture"
+                    f"Section {title!r}: alt: got nothing, expected a sentence that describes the "
+                    "picture"
                 )
             picture = image(picture)
         vars(self).update(

@@ -123,6 +123,17 @@ class Cost(Shown):
     simulators : tuple
         For each simulator: ``name``, ``propagation``, the ``needed`` runs (``first``,
         ``per_theta``, ``most`` and ``growth``), the number of ``computed`` runs, and ``workers``.
+
+    Examples
+    --------
+    >>> import pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
+    >>> prb.cost(model).runs
+    1024
     """
 
     simulators: tuple[SimulatorCost, ...]

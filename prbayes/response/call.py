@@ -521,10 +521,9 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
             raise StoreError(
                 f"{settings.name}: store: got a response that gives {text} at "
                 f"({', '.join(f'{x:.6g}' for x in keys[row])}), expected "
-                f"{numbers_text(values[row])}, which is stored in {store.path}: it is of another "
-                "function, or its variables have changed; nothing was changed: "
-                f"{remedy} another folder, or version= with a name for the response as it is now, "
-                "whose runs are then kept apart"
+                f"{numbers_text(values[row])}, which is stored in {store.path}: it is another "
+                f"function, or its variables have changed; nothing was changed: {remedy} another "
+                "folder, or version= with a new name, whose runs are stored apart"
             )
     store.verified = True
 
@@ -782,6 +781,6 @@ def _raise_lost(name: str, error: BaseException) -> None:
     if is_loss(error):
         cause = "if a response ends its worker, on_failure= may let that cost its point only; "
     raise ResponseError(
-        f"{name}: {failure_text(error)}; {cause}run again: with store= nothing that was computed "
-        "is computed again"
+        f"{name}: {failure_text(error)}; {cause}run again: with store= finished responses are not "
+        "computed again"
     ) from error

@@ -59,6 +59,11 @@ def command(
     keep : bool
         Whether folders are kept. With ``folder``, those of failed runs are kept in any case.
 
+    Returns
+    -------
+    callable
+        The response, to be passed to `Simulator`, `Surrogate.fit` or `predict`.
+
     Raises
     ------
     TypeError, ValueError
@@ -125,7 +130,7 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
     path = shutil.which(program)
     if path is None:
         raise FileNotFoundError(
-            f"command: got the program {program!r}, which is not there or cannot be run, expected "
+            f"command: got the program {program!r}, which is missing or not executable, expected "
             "one on the path, or its whole path"
         )
     return (os.path.abspath(path), *rest)  # it runs in another folder

@@ -115,7 +115,7 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
         raise ValueError(
             f"{caller}: values: got shape {array.shape}, {int((~np.isfinite(array)).sum())} of "
             "them not finite, expected a finite number for each of at least two specimens, or a "
-            "row of them, filled up with NaN"
+            "row of numbers for each, padded with NaN"
         )
     if array.min() == array.max():
         raise ValueError(
@@ -135,7 +135,7 @@ def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVar
     if np.isinf(array).any() or not is_number.any(axis=1).all():
         raise ValueError(
             f"{caller}: values: got infinite values, or a row without a number, expected finite "
-            "numbers for each specimen, filled up with NaN"
+            "numbers for each specimen, padded with NaN"
         )
     distinct, inverse = np.unique(array[is_number], return_inverse=True)
     if len(distinct) > most:

@@ -23,8 +23,8 @@ class ModelDiscrepancy(ABC):
         conditions = real_array(seen, f"{label}: seen")
         if conditions.ndim != 1 or not np.isfinite(conditions).all() or np.ptp(conditions) == 0:
             raise ValueError(
-                f"{label}: seen: got {seen!r:.60}, expected two different finite conditions at "
-                "least, such as [20.0, 1000.0]"
+                f"{label}: seen: got {seen!r:.60}, expected at least two different finite "
+                "conditions, such as [20.0, 1000.0]"
             )
         if shape is not None and not callable(shape):
             raise TypeError(

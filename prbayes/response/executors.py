@@ -238,9 +238,9 @@ class Pool:
         failure = failure_of(future)
         if failure is not None:
             raise ResponseError(
-                f"{self.name}: {failure_text(failure)}, also without a response at work, expected "
-                "an executor whose workers stay; make a new one, and look at what its workers do "
-                "when they start: its initializer, or a script that runs without "
+                f"{self.name}: {failure_text(failure)}, also when it computed no response, "
+                "expected an executor whose workers do not end; make a new one, and check what "
+                "its workers do when they start: its initializer, or a script that runs without "
                 "`if __name__ == '__main__':`"
             )
 
@@ -278,5 +278,5 @@ class Pool:
                 raise ResponseError(
                     f"{self.name}: got no response for {silent:.0f} s, and no worker is left, "
                     "expected workers; start some, wait for them, and run again: with store= "
-                    "nothing that was computed is computed again"
+                    "finished responses are not computed again"
                 )

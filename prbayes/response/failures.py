@@ -10,7 +10,7 @@ from prbayes._validate import Floats, called, flag, positive_integer
 
 
 class ResponseError(RuntimeError):
-    """The user's response raised, or returned something that is no response."""
+    """The user's response raised, or returned an invalid value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,11 @@ class Abort(OnFailure):
     on_nan : bool
         By default NaN is a result: a point that could not be computed keeps its weight, which is
         reported as lost mass.
+
+    Raises
+    ------
+    TypeError
+        If ``on_nan`` is not True or False.
 
     Examples
     --------

@@ -90,6 +90,11 @@ def fmu(
         Whether an instance of the unit is reused for the next specimen. Pass False for units that
         ``fmi2Reset`` does not return to their start: each specimen has a new instance.
 
+    Returns
+    -------
+    callable
+        The response, to be passed to `Simulator`, `Surrogate.fit` or `predict`.
+
     Raises
     ------
     TypeError, ValueError

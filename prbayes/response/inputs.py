@@ -502,7 +502,7 @@ def groups_of(name: str, parents: Iterable[Variable]) -> Groups | None:
         raise ValueError(
             f"{name}: inputs: got {len(ops)} calls of prb.response.group, of "
             f"{[op.dim for op in ops]}, expected one; call it once, and use what it returns for "
-            "all inputs; two partitions are one whose groups are their pairs"
+            "all inputs; combine two partitions into one, whose groups are their pairs"
         )
     return Groups(ops[0].dim, ops[0].labels)
 

@@ -63,7 +63,8 @@ class Outputs:
         if not self.keys:
             raise KeyError(
                 f"the response returned a mapping with the keys {list(result)}, expected an array; "
-                "outputs have no names: pass observed= as a mapping, or as a DataFrame, with these"
+                "outputs have no names: pass observed= as a mapping, or as a DataFrame, with "
+                "these names"
             )
         expected = [key for key, _ in self.keys]
         if set(result) != set(expected):

@@ -426,17 +426,17 @@ class Responses:
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
-                    f"response {self._place(selected, changed)}, expected the same: it has scatter "
-                    "of its own, or a state from one specimen to the next; fix its random seed or "
-                    "state, model scatter as an input, such as pm.Normal.dist(0, 1), or take "
-                    "prb.ProbabilityResidual() with prb.Fresh(), for random responses"
+                    f"response {self._place(selected, changed)}, expected the same: it is random, "
+                    "or keeps a state from one specimen to the next; fix its random seed or "
+                    "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
+                    "prb.ProbabilityResidual() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
-                f"{self.name}: the response of a specimen depends on those that it is computed "
-                f"with: got {numbers_text(got, 6)} by itself, and {numbers_text(expected, 6)} "
-                f"among {len(values)}, expected the same; look for a mean, a sum, a sort or "
-                "another order over the axis of specimens, and for a state from one specimen to "
-                "the next, or write it for one specimen, in prb.scalar"
+                f"{self.name}: the response of a specimen depends on the other specimens of a "
+                f"call: got {numbers_text(got, 6)} alone, and {numbers_text(expected, 6)} among "
+                f"{len(values)}, expected the same; look for a mean, a sum, a sort or another "
+                "order over the axis of specimens, and for a state from one specimen to the next, "
+                "or write it for one specimen, in prb.scalar"
             )
 
     def _refuse_one_size(
@@ -454,8 +454,8 @@ class Responses:
             self._called([x.reshape(few + x.shape[1:]) for x in specimens], few, is_run=False)
         except ResponseError:
             raise ResponseError(
-                f"{self.name}: the response takes {size} specimens, and neither one nor "
-                f"{few[-1]}, expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
+                f"{self.name}: the response takes {size} specimens, but not one or {few[-1]}, "
+                f"expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
             ) from None
 
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
@@ -477,11 +477,10 @@ class Responses:
         if changed is not None:
             raise ResponseError(
                 f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
-                f"{self._place(selected, changed)}, expected {numbers_text(then[changed])}, which "
-                "it gave when the simulator was written: a variable that it reads has changed "
-                "since, before or in its runs, which begin at the first use; write a function "
-                "without a state, and one for each condition, such as "
-                "functools.partial(response, load=2.0)"
+                f"{self._place(selected, changed)}, expected {numbers_text(then[changed])}, its "
+                "value when the simulator was created: a variable that it reads has changed since "
+                "then (runs begin at the first use); write a function without a state, and one "
+                "for each condition, such as functools.partial(response, load=2.0)"
             )
 
 
@@ -501,8 +500,8 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
         raise ResponseError(
             f"{settings.name}: got {numbers_text(values[rows[changed]])} and "
             f"{numbers_text(again[changed])} from the response with inputs {where}, expected the "
-            "same: it has scatter of its own, or depends on the specimens that it is computed "
-            "with; fix its random seed or state, or write it for one specimen, in prb.scalar"
+            "same: it is random, or depends on the other specimens of a call; fix its random seed "
+            "or state, or write it for one specimen, in prb.scalar"
         )
 
 

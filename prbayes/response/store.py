@@ -31,7 +31,7 @@ _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be read or written, or is of something else; never overwritten."""
+    """A store that cannot be read or written, or of something else; it is never overwritten."""
 
 
 @dataclass(eq=False)
@@ -291,14 +291,14 @@ class Store:
             responses = _responses(connection)
         if name not in responses:
             raise _FileError(
-                f"which holds no responses of simulator {_name_text(*name)}",
+                f"which has no responses of simulator {_name_text(*name)}",
                 f"one of [{', '.join(_name_text(*response) for response in responses)}]",
                 "look at name, version and folder",
             )
         _, columns = responses[name]
         if self.columns not in (None, columns):
             raise _FileError(
-                f"which holds inputs of {columns} values for simulator {self.name!r}",
+                f"which has inputs of {columns} values for simulator {self.name!r}",
                 f"{self.columns} values",
                 "nothing was changed: give the simulator another name, or pass another folder",
             )
@@ -332,7 +332,7 @@ class Store:
         expected = self._n_outputs(session)
         if (session.values and n != expected) or self.outputs not in (None, n):
             raise _FileError(
-                f"which holds runs with {n} outputs for simulator {self.name!r}",
+                f"which has runs with {n} outputs for simulator {self.name!r}",
                 f"{expected}",
                 "nothing was changed: pass version= with a name for the response as it is now",
             )

@@ -1,4 +1,4 @@
-"""Models behind an UM-Bridge server as responses.
+"""Models behind a UM-Bridge server as responses.
 
 The protocol: https://um-bridge-benchmarks.readthedocs.io, version 1.0.
 """
@@ -38,7 +38,7 @@ def umbridge(
     timeout: float | None = None,
     patience: float = 60.0,
 ) -> scalar:
-    """Turn a model behind an UM-Bridge server into a response, of one output or several.
+    """Turn a model behind a UM-Bridge server into a response, of one output or several.
 
     The names and sizes of the server's models are requested at once. A `Simulator` compares them
     with its inputs and with ``observed`` before anything is computed.
@@ -57,6 +57,11 @@ def umbridge(
         limit as long as the server's machine answers.
     patience : float
         Seconds to wait for a server that went away before the response fails.
+
+    Returns
+    -------
+    callable
+        The response, to be passed to `Simulator`, `Surrogate.fit` or `predict`.
 
     Raises
     ------
@@ -259,19 +264,22 @@ class RemoteModel:
                 n_lost, give_up_at, pause, reason = n_lost + 1, 0.0, 0.1, str(error)
                 if n_lost == 3:
                     raise ConnectionError(
-                        f"{self.model}: the server at {self.address} was lost 3 times while it "
-                        f"was at work on this specimen ({reason})"
+                        f"{self.model}: the connection to the server at {self.address} was lost 3 "
+                        f"times during this specimen ({reason})"
                     ) from None
             except (HTTPError, OSError) as error:
                 reason = f"{type(error).__name__}: {error}"
             if not give_up_at:
                 give_up_at = time.monotonic() + self.patience
-                text = f"{self.model}: the server at {self.address} is away ({reason}); waiting."
+                text = (
+                    f"{self.model}: the server at {self.address} does not answer ({reason}); "
+                    "waiting."
+                )
                 report(Finding("server-away", text))
             if time.monotonic() > give_up_at:
                 raise ConnectionError(
-                    f"{self.model}: the server at {self.address} is away for more than patience = "
-                    f"{self.patience:g} s ({reason})"
+                    f"{self.model}: the server at {self.address} has not answered for more than "
+                    f"patience = {self.patience:g} s ({reason})"
                 )
             time.sleep(pause)
             pause = min(2 * pause, 2.0)
@@ -301,9 +309,9 @@ class RemoteModel:
                 return
             reason = f"input {int(is_cut.argmax()) + 1} would be cut in two"
         raise ValueError(
-            f"{name}: got inputs of {', '.join(map(str, sizes))} numbers, expected such as fill "
-            f"vectors of sizes {list(self.inputs)} one after the other ({reason}), which the model "
-            f"{self.model!r} at {self.address} has; pass other inputs, or in another order"
+            f"{name}: got inputs of {', '.join(map(str, sizes))} numbers, expected inputs that "
+            f"fill vectors of sizes {list(self.inputs)} one after the other ({reason}), as the "
+            f"model {self.model!r} at {self.address} requires; pass other inputs, or another order"
         )
 
 

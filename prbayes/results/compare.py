@@ -129,7 +129,7 @@ def compare(
     try:
         identity = require_together(identities, "compare", model=model)
     except ValueError as error:
-        raise ValueError(f"{error}; models of the same data are compared by prb.rank") from None
+        raise ValueError(f"{error}; use prb.rank to compare models of the same data") from None
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates have those of the model.
     naming = optima[0].model if model is None and optima else model

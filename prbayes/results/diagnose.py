@@ -82,6 +82,17 @@ class Diagnosis:
         misfit.
     untested : tuple of str
         Tests of the log-likelihood by specimen that were not run, and why.
+
+    Examples
+    --------
+    >>> import pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
+    >>> [finding.code for finding in prb.diagnose(prb.minimize(model)).findings]
+    ['few-specimens']
     """
 
     findings: tuple[Finding, ...]
@@ -284,7 +295,7 @@ def _check_convergence(attrs: Mapping[Any, Any], findings: Sequence[Finding]) ->
 
 
 def _not_tested(reason: str) -> Checked:
-    text = f"Whether the inputs have the right family was not looked at: {reason}."
+    text = f"The family of the inputs was not tested: {reason}."
     return Checked(remarks=(Finding("population-not-tested", text),))
 
 
@@ -381,8 +392,8 @@ def _failure_findings(
             harmless.append(Finding("harmless-failures", text))
             continue
         text += (
-            "what took its place is no result. Look at optimum.failures, or the group failures of "
-            "a result, and repair the response."
+            "the replaced values are not results. Look at optimum.failures, or the group failures "
+            "of a result, and repair the response."
         )
         page = "expensive.md#when-a-run-fails"
         findings.append(Finding("failed-responses", text, page))
@@ -420,9 +431,10 @@ def _lost_mass(optimum: Optimum | None, lost: Mapping[str, float]) -> list[Findi
     names = evaluator.hyperparameters.readable_names
     shifts = ", ".join(f"{names[i]} by {shift[i]:+.1f}" for i in far)
     text = (
-        f"Specimens without response (NaN) matter: if they counted as far from the data, the "
-        f"optimum would move {shifts} standard errors. It is right if such specimens cannot be "
-        "measured; otherwise repair the response there, or return +inf for specimens that fail."
+        "Specimens without response (NaN) matter: if they counted as far from the data, the "
+        f"optimum would move {shifts} standard errors. The optimum is right if such specimens "
+        "cannot be measured; otherwise repair the response there, or return +inf for specimens "
+        "that fail."
     )
     return [Finding("lost-mass-matters", text, "distributed.md#when-a-response-fails")]
 
@@ -466,7 +478,7 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
         text = (
             f"R-hat is {', '.join(large)}, expected at most {limit:.2f}: the chains disagree, look "
             "at az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; "
-            "if the chains sit in separate modes, state a prior that excludes one."
+            "if the chains are in separate modes, state a prior that excludes one."
         )
         findings.append(Finding("chains-disagree", text, page))
     total = chains * draws
@@ -511,7 +523,7 @@ def _repeated_draws(draws: xr.Dataset) -> list[Finding]:
     text = (
         f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
         f"expected at least {expected}: few particles, or one, survived, and the width of the "
-        "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon."
+        "draws is meaningless. Pass more draws, priors nearer to the data, or a larger epsilon."
     )
     return [Finding("repeated-draws", text, "validity.md#diagnostics-of-the-sampler")]
 

@@ -174,7 +174,7 @@ def check_population(optimum: Optimum) -> Checked:
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
         if misfit and is_rounded:
-            reason = f"rounded readings do not fit any; pass rounded= to {likelihood.name} first"
+            reason = f"rounded readings fit no family; pass rounded= to {likelihood.name} first"
             checked += _not_tested(_FAMILY, reason)
             continue
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
@@ -394,7 +394,7 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
         "without the prior"
     )
     if pulls[j] <= _OPTIONS.pull:
-        text = f"{shift}, less than a conflict with the prior that matters."
+        text = f"{shift}, too little to matter."
         return Checked(remarks=(Finding("prior-agrees", text),))
     prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)

@@ -359,8 +359,8 @@ def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> st
     is_named = hasattr(inner, "__name__") and name != "<lambda>"
     if calling.get("store") is not None and not is_named:
         raise ValueError(
-            f"store: got a function called {name}, expected a name to keep its responses by; "
-            f"{advice}"
+            f"store: got a function called {name}, expected a name under which its responses are "
+            f"stored; {advice}"
         )
     return name
 
@@ -565,12 +565,15 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
     if missing > max_lost * is_nan.size:
         raise DesignError(
             f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
-            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            f"the specimens that have a response; {remedy}, return +inf for specimens that fail, "
-            "or pass a larger max_lost"
+            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would describe "
+            f"only the specimens that have a response; {remedy}, return +inf for specimens that "
+            "fail, or pass a larger max_lost"
         )
     if missing:
-        text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN."
+        text = (
+            f"{label}: {missing} of {is_nan.size} predicted responses are NaN; look at the "
+            "response there."
+        )
         report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)

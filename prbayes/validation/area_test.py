@@ -33,7 +33,9 @@ class ValidityTest(Shown):
     critical_value : float
         The largest area that is not rejected.
     p_value : float
+        Probability of an area at least as large under the null hypothesis.
     alpha : float
+        The significance level.
     null : str
         The null hypothesis.
     folded : bool
@@ -47,6 +49,13 @@ class ValidityTest(Shown):
         The condition and the specimen of each u-value.
     identity : Identity or None
         Of the problem whose calibration is tested, if the predictions have it.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> test = prb.area_test([0.1, 0.4, 0.6, 0.9], np.linspace(0, 1, 401))
+    >>> test.rejected, round(test.statistic, 3)
+    (False, 0.065)
     """
 
     statistic: float

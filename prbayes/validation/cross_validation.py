@@ -210,7 +210,7 @@ def _folds(
     if too_few:
         raise ValueError(
             f"folds: got {folds}, with fewer than 2 observations of {too_few} in the others, "
-            "expected fewer"
+            "expected fewer folds"
         )
     return held_out, [w / w.sum(axis=1, keepdims=True) for w in kept], np.array(sizes).T
 
@@ -382,11 +382,11 @@ def rank(
         n_missing = int(np.isnan(table["score"].values).sum())
         if n_missing:
             raise ValueError(
-                f"rank: got {label} without a score of {n_missing} of "
-                f"{table.sizes['specimen']} specimens, expected one of each: the observed values "
-                "have no density, as where all are equal, the population of a fold has no "
-                "response, or it depends on a condition of each specimen; compare the "
-                "discrepancies of prb.cross_validate instead"
+                f"rank: got {label} without a score of {n_missing} of {table.sizes['specimen']} "
+                "specimens, expected a score of each. The observed values may have no density "
+                "because all are equal, the population of a fold no response, or the response may "
+                "depend on a condition of each specimen; compare the discrepancies of "
+                "prb.cross_validate instead"
             )
     return _comparison(tables)
 

@@ -162,7 +162,10 @@ def calibrate_each(
     rows = [row for part in parts for row in part]
     failures = [row.finding for row in rows if not row.values]
     if failures:
-        text = f"{len(failures)} of {len(names)} products failed; the first: {failures[0]}"
+        text = (
+            f"{len(failures)} of {len(names)} products failed; the column finding of the table has "
+            f"the reasons; the first: {failures[0]}"
+        )
         report(Finding("failed-products", text, "fleets.md#products-that-fail"))
     if len(failures) > len(names) / 2:
         raise RuntimeError(

@@ -114,6 +114,11 @@ class PosteriorNull(Null):
     replicates : int
     random_seed : int
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
     Examples
     --------
     >>> PosteriorNull(1999)
@@ -487,8 +492,8 @@ class JointNull(Null):
         if node is None:
             raise ValueError(
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted "
-                "has, expected its .dist() objects; only then is it known which responses belong "
-                "to the specimens of the calibration"
+                "has, expected its .dist() objects, which identify the responses of the "
+                "calibration's specimens"
             )
         assert node.reweighted is not None
         return _Tested(condition, nodes.index(node), node.reweighted.values_of(responses))
@@ -559,9 +564,9 @@ def _validated_counts(
                 n_new += 1
             elif number_and_group[label][1] != group:
                 raise ValueError(
-                    f"{condition.name}: specimens: got {label!r}, which other simulators measured "
-                    f"than {node.name}, whose design points serve here; expected simulators that "
-                    "share labels and .dist() objects"
+                    f"{condition.name}: specimens: got {label!r}, which is not a specimen of "
+                    f"{node.name}, whose design is used, but of another simulator; expected "
+                    "simulators that share labels and .dist() objects"
                 )
         numbers.append(np.array([number_and_group[label][0] for label in labels], dtype=np.intp))
     return numbers, n_new

@@ -64,7 +64,7 @@ def test_nearly_equal_points_and_constant_responses() -> None:
     ("arguments", "message"),
     [
         ({"kernel": "cubic"}, "kernel: got 'cubic'"),
-        ({"lengths": (1.0, 2.0)}, "expected both, or neither"),
+        ({"lengths": (1.0, 2.0)}, "expected both or neither"),
         ({"lengths": (1.0, -2.0), "nugget": 0.1}, "lengths: got -2.0"),
         ({"lengths": (1.0, 2.0), "nugget": -0.1}, "nugget: got -0.1"),
         ({"lengths": (1.0, 2.0), "nugget": 0.0}, "got 2, expected one for each of 3 inputs"),

@@ -136,7 +136,7 @@ GENERATOR = np.random.default_rng(0)
 
 @pytest.mark.parametrize("response", [scattered, followed, centred, prb.scalar(Hot())])
 def test_a_response_with_scatter_or_a_state_is_refused(response: Any) -> None:
-    with pytest.raises(ResponseError, match=r"inputs \(x = .*expected the same: it has scatter"):
+    with pytest.raises(ResponseError, match=r"inputs \(x = .*expected the same: it is random"):
         prb.Surrogate.fit(response, BOX, 64)
 
 

@@ -233,7 +233,7 @@ def test_missing_outputs_are_compared_with_all_specimens_that_have_the_others() 
     unit = np.diff(values) / np.diff(y[6:, 0])
     np.testing.assert_allclose(unit, unit[0], err_msg="in robust units")
     assert 0.5 < abs(unit[0]) < 2
-    with pytest.raises(ValueError, match=r"lack outputs which every part .* of 'direction 1'"):
+    with pytest.raises(ValueError, match=r"all outputs of a component.* those of 'direction 1'"):
         area.against(y[12:]).with_observed(y[:6])
     assert area.against(np.ma.masked_invalid(y))(x) == whole(x)
 

@@ -252,7 +252,7 @@ def test_after_an_error_the_next_use_tries_again(
 def test_a_response_that_mixes_specimens_is_refused_at_each_use() -> None:
     model = build(lambda x: x - np.mean(x))
     for _ in range(2):
-        with pytest.raises(prb.response.ResponseError, match="depends on those that it is comp"):
+        with pytest.raises(prb.response.ResponseError, match="depends on the other specimens"):
             first_use(model)
 
 

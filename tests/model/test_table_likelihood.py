@@ -124,7 +124,9 @@ def test_a_table_beside_a_function_of_the_same_specimens_is_refused() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.2)
         settings = {"metric": prb.LogLikelihood(error=0.1), "specimens": [0, 1, 2]}
         prb.Simulator("a", lambda x: x + 1, x, observed=[2.0, 2.1, 2.2], **settings)
-        with pytest.raises(ValueError, match="a table of runs in one, and a function in the other"):
+        with pytest.raises(
+            ValueError, match="a table of runs in one and a function in the other of b"
+        ):
             prb.Simulator("b", runs, x, observed=[1.0, 1.1, 1.2], **settings)
 
 

@@ -321,7 +321,7 @@ def test_a_collapsed_population_is_no_convergence_and_has_no_errors() -> None:
     optimum = prb.minimize(model)
     assert optimum.search.at_edge == ("sigma",)
     assert np.isnan(errors(optimum)).all()
-    assert optimum.message.endswith("sigma ran to the edge of the support.")
+    assert optimum.message.endswith("sigma reached the edge of the support.")
     messages = prb.diagnose(optimum).messages
     assert "collapsed" in messages[0]
     assert not any("did not converge" in message for message in messages)
@@ -331,10 +331,10 @@ def test_a_collapsed_population_is_no_convergence_and_has_no_errors() -> None:
         prb.cross_validate,
         prb.validation.JointNull,
     ):
-        with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
+        with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma reached the edge"):
             call(optimum)
     sampler: dict[str, Any] = {"chains": 1, "optimum": optimum, "model": model, "random_seed": 1}
-    with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjustment=None"):
+    with pytest.raises(ValueError, match=r"sample_smc: .*sigma reached the edge .*adjustment=None"):
         prb.sample_smc(50, **sampler)
     tree = prb.sample_smc(50, epsilon=1 / 20, adjustment=None, **sampler)
     assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
@@ -701,7 +701,7 @@ def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.Mo
         ([None], "pass a larger n or max_points to prb.Reweighted (now 300 runs)"),
         ([16384], "pass a larger n"),
         ([SIZES.largest, None], "pass a larger n"),
-        ([SIZES.largest, SIZES.largest], "between its 300 runs are 65536 emulated points, the most"),
+        ([SIZES.largest, SIZES.largest], "the 300 runs have the largest number of emulated points"),
     ],
 )  # fmt: skip
 def test_a_large_error_of_the_design_is_reported(sizes: list[int | None], advice: str) -> None:

@@ -30,7 +30,7 @@ def test_where_nothing_is_known_an_optimum_is_refused(kind: str) -> None:
     search = SimpleNamespace(**({"at_edge": (), "at_jump": ()} | {kind: ("sigma",)}))
     optimum: Any = SimpleNamespace(search=search)
     with pytest.raises(
-        ValueError, match=r"bootstrap: got an optimum around .*sigma.*adjustment=None"
+        ValueError, match=r"bootstrap: got an optimum without .*sigma.*adjustment=None"
     ):
         require_sampling(optimum, "bootstrap")
 
@@ -101,7 +101,7 @@ def test_a_covariance_is_shown_as_standard_deviations_and_correlations() -> None
     expected = (
         "mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, cov_corr[0,1] = -0.6"
     )
-    assert f"come from {expected}: another optimum" in finding.text
+    assert f"Another optimum fits about as well, {expected}: " in finding.text
 
 
 def test_elements_with_labels_are_shown_one_by_one() -> None:

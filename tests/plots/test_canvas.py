@@ -38,7 +38,9 @@ def test_every_picture_is_drawn_with_labels(
     assert min(image.shape[:2]) > 100
     assert (image.min(axis=2) < 0.9).mean() > 0.01
     if picture in ("responses", "population", "posterior", "optimizer", "landscape", "comparison"):
-        with pytest.raises(KeyError, match="labels: got 'crak', which is no name of what is shown"):
+        with pytest.raises(
+            KeyError, match="labels: got 'crak', expected names that the picture shows"
+        ):
             pictures[picture](labels={"crak": "crack length (mm)"})
 
 

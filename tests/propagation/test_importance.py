@@ -212,7 +212,7 @@ def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
     # One that no surface follows is refused.
     rough_response = bound.responses.copied()
     rough_response.function = rough
-    with pytest.raises(PoorEmulatorError, match="another response of the same specimens is not"):
+    with pytest.raises(PoorEmulatorError, match="got a response of the same specimens"):
         bound.values_of(rough_response)
 
 
@@ -245,7 +245,7 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     fresh = prb.predict(optimum, rough, *inputs, n_samples=500, random_seed=1, stored=False)
     null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     before = optimum.evaluator(optimum.theta[None]).discrepancies
-    with pytest.raises(DesignError, match=r"y: .* is not predicted by the runs"):
+    with pytest.raises(DesignError, match=r"y: .* to the \d+ runs alone"):
         prb.area_test(np.linspace(-1, 1, 20), fresh, null=null)
     np.testing.assert_array_equal(optimum.evaluator(optimum.theta[None]).discrepancies, before)
 

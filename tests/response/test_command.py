@@ -219,5 +219,5 @@ def test_inputs_that_occur_nowhere_and_formats_of_no_number_are_refused() -> Non
         square(write={"in.txt": "{x:d}"})
     with pytest.raises(ValueError, match=r"got 2 inputs, expected 1: x"):
         square()(1.0, 2.0)
-    with pytest.raises(FileNotFoundError, match=r"'no such solver', which is not there or cannot"):
+    with pytest.raises(FileNotFoundError, match=r"'no such solver', which is missing or not"):
         prb.command(["no such solver", "{x}"], inputs=["x"], read=printed)

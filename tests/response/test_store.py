@@ -231,7 +231,7 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
-    held = r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; no"
+    held = r"y: store: .* has inputs of 3 values for simulator 'y', expected 2 values; no"
     with pytest.raises(StoreError, match=held):
         Store(folder, "y", columns=2)
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""A model behind an UM-Bridge server: a real one, and one that does to requests what it is told."""
+"""A model behind a UM-Bridge server: a real one, and one that does to requests what it is told."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def test_a_server_that_goes_away_is_waited_for() -> None:
         url = server.url
         patient, hasty = prb.umbridge(url), prb.umbridge(url, patience=0.2)
         assert hasty(7.0, 1.0)[1] == 49
-    with pytest.raises(ConnectionError, match=r"is away for more than patience = 0.2 s"):
+    with pytest.raises(ConnectionError, match=r"has not answered for more than patience = 0.2 s"):
         hasty(7.0, 1.0)
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(patient, 7.0, 1.0)
@@ -238,7 +238,7 @@ def test_a_simulator_that_does_not_fit_is_refused_before_anything_is_computed() 
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
         rng = np.random.default_rng(0)
         for inputs, event, said in (
-            ((x,), (2,), r"y: got inputs of 1 numbers, expected such as fill vectors"),
+            ((x,), (2,), r"y: got inputs of 1 numbers, expected inputs that fill vectors"),
             ((x, 1.0, 2.0), (2,), r"y: got inputs of 1, 1, 1 numbers, .*\(2 in all\)"),
             ((x, 1.0), (), r"y: observed: got shape \(N,\), expected \(N, 2\)"),
             ((x, 1.0), (3,), r"y: observed: got shape \(N, 3\), expected \(N, 2\)"),
@@ -252,7 +252,9 @@ def test_a_simulator_that_does_not_fit_is_refused_before_anything_is_computed() 
                     observed=rng.normal(size=(9, *event)),
                     propagation=prb.Reweighted(16, on_failure=prb.response.Replace()),
                 )
-        with pytest.raises(ValueError, match=r"y: got inputs of 1 numbers, expected such as fill"):
+        with pytest.raises(
+            ValueError, match=r"y: got inputs of 1 numbers, expected inputs that fill"
+        ):
             prb.Surrogate.fit(response, {"x": (0, 1)}, 16, name="y")
         assert not server.asked
 
@@ -307,7 +309,7 @@ def test_a_specimen_that_ends_its_server_is_sent_three_times() -> None:
         with ThreadPoolExecutor(1) as pool:
             error = pool.submit(response, 6.0, 1.0).exception()
         assert isinstance(error, ConnectionError)
-        assert "was lost 3 times while it was at work on this specimen" in str(error)
+        assert "was lost 3 times during this specimen" in str(error)
         assert len(server.asked) == 3
         assert response(5.0, 1.0)[1] == 25
 
@@ -339,7 +341,7 @@ def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCapture
         assert prb.umbridge(server.url)(7.0, 1.0)[1] == 49
     assert len(server.asked) == 4
     (record,) = caplog.records
-    assert "is away (it answered 503); waiting" in record.getMessage()
+    assert "does not answer (it answered 503); waiting" in record.getMessage()
 
 
 @pytest.mark.parametrize(

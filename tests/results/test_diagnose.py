@@ -156,7 +156,7 @@ def test_a_stored_optimum_has_the_findings_of_the_optimum() -> None:
     assert "did not converge (The minimiser failed. It stopped)" in diagnosis.messages[2]
     assert diagnosis.support.sizes == {"simulator": 1, "sample": 1}
     # An edge is reported once.
-    edge_finding = Finding("flat-edge", "mu ran to the edge.")
+    edge_finding = Finding("flat-edge", "mu reached the edge.")
     search = replace(optimum().search, result=Result.AT_EDGE, at_edge=("mu",))
     edge = replace(optimum(), search=search, findings=(edge_finding,))
     for result in (edge, edge.to_datatree()):
@@ -264,7 +264,7 @@ def test_an_answer_is_refused_if_most_draws_lose_too_much(
     with pytest.raises(DesignError, match=r"got 30\.0% of the") if is_refused else nullcontext():
         chains = Chains(np.zeros((1, 50, 1)), {}, xr.Dataset(), lost=lost)
         (finding,) = _lost_findings(Evaluator.of(model), chains)
-        assert "y: lost mass: of 40% of the draws more than max_lost = 5.0%" in finding.text
+        assert "y: lost mass: in 40% of the draws more than max_lost = 5.0%" in finding.text
 
 
 def test_draws_that_lose_too_much_are_counted() -> None:
@@ -281,7 +281,7 @@ def test_draws_that_lose_too_much_are_counted() -> None:
     assert calibration["lossy_draws"].item() == share
     assert 0 <= calibration["lost_mass_at_best"].item() < 0.9
     (message,) = [m for m in prb.diagnose(tree).messages if "lost mass" in m]
-    assert message.startswith(f"y: lost mass: of {share:.0%} of the draws more than")
+    assert message.startswith(f"y: lost mass: in {share:.0%} of the draws more than")
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_draws_given_the_estimate_lose_responses(sampler: Any, limit: float) -> 
     share = np.mean(lost[~np.isnan(lost)] > 0.05)
     assert 0.1 < share < 0.5
     assert calibration["lossy_draws"].item() == share
-    assert f"y: lost mass: of {share:.0%} of the draws more than" in str(prb.diagnose(tree))
+    assert f"y: lost mass: in {share:.0%} of the draws more than" in str(prb.diagnose(tree))
 
 
 def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:

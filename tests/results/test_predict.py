@@ -386,7 +386,7 @@ def test_labels_of_the_response_are_those_of_the_prediction() -> None:
 
 def test_an_array_of_values_of_specimens_is_no_population() -> None:
     load = np.linspace(1, 2, 100)
-    with pytest.raises(ResponseError, match="takes 600 specimens, and neither one nor 2"):
+    with pytest.raises(ResponseError, match="takes 600 specimens, but not one or 2"):
         predict(lambda x: x * load, n_samples=100, stored=False)
 
 

@@ -164,9 +164,9 @@ def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> li
     findings = []
     if at_edge:
         text = (
-            f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no longer "
-            "changes; perhaps the population has collapsed within the bandwidth of the metric: use "
-            "a smaller bandwidth, or prb.AreaMetric(), which has none."
+            f"{', '.join(at_edge)} reached the edge of the support, where the discrepancy no "
+            "longer changes; perhaps the population has collapsed within the bandwidth of the "
+            "metric: use a smaller bandwidth, or prb.AreaMetric(), which has none."
         )
         findings.append(Finding("flat-edge", text, "choosing_metric.md#advice"))
     if at_jump:

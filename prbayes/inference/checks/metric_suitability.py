@@ -38,11 +38,11 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         # freedom 1.5, of a lognormal one with a spread of 2.5 1.1.
         if index < 1.1:
             text = (
-                f"{node.name}: the tail of the simulated responses is so long (tail index "
-                f"{index:.2f}, of which one or less has no mean) that the area between "
-                "distribution functions is infinite, or rests on responses beyond all that were "
-                "computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs with a "
-                "mean, or the logarithm of the response."
+                f"{node.name}: the simulated responses have so heavy a tail (tail index "
+                f"{index:.2f}; a population with an index of one or less has no mean) that the "
+                "area between distribution functions is infinite, or depends on responses beyond "
+                "the computed ones: use prb.ProbabilityResidual() or prb.KullbackLeibler(), "
+                "inputs with a mean, or the logarithm of the response."
             )
             findings.append(Finding("heavy-tail", text, _ADVICE))
     return findings
@@ -93,7 +93,8 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
                     f"{node.name}: {int(is_between.sum())} of {observed.size} observed values "
                     f"({listed}) lie between responses that are farther apart than the kernel is "
                     "wide, so that their likelihood is not known: pass a larger "
-                    "prb.Reweighted(n), until the optimum stays, or use prb.KullbackLeibler()."
+                    "prb.Reweighted(n), until the optimum does not change, or use "
+                    "prb.KullbackLeibler()."
                 )
                 findings.append(Finding("data-between-runs", text, _ADVICE))
     return findings
@@ -130,9 +131,9 @@ def small_simulators(evaluator: Evaluator, *, enough: int = 30) -> list[Finding]
     return [
         Finding(
             "small-simulators",
-            f"The optimum underestimates a spread that {len(nodes)} simulators have in common, as "
-            f"they have {fewest} specimens or more, expected at least {enough}: by 30% with 4, 10% "
-            "with 10; take the posterior of prb.sample, which corrects for it, or "
+            f"The optimum underestimates the common spread of {len(nodes)} simulators, the "
+            f"smallest with {fewest} specimens, expected at least {enough}: by 30% with 4, 10% "
+            "with 10; use the posterior of prb.sample, which corrects for it, or "
             "prb.ProbabilityResidual(), or give one simulator all specimens of a condition.",
         )
     ]
@@ -204,8 +205,8 @@ def refit_bias(fitted: FittedSets) -> list[Finding]:
     text = (
         f"Refits of data sets that are drawn at the optimum give a {side[0]} {name}, on average by "
         f"{abs(shift[worst]):.1f} of their standard deviations: the optimum {side[1]}estimates it, "
-        "as with few specimens for each mean or output; report the posterior of prb.sample, which "
-        "corrects for it."
+        "usually because there are few specimens for each mean or output; report the posterior of "
+        "prb.sample, which corrects for it."
     )
     return [Finding("biased-optimum", text, _ADVICE)]
 
@@ -281,8 +282,8 @@ def _smoothing_finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     if bias[worst] > 1.5:
         amount = "more than a standard error"
     text = (
-        f"{node.name}: the kernel of the log-likelihood is wide beside what it smooths, as where "
-        f"responses lie in groups or a long tail: {name} is off by {amount} for that; use {kernel}"
-        "prb.KullbackLeibler()."
+        f"{node.name}: the kernel of the log-likelihood is wide beside features of the "
+        f"distribution, such as groups of responses or a long tail, and shifts {name} by {amount}; "
+        f"use {kernel}prb.KullbackLeibler()."
     )
     return Finding("smoothing-bias", text, _ADVICE)

@@ -169,9 +169,9 @@ def failing_region_findings(
         if share * n < lost:
             continue
         meaning = (
-            "the specimens are taken for a sample of the rest, the population truncated to inputs "
-            "with a response. If specimens with these inputs were measured, repair the response; "
-            "if none would fail unseen, return inf"
+            "the specimens count as a sample of the population truncated to inputs with a "
+            "response. If specimens with these inputs were measured, repair the response; if "
+            "their failures would have been recorded, return inf"
         )
         if prepared(likelihood).share is None:
             meaning = (
@@ -215,10 +215,10 @@ def replaced_findings(
         Finding(
             "failed-responses",
             f"{name}: got {responses[name].failures} failed responses, replaced by "
-            f"{responses[name].replacement:g}, with {share:.1%} of the population on that number, "
-            "which is compared with the data like any response. Look at optimum.failures and "
-            "repair the response; or replace it by NaN, if such specimens cannot be measured, or "
-            "by inf, if they fail.",
+            f"{responses[name].replacement:g}, which stands for {share:.1%} of the population and "
+            "is compared with the data like any response. Look at optimum.failures and repair the "
+            "response; or replace it by NaN, if such specimens cannot be measured, or by inf, if "
+            "they fail.",
             "distributed.md#when-a-response-fails",
         )
         for name, share in shares.items()

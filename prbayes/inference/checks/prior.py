@@ -116,8 +116,8 @@ def prior_end_findings(
     if not ends:
         return []
     text = (
-        f"The data push {', and '.join(map(str, ends))}, and ask for more than it allows: widen "
-        "the prior, or look at units, at the response and at the family of the inputs."
+        f"The data push {', and '.join(map(str, ends))}: widen the prior, or check the units, the "
+        "response and the family of the inputs."
     )
     return [Finding("prior-end", text, page)]
 

@@ -69,13 +69,13 @@ def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
     names = ", ".join(evaluator.simulators[k].name for k in fewest)
     text = f"{names}: got {n:.3g} specimen{'s' * (n != 1)}, expected at least {enough}: "
     if n < 2:
-        text += "one specimen says nothing of a spread, and standard errors are no measure of it; "
+        text += "one specimen does not identify a spread, and standard errors do not apply; "
     else:
         mean, spread = interval_ratios(n)
         text += (
-            "standard errors are those of many specimens. Where the spread is estimated too, "
+            "standard errors assume many specimens. Where the spread is estimated too, "
             f"{INTERVAL:.0%} intervals of a normal population's mean are at least {mean:.1f} times "
-            f"as wide as standard errors make them, and those of its spread {spread:.1f} times; "
+            f"as wide as by standard errors, and those of its spread {spread:.1f} times; "
         )
     text += "report intervals of prb.sample, not the optimum's."
     page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"

@@ -136,7 +136,7 @@ def test_an_optimum_without_standard_errors_has_a_finding() -> None:
 def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
     assert breakdown_findings((), ()) == []
     edge, jump = breakdown_findings(("sigma", "tau"), ("y",))
-    assert edge.text.startswith("sigma, tau ran to the edge of the support")
+    assert edge.text.startswith("sigma, tau reached the edge of the support")
     assert jump.text.startswith("y: points lose their response at the optimum")
 
 

@@ -114,7 +114,7 @@ def test_few_specimens_underestimate_a_spread_in_common(
     findings = small_simulators(Evaluator.of(model))
     assert len(findings) == is_reported
     for finding in findings:
-        assert f"they have {n} specimens or more, expected at least 30" in finding.text
+        assert f"the smallest with {n} specimens, expected at least 30" in finding.text
 
 
 @pytest.mark.parametrize("metric", [prb.KullbackLeibler(), LOG_LIKELIHOOD])
@@ -195,7 +195,7 @@ def test_a_kernel_that_is_wide_beside_a_branch_is_reported() -> None:
     assert biased.point["sigma"] < INPUTS.std() - biased.stderr["sigma"]
     (line,) = [f.text for f in biased.findings if f.code == "smoothing-bias"]
     assert "y: the kernel of the log-likelihood is wide" in line
-    assert "sigma is off by more than a standard error" in line
+    assert "shifts sigma by more than a standard error" in line
     # The proposed kernel has no bias.
     width = float(line.split("GaussianKDE(")[1].split(")")[0])
     mended = optimum(prb.LogLikelihood(density=prb.GaussianKDE(width)))
@@ -212,7 +212,7 @@ def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
     bias = (INPUTS.std() - sigma) / stderr
     assert bool(lines) == (bias > 0.5)
     for line in lines:
-        number = float(line.split("off by about ")[1].split()[0])
+        number = float(line.split("by about ")[1].split()[0])
         assert number == pytest.approx(bias, abs=0.1)
         proposed = float(line.split("GaussianKDE(")[1].split(")")[0])
         assert proposed == pytest.approx(width * np.sqrt(0.1 / number), rel=0.03)

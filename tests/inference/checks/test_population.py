@@ -270,7 +270,7 @@ def responding(value: float, propagation: Any) -> tuple[float, tuple[Any, ...]]:
 def test_numbers_in_place_of_responses_are_reported(propagation: Any) -> None:
     share, (finding,) = responding(-1.0, propagation)
     assert finding.code == "failed-responses"
-    match = re.search(r"replaced by -1, with ([\d.]+)% of the population", finding.text)
+    match = re.search(r"replaced by -1, which stands for ([\d.]+)% of the population", finding.text)
     assert match is not None
     assert float(match[1]) / 100 == pytest.approx(share, abs=0.02)
 

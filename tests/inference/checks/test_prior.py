@@ -49,10 +49,10 @@ def test_data_beyond_a_prior_push_to_its_end(name: str, place: float, bound: flo
     assert (end.name, end.bound) == ("mu", bound)
     assert end.value == pytest.approx(bound, abs=1e-3)
     (finding,) = prior_end_findings([end])
-    expected = f"The data push mu to {end.value:.4g}, next to the end of its prior at {bound:.4g}, "
+    expected = f"The data push mu to {end.value:.4g}, next to the end of its prior at {bound:.4g}: "
     assert finding.text.startswith(expected)
     (both,) = prior_end_findings([end, PriorEnd("sd", 0.1, 0.2)])
-    assert "and sd to 0.1, next to the end of its prior at 0.2, and ask for" in both.text
+    assert "and sd to 0.1, next to the end of its prior at 0.2: widen" in both.text
 
 
 @pytest.mark.long

@@ -42,7 +42,7 @@ def test_fewer_than_eight_specimens_are_reported_with_the_price(metric: prb.Metr
         return result
 
     assert "y: got 3 specimens" in warned(model(INPUTS[:3]))
-    assert "are at least 2.1 times as wide as standard errors make them" in warned(model([0, 1, 3]))
+    assert "are at least 2.1 times as wide as by standard errors" in warned(model([0, 1, 3]))
     assert "its spread 3.4 times" in warned(model(INPUTS[:3]))
     assert "y: got 7 specimens" in warned(model(INPUTS[:7]))
     assert not warned(model(INPUTS[:8]))
