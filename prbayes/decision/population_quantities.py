@@ -19,7 +19,7 @@ from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviat
 from prbayes.model.evaluator import read_inputs_of_copy
 from prbayes.model.fingerprint import from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
-from prbayes.model.parameters import element_name, variable_of
+from prbayes.model.parameters import element_name, variable_of, variables_at
 from prbayes.optimize.optimum import identity_in
 from prbayes.response.inputs import (
     Groups,
@@ -61,7 +61,7 @@ class PopulationReader:
 
     @cached_property
     def _points(self) -> dict[str, Floats]:
-        return self.populations.evaluator.hyperparameters.variables(self._thetas)
+        return variables_at(self.populations.evaluator.hyperparameters, self._thetas)
 
     def elements(self, requested: Any) -> list[Element]:
         """Return the requested elements, or those of all inputs of the model."""

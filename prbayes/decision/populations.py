@@ -33,6 +33,7 @@ from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
+from prbayes.model.parameters import variables_at
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import N_BLOCKS, DesignError
@@ -414,7 +415,7 @@ class CentralSpecimens:
         """Return the inputs of the specimens."""
         if self.inputs is None:
             evaluator = self.populations.evaluator
-            center = evaluator.hyperparameters.variables(self.populations.center[None])
+            center = variables_at(evaluator.hyperparameters, self.populations.center[None])
             parents = [center[str(rv.name)] for rv in responses.inputs.parents]
             rng = np.random.default_rng(0)
             self.inputs = new_specimens(responses.name, responses.inputs, parents, self.size, rng)

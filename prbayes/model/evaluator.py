@@ -21,7 +21,7 @@ from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -140,7 +140,7 @@ class Evaluator:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
         if self.likelihoods:
-            values = self.hyperparameters.variables(thetas)
+            values = variables_at(self.hyperparameters, thetas)
             for likelihood in self.likelihoods:
                 total += log_likelihoods(likelihood, values).sum(axis=1)
         observed = self.model.observed_RVs
@@ -269,7 +269,7 @@ class Evaluator:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
         if k >= len(self.nodes):
             simulator = self.emulated[k - len(self.nodes)]
-            values = self.hyperparameters.variables(thetas)
+            values = variables_at(self.hyperparameters, thetas)
             numbers = specimen_numbers(simulator.likelihood, simulator.measurement)
             return simulator.likelihood.parents(values, simulator.place, numbers[simulator.rows])
         key = ("parents", *(node.name for node in self.nodes))
@@ -421,7 +421,7 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
     Of simulators with common specimens the last has those of all, and the first ones have none.
     """
     result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
-    values = evaluator.hyperparameters.variables(thetas)
+    values = variables_at(evaluator.hyperparameters, thetas)
     for likelihood in evaluator.likelihoods:
         result[likelihood.measurements[-1].name] = log_likelihoods(likelihood, values)
     return result

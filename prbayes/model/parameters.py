@@ -170,14 +170,6 @@ class Hyperparameters:
             for variable, value in zip(variables, values, strict=True)
         }
 
-    def variables(self, thetas: Floats) -> dict[str, Floats]:
-        """Return all variables of the model, with those of `fixed_values`, shapes (P, *shape)."""
-        fixed = fixed_values(self.model).items()
-        size = len(thetas)
-        return self.constrained(thetas) | {
-            name: np.broadcast_to(value, (size, *value.shape)) for name, value in fixed
-        }
-
     def unconstrained(self, point: Mapping[str, Any]) -> Floats:
         """Return theta, shape (d,), of a point given in the user's own units.
 
@@ -280,6 +272,14 @@ def fixed_values(model: pm.Model) -> dict[str, Floats]:
     values |= {str(v.name): v.get_value() for v in model.data_vars if hasattr(v, "get_value")}
     numbers = {name: np.asarray(value) for name, value in values.items() if value is not None}
     return {name: x.astype(np.float64) for name, x in numbers.items() if x.dtype.kind in "biuf"}
+
+
+def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+    """Return all variables of the model, with those of `fixed_values`, shapes (P, *shape)."""
+    size, fixed = len(thetas), fixed_values(hyperparameters.model).items()
+    return hyperparameters.constrained(thetas) | {
+        name: np.broadcast_to(value, (size, *value.shape)) for name, value in fixed
+    }
 
 
 def log_posterior(

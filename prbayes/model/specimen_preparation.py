@@ -29,7 +29,7 @@ from prbayes.model.data_checks import (
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood, output_columns
-from prbayes.model.parameters import Hyperparameters, log_posterior
+from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
@@ -330,7 +330,7 @@ class Populations:
         result = np.empty((len(thetas), n))
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
-        values = self.hyperparameters.variables(thetas)
+        values = variables_at(self.hyperparameters, thetas)
         contexts = likelihood.by_group if smoothing is None else likelihood.by_context
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
@@ -354,7 +354,7 @@ class Populations:
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
-        values = self.hyperparameters.variables(thetas)
+        values = variables_at(self.hyperparameters, thetas)
         return log_shares(self.likelihood, values, share).sum(axis=1)
 
     def _normal_log_density(
@@ -456,7 +456,7 @@ class PopulationDraws:
         populations, likelihood = self.populations, self.populations.likelihood
         rng = np.random.default_rng([0, 3])
         parts = []
-        values = populations.hyperparameters.variables(self.thetas)
+        values = variables_at(populations.hyperparameters, self.thetas)
         for group, rows in likelihood.by_group:
             if likelihood.inputs.covariates:
                 rows = rng.choice(rows, (len(self.thetas), n_of_each))
