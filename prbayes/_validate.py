@@ -106,9 +106,9 @@ def observed_sample(
     if n_invalid:
         advice = ""
         if failures:
-            advice = ", and give those that had failed as +inf"
+            advice = ", and pass +inf for those that failed"
         elif n_failed:
-            advice = "; a specimen that failed, +inf, takes a metric that counts it"
+            advice = "; for specimens that failed, +inf, use a metric that counts them"
         raise ValueError(
             f"{name}: got {n_invalid} NaN or infinite among {array.size} values, expected finite "
             f"ones; leave out missing specimens (NaN or masked){advice}"

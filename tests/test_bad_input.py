@@ -136,14 +136,14 @@ BAD: dict[str, Case] = {
     "observed -inf": (
         simulator(observed=[1, -np.inf, 2]),
         ValueError,
-        r"got 1 NaN or infinite among 3.*leave missing.*that had failed as \+inf",
+        r"got 1 NaN or infinite among 3.*leave out missing.*pass \+inf",
     ),
     "observed inf": (
         simulator(
             observed=[1, np.inf, 2], metric=prb.FunctionMetric(lambda s, o, w: 0.0, weighted=True)
         ),
         ValueError,
-        r"got 1 NaN or infinite among 3.*\+inf, takes a metric that counts it",
+        r"got 1 NaN or infinite among 3.*\+inf, use a metric that counts them",
     ),
     "observed failures": (
         simulator(observed=[np.inf, np.inf, 2]),

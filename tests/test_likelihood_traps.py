@@ -272,12 +272,12 @@ TRAPS = {
     ),
     "end of a prior": Trap("prior-end", partial(at_end, sd=0.3), partial(at_end, sd=0.9), True),
     "sum of inputs alone": Trap(
-        "leave a direction of a, b open",
+        "not determine a direction of a, b",
         partial(two_outputs, response=sums),
         partial(two_outputs, response=three_outputs),
     ),
     "no influence": Trap(
-        "leave a direction of b open",
+        "not determine a direction of b",
         partial(two_outputs, response=of_first),
         partial(two_outputs, response=three_outputs),
     ),

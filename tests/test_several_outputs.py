@@ -374,7 +374,7 @@ def test_own_specimens_of_several_outputs_are_tested_by_recalibration():
     optimum = prb.minimize(model_of(data=data))
     a, b = node_of(optimum.model).bound.inputs.aleatory
     predicted = prb.predict(optimum, two, a, b, random_seed=1)
-    with pytest.raises(ValueError, match="very data of the calibration"):
+    with pytest.raises(ValueError, match="data of the calibration"):
         prb.area_test(data, predicted)
     null = prb.validation.JointNull(optimum, replicates=99)
     found = prb.area_test(data, predicted, null=null)

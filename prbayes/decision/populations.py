@@ -149,7 +149,8 @@ class Populations:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
                 "simulator of the model, expected the .dist() objects of one with "
-                "prb.Reweighted(), and constants"
+                "prb.Reweighted() or prb.LogLikelihood(), and constants; prb.exceedance takes "
+                "other .dist() objects with n_points=1000, prb.predict also model variables"
             )
         k = simulators.index(simulator)
         if simulator.is_emulated:

@@ -96,7 +96,7 @@ class Runs(Shown):
         inputs : sequence of str
             Columns of the inputs, in the order of the inputs of the simulator.
         outputs : sequence of str
-            Columns of the responses. An empty cell is a run without response.
+            Columns of the responses. A cell that is empty or "nan" is a run without response.
         delimiter, decimal : str
             Characters between columns, and before decimals.
 

@@ -336,7 +336,7 @@ class Surrogate(Shown):
         residuals[usable], joined = _best(model, x, y, coarse_values, seed)
         if coarse is not None and joined is None:
             coarse = None
-            _log.info("%s: the coarse response does not improve the fit, and is not followed", name)
+            _log.info("%s: the coarse response does not improve the fit, and is not used", name)
         surrogate = cls(
             *(domain, design, responses, model, outside, tally.computed),
             error=CrossValidation(residuals, _spread(y)),

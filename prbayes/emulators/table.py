@@ -131,7 +131,8 @@ def _number(cell: str, decimal: str, label: str) -> float:
     except ValueError:
         raise ValueError(
             f"{label}: got the text {text!r:.40}, expected a number, or an empty cell for a run "
-            "that failed; leave lines of units out, and pass decimal=',' for decimal commas"
+            "that failed; leave lines of units out, pass decimal=',' for decimal commas, or read "
+            "the file with pandas.read_csv, and pass prb.Runs(table[inputs], table[outputs])"
         ) from None
 
 

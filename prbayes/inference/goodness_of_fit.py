@@ -272,11 +272,11 @@ def output_misfits(fitted: FittedSets) -> list[Finding]:
                 )
         parts = [f"outputs {', '.join(outputs)}"] if outputs else []
         parts += [f"correlations {', '.join(pairs)}"] if pairs else []
-        text = f"what disagrees with the best population are {' and '.join(parts)}."
+        text = f"these disagree with the best population: {' and '.join(parts)}."
         if not parts:
             text = (
-                "no output by itself, and no correlation of two, disagrees with the best "
-                "population; what does is a combination of outputs."
+                "no single output and no correlation of two disagrees with the best population, "
+                "but a combination of outputs does."
             )
         findings.append(Finding("outputs-misfit", f"{node.name}: {text}"))
     return findings

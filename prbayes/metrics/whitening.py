@@ -64,14 +64,14 @@ class Components:
         """
         if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # white noise has .1
             return (
-                f"{self.summary}: it is no noise, and the metric does not compare it; pass more "
+                f"{self.summary}: this is not noise, and the metric does not compare it; pass more "
                 "components= to prb.Joint, or measure more specimens"
             )
         if self.left_out > LEFT_OUT and population > LEFT_OUT:
             return (
-                f"{self.summary}: noise that the model has too, and whose size rests on few "
-                "directions; leave metric= out, for the "
-                "log-likelihood by specimen, or use prb.MarginalCorrelation(metric)"
+                f"{self.summary}: noise that the model also has, whose size is estimated from few "
+                "directions; leave metric= out, for the log-likelihood by specimen, or use "
+                "prb.MarginalCorrelation(metric)"
             )
         # Components of few data leave out more of a population than of the data.
         if population > 3 * LEFT_OUT:

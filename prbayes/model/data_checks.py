@@ -571,10 +571,10 @@ def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) 
     is_named = weights > 0.05 * weights.max()
     involved = ", ".join(x for x, is_shown in zip(inputs, is_named, strict=True) if is_shown)
     return DesignError(
-        f"{name}: got {m} outputs that leave a direction of {involved} open, expected outputs that "
-        f"determine the {len(inputs)} inputs of a specimen; make an input without influence a "
-        "constant, replace inputs that enter only through their sum or product by it, or pass "
-        "independent outputs alone"
+        f"{name}: got {m} outputs that do not determine a direction of {involved}, expected "
+        f"outputs that determine the {len(inputs)} inputs of a specimen; make an input without "
+        "influence a constant, replace inputs that enter only through their sum or product by it, "
+        "or pass only independent outputs"
     )
 
 

@@ -6,6 +6,7 @@ Elements of variables have names such as 'mu[1]' or 'mu[Adler]', by which tables
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -370,10 +371,11 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
 def variable_of(element: str, variables: Iterable[str] = ()) -> str:
     """Return the name of the variable that an element belongs to.
 
-    A name among ``variables`` may have a bracket itself, such as 'mu[1]' or 'force [N]'.
+    A name among ``variables`` may have a bracket itself, such as 'mu[1]'. A bracket after a space
+    is a unit, as in 'force [N]', and no index.
     """
     matches = [name for name in variables if element == name or element.startswith(f"{name}[")]
-    return max(matches, key=len, default=element.partition("[")[0])
+    return max(matches, key=len, default=re.split(r"(?<!\s)\[", element, maxsplit=1)[0])
 
 
 def coordinates(model: Any, name: str) -> tuple[Any, ...]:

@@ -153,8 +153,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         How populations become responses; ``Reweighted(1024)`` by default.
     units : mapping, optional
         Units for tables, pictures and the report: of aleatory inputs, by the name of the
-        ``.dist()`` or of the response's argument, and of the response, by the name of the
-        simulator or of an output. Those of the response are ``observed.attrs["units"]`` by default.
+        ``.dist()`` or of the response's argument (``"x[0]"`` is an element of a vector), and of
+        the response, by the name of the simulator or of an output. Those of the response are
+        ``observed.attrs["units"]`` by default.
     progressbar : bool
         Whether the first runs show a bar on stderr if they take more than two seconds.
 
@@ -554,8 +555,9 @@ def _refuse_by_specimen(
         names = ", ".join(str(e.name or e) for e in inputs.epistemic)
         raise TypeError(
             f"{name}: got {names}, which goes into the response as a model variable, expected "
-            "aleatory inputs and constants for prb.LogLikelihood(); use "
-            "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
+            "aleatory inputs and constants for prb.LogLikelihood(); let it scatter a little, as in "
+            "pm.Normal.dist(c, 0.01) with a known scatter, or use metric=prb.ProbabilityResidual() "
+            "with propagation=prb.Resimulated()"
         )
     discrete = [x for x in inputs.aleatory if not x.dtype.startswith("float")]
     if discrete:

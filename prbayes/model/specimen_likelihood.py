@@ -143,7 +143,9 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
             logs.append(_with_gross_errors(likelihood, values, of_points, rows))
         with np.errstate(invalid="ignore"):
             difference = logs[0] - logs[1]
-        variance += np.nansum(np.where(np.isfinite(difference), difference / 2, 0) ** 2, axis=1)
+        with np.errstate(over="ignore"):  # far from the data: an infinite error
+            halves = np.where(np.isfinite(difference), difference / 2, 0)
+            variance += np.nansum(halves**2, axis=1)
     return np.sqrt(variance)
 
 

@@ -89,12 +89,12 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.fresh)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
-    most = first + 5 * batch
+    least, most = first + 2 * batch, first + 5 * batch
     growth = (
-        f"up to {most} in all, {batch} at a time at the roots of the specimens, until the emulator "
-        f"shifts no estimate by more than {likelihood.options.bias} standard deviations"
+        f"{least} to {most} in all, {batch} at a time at the roots of the specimens, until the "
+        f"emulator shifts no estimate by more than {likelihood.options.bias} standard deviations"
     )
-    return RunCost(max(first + 2 * batch, computed), 0, most, growth)
+    return RunCost(max(least, computed), 0, most, growth)
 
 
 def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
@@ -424,7 +424,8 @@ def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
     if not np.isfinite(log_weights).any():
         raise ValueError(
             "log-likelihood: got no population of the prior that reaches the specimens, expected "
-            "one at least; look at the priors and at the data's units"
+            "one at least; look at the priors and at the data's units, and pass "
+            "prb.LogLikelihood(error=...) if readings have an error"
         )
     temper = 1.0
     while True:

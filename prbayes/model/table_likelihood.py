@@ -107,14 +107,25 @@ def points_of_tables(
         likely = likely_roots(roots, emulation.box) if len(roots.z) else roots.z
         emulation = _with_bias(problem, likelihood, emulation, likely, ranges)
         _require_accurate(likelihood, problem, emulation)
-        points = draw_points(
-            emulation,
-            readings,
-            roots,
-            options,
-            error_is_known=likelihood.error_is_known,
-            gross_errors=likelihood.measurements[0].gross_errors is not False,
-        )
+        try:
+            points = draw_points(
+                emulation,
+                readings,
+                roots,
+                options,
+                error_is_known=likelihood.error_is_known,
+                gross_errors=likelihood.measurements[0].gross_errors is not False,
+            )
+        except DesignError as error:
+            outside = ~_is_inside(likely, ranges)
+            if outside.mean() <= MAX_LOST:
+                raise
+            raise DesignError(
+                f"{likelihood.name}: got runs that do not cover the populations of the data: the "
+                f"likeliest inputs of {outside.sum()} of {len(outside)} specimens are outside "
+                f"their ranges, expected none: about {_asked(likelihood, likely, ranges)}; "
+                "prb.propose_runs(model) returns a table of runs to add"
+            ) from error
     draws: Draws = posterior(points.z, points.log_a)
     specimens = draws.specimens()
     _require_cover(likelihood, points, draws, specimens, ranges)
@@ -216,6 +227,17 @@ def _require_cover(
     outside = 1 - shares
     if outside.max() <= 0.5 and outside.mean() <= MAX_LOST:
         return
+    raise DesignError(
+        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs of "
+        f"{int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
+        f"expected none, and {outside.mean():.0%} of the likelihood of all, expected at most "
+        f"{MAX_LOST:.0%}: about {_asked(likelihood, specimens, ranges)}; "
+        "prb.propose_runs(model) returns a table of runs to add"
+    )
+
+
+def _asked(likelihood: SpecimenLikelihood, specimens: Floats, ranges: Floats) -> str:
+    """Return the inputs that the data ask for beyond the ranges of the runs."""
     coordinates = likelihood.coordinates
     ends = _as_inputs(coordinates, ranges)
     asked = np.quantile(_as_inputs(coordinates, specimens), [0.005, 0.995], axis=0)
@@ -224,13 +246,7 @@ def _require_cover(
         for name, low, high, least, most in zip(_columns(likelihood), *asked, *ends, strict=True)
         if low < least or high > most
     ]
-    raise DesignError(
-        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs of "
-        f"{int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
-        f"expected none, and {outside.mean():.0%} of the likelihood of all, expected at most "
-        f"{MAX_LOST:.0%}: about {'; '.join(parts) or 'the corners of the ranges'}; "
-        "prb.propose_runs(model) returns a table of runs to add"
-    )
+    return "; ".join(parts) or "the corners of the ranges"
 
 
 def _require_accurate(

@@ -210,7 +210,8 @@ class _Objective:
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Return value and gradient at theta; +inf outside the support."""
-        value, gradient = self.function(theta, np.empty(0))
+        with np.errstate(over="ignore", invalid="ignore"):  # +inf far from the data
+            value, gradient = self.function(theta, np.empty(0))
         value = float(value) if np.isfinite(value) else np.inf
         self.thetas.append(theta.copy())
         self.values.append(value)

@@ -509,6 +509,6 @@ def _moved_inside(
 
 def _at_edge(subject: str) -> str:
     return (
-        f"got {subject} at an edge, as where a standard deviation is about zero, where estimates "
-        "pile up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
+        f"got {subject} at an edge, such as a standard deviation of zero, where estimates have no "
+        "density; use prb.LogLikelihood(), or prb.sample_smc"
     )

@@ -779,7 +779,7 @@ def _raise_lost(name: str, error: BaseException) -> None:
         raise ResponseError(f"{name}: {error}") from None
     cause = ""
     if is_loss(error):
-        cause = "if a response ends its worker, on_failure= may let that cost its point only; "
+        cause = "if a response ends its worker, on_failure= can treat it as a failed point; "
     raise ResponseError(
         f"{name}: {failure_text(error)}; {cause}run again: with store= finished responses are not "
         "computed again"

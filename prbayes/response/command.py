@@ -198,8 +198,8 @@ class Program:
             if len(values) == 1 and np.size(values[0]) == len(self.inputs):
                 elements = ", ".join(f"x[{i}]" for i in range(len(self.inputs)))
                 hint = (
-                    "; one input that has these as its elements, as correlated ones are, is taken "
-                    f"apart by prb.scalar(lambda x: program({elements}))"
+                    "; for one input with these elements, such as correlated ones, pass "
+                    f"prb.scalar(lambda x: program({elements}))"
                 )
             raise ValueError(
                 f"{self.__name__}: got {len(values)} inputs, expected {len(self.inputs)}: "

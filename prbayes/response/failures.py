@@ -93,7 +93,8 @@ class Replace(OnFailure):
         if np.isneginf(self.value):
             raise ValueError(
                 "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "
-                "specimen failed)"
+                "specimen failed); for specimens that fail at the low end calibrate minus the "
+                "response against minus the data, with +inf"
             )
 
 

@@ -388,7 +388,7 @@ def _failure_findings(
         elif np.isposinf(replacement):
             share = failed.get(name, np.nan)
         if share < SMALLEST_SHARE:
-            text += "the populations of the answer have next to no specimens there."
+            text += "the calibrated populations have next to no specimens there."
             harmless.append(Finding("harmless-failures", text))
             continue
         text += (
@@ -434,7 +434,7 @@ def _lost_mass(optimum: Optimum | None, lost: Mapping[str, float]) -> list[Findi
         "Specimens without response (NaN) matter: if they counted as far from the data, the "
         f"optimum would move {shifts} standard errors. The optimum is right if such specimens "
         "cannot be measured; otherwise repair the response there, or return +inf for specimens "
-        "that fail."
+        "that fail (of minus the response and minus the data, if they fail at the low end)."
     )
     return [Finding("lost-mass-matters", text, "distributed.md#when-a-response-fails")]
 

@@ -222,7 +222,7 @@ def predict(
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
-    missing = _check_responses(label, drawn, max_lost, responses.remedy)
+    missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -552,6 +552,18 @@ def with_known_conditions(
     return changed, stacked_values(values)
 
 
+def _remedy(response: Any, responses: Responses) -> str:
+    """Return what to do where a predicted response is NaN."""
+    if not isinstance(response, Runs):
+        return responses.remedy
+    # propose_runs(model) returns runs near the data, and not under another condition.
+    parts = [
+        f"{name} from {np.min(low):.4g} to {np.max(high):.4g}"
+        for name, (low, high) in response.ranges.items()
+    ]
+    return f"the runs have {', '.join(parts)}: add runs at the inputs of the prediction"
+
+
 def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
     """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
@@ -559,8 +571,8 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
     missing = int(is_nan.sum())
     if missing == is_nan.size:
         raise ResponseError(
-            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
-            "that fails"
+            f"{label}: got NaN at all {missing} specimens, expected numbers; {remedy}, or return "
+            "+inf for specimens that fail"
         )
     if missing > max_lost * is_nan.size:
         raise DesignError(
@@ -570,10 +582,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
             "fail, or pass a larger max_lost"
         )
     if missing:
-        text = (
-            f"{label}: {missing} of {is_nan.size} predicted responses are NaN; look at the "
-            "response there."
-        )
+        text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN; {remedy}."
         report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)

@@ -265,7 +265,7 @@ def _refuse_calibration_specimens(case: Case) -> None:
         if shared:
             got = f"{len(shared)} specimens of the calibration, such as {min(shared)!r}"
         elif data_digest(condition.measured) in digests:
-            got = "the very data of the calibration"
+            got = "the data of the calibration"
         else:
             continue
         raise ValueError(

@@ -291,7 +291,7 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
     if n_bad:
         raise ValueError(
             f"{name}: observed: got {n_bad} NaN or -inf among {y.size} values, expected numbers; "
-            "leave missing specimens out, and give those that had failed as +inf"
+            "leave missing specimens out, and pass +inf for those that failed"
         )
     if y.ndim == 1 or not isinstance(simulated, xr.DataArray):
         return y

@@ -70,6 +70,8 @@ def test_the_first_bad_cell_is_named(tmp_path: Path) -> None:
     assert np.isnan(read("load,sag", *rows, "12,").responses[-1])
     with pytest.raises(ValueError, match=r"line 2: load: got the text 'kN', .* lines of units out"):
         read("load,sag", "kN,mm", *rows)
+    with pytest.raises(ValueError, match=r"line 13: sag: got the text 'n/a', .* pandas.read_csv"):
+        read("load,sag", *rows, "12,n/a")
     with pytest.raises(ValueError, match=r"columns \['load', 'sag'\], expected 'sink' once"):
         read("load,sag", *rows, outputs=("sink",))
     with pytest.raises(ValueError, match=r"inputs: load: got nan in row 11 .*leave the row out"):

@@ -198,7 +198,8 @@ def test_the_shift_is_that_of_specimens_far_from_the_data() -> None:
     counted = kld.theta + stderr * lost_mass_shift(kld.evaluator, kld.theta, np.ones(1), stderr)
     np.testing.assert_allclose(counted, far.theta, atol=0.05 * stderr.min())
     assert shift[1] < -0.5
-    assert "lost-mass-matters" in [finding.code for finding in prb.diagnose(kld).findings]
+    texts = {finding.code: finding.text for finding in prb.diagnose(kld).findings}
+    assert "minus the data, if they fail at the low end" in texts["lost-mass-matters"]
 
 
 def test_a_tiny_lost_share_does_not_matter() -> None:

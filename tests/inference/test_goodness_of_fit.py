@@ -272,7 +272,7 @@ def test_outputs_and_pairs_that_misfit_are_named(gaps: bool) -> None:
     # Without the last output of some specimens.
     lost = gaps & (np.arange(60) < 10)[:, None] & [False, False, True]
     text = misfit(np.where(lost, np.nan, WRONG_OUTPUT))
-    assert text.startswith("y: what disagrees with the best population are outputs 2 (p = 0.0")
+    assert text.startswith("y: these disagree with the best population: outputs 2 (p = 0.0")
     assert "correlations" not in text
     text = misfit(np.where(lost, np.nan, WRONG_CORRELATION))
     assert "outputs" not in text
@@ -287,7 +287,7 @@ def test_failures_that_the_model_does_not_predict_are_named() -> None:
 
 @pytest.mark.long
 def test_of_right_data_nothing_is_named() -> None:
-    assert misfit(DATA).startswith("y: no output by itself, and no correlation of two, disagrees")
+    assert misfit(DATA).startswith("y: no single output and no correlation of two disagrees")
 
 
 @pytest.mark.long
@@ -299,4 +299,4 @@ def test_a_diagnosis_names_what_disagrees_and_is_quiet_otherwise(is_wrong: bool)
     assert found.evaluator.n_responses == before
     expected = any("farther from the best population" in text for text in diagnosis.messages)
     assert is_wrong == expected
-    assert is_wrong == ("y: what disagrees with the best population are" in str(diagnosis))
+    assert is_wrong == ("y: these disagree with the best population" in str(diagnosis))

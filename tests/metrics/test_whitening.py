@@ -40,10 +40,10 @@ def test_two_inputs_make_two_components_and_a_remainder_is_noise_or_structure() 
     assert abs(noisy.rest_correlation) < 0.2
     too_few = principal_components(curves(30), EQUAL, ALL, 1)
     assert too_few.rest_correlation > 0.5
-    assert "it is no noise" in too_few.missed(0.0)
+    assert "this is not noise" in too_few.missed(0.0)
     assert not found.missed(0.0)
     assert not noisy.missed(0.0)
-    assert "noise that the model has too" in noisy.missed(0.2)
+    assert "noise that the model also has" in noisy.missed(0.2)
 
 
 def test_the_fewest_that_leave_out_a_hundredth_and_a_population_that_varies_elsewhere() -> None:

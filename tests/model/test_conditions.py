@@ -153,7 +153,7 @@ def test_predictions_are_at_the_conditions_of_new_specimens() -> None:
         with pytest.raises(ValueError, match=r"observed: got 2 values, expected 8"):
             prb.area_test(right[:2], predicted)
         own = prb.predict(optimum, grown, x, load)
-        with pytest.raises(ValueError, match="very data of the calibration"):
+        with pytest.raises(ValueError, match="data of the calibration"):
             prb.area_test(np.exp(X) * LOADS["linear"], own)
         with pytest.raises(ValueError, match=r"got load = 4, expected values from 0.35 to 2.15"):
             prb.predict(optimum, grown, x, condition("load", [1.0, 4.0]))

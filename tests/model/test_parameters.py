@@ -261,6 +261,11 @@ def test_an_element_belongs_to_the_longest_name() -> None:
     elements = ["mu[0]", "mu[1]", "mu[1][0]", "force [N]", "force [N][2]", "sigma[1]", "muu"]
     expected = ["mu", "mu[1]", "mu[1]", "force [N]", "force [N]", "sigma", "muu"]
     assert [variable_of(element, names) for element in elements] == expected
+    assert [variable_of(x) for x in ("a[0]", "yield [MPa]", "yield [MPa][1]")] == [
+        "a",
+        "yield [MPa]",
+        "yield [MPa]",
+    ]
 
 
 @pytest.mark.parametrize("name", ["chain", "draw", "mu[1]"])

@@ -402,7 +402,7 @@ def test_data_of_another_shape_and_two_samples_are_refused() -> None:
         ),
         (
             {"inputs": lambda: [*normal(), pm.Normal("c")]},
-            "got c, which goes into the response as a model variable.*prb.ProbabilityResidual",
+            "got c, which goes into the response as a model variable.*scatter.*ProbabilityResidual",
         ),
     ],
 )
@@ -520,7 +520,7 @@ def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture)
         with caplog.at_level("INFO", logger="prbayes"):
             values(model, {"mu": 0.0})
     assert "y: runs at first: 64" in caplog.text
-    assert "propagation=Reweighted(n=64); more: up to" in caplog.text
+    assert "propagation=Reweighted(n=64); more: 128 to 224 in all" in caplog.text
 
 
 def test_the_response_itself_serves_in_place_of_an_emulator() -> None:

@@ -13,6 +13,7 @@ from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
+from prbayes.response import ResponseError
 
 RNG = np.random.default_rng(3)
 E, T = RNG.normal(70, 4, 24), RNG.normal(2, 0.1, 24)
@@ -85,6 +86,20 @@ def test_a_table_that_ends_within_the_data_is_refused_with_a_proposal() -> None:
     x = np.concatenate([narrow.points, prb.propose_runs(model, n=24).to_numpy()])
     wider = model_of(prb.Runs({"e": x[:, 0], "t": x[:, 1]}, stiffness(*x.T)))
     np.testing.assert_allclose(log_density(wider), log_density(model_of(stiffness)), atol=0.3)
+
+
+def test_points_that_do_not_suffice_beyond_the_table_are_a_table_that_is_too_short(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise DesignError("two halves differ")
+
+    monkeypatch.setattr("prbayes.model.table_likelihood.draw_points", refuse)
+    message = r"likeliest inputs of \d+ of 24 specimens .*where the runs have 50.*propose_runs"
+    with pytest.raises(DesignError, match=message):
+        log_density(model_of(table(64, high=(70, 2.6))))
+    with pytest.raises(DesignError, match=r"^two halves differ$"):
+        log_density(model_of(table(64)))
 
 
 def test_an_inaccurate_table_is_refused_and_runs_near_the_specimens_are_proposed() -> None:
@@ -166,7 +181,10 @@ def test_predictions_of_a_table_are_nan_outside_and_the_error_is_diagnosed() -> 
     )
     np.testing.assert_allclose(predicted, of_function, rtol=1e-3)
     narrow = prb.Runs({"x": x[:15]}, x[:15])
-    with pytest.raises(DesignError, match=r"% NaN .* add the runs that prb.propose_runs"):
+    remedy = r"the runs have x from 0 to 2\.897: add runs at the inputs of the prediction"
+    with pytest.raises(DesignError, match=f"% NaN .*{remedy}"):
         prb.predict(optimum, narrow, dist, model=model, progressbar=False)
+    with pytest.raises(ResponseError, match=f"NaN at all .*{remedy}"):
+        prb.predict(optimum, narrow, pm.Normal.dist(model["mu"] + 6, 0.1), model=model)
     result = prb.exceedance(optimum, runs, 5.0, dist, model=model)
     assert 0 <= float(result.probability) < 1

@@ -275,6 +275,16 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     narrow, wide = monte_carlo_error(likelihood, values)
     assert narrow > 2
     assert wide < 0.2
+    values["s1"] = np.array([1e-80, 0.2])  # the square of the difference overflows: no warning
+    assert monte_carlo_error(likelihood, values).tolist() == [np.inf, pytest.approx(wide)]
+
+
+def test_a_likelihood_that_overflows_is_no_warning() -> None:
+    objective = _Objective(normal_optimum().evaluator, prior=False)
+    for log_sd in np.linspace(-360, -350, 101):
+        value, gradient = objective(np.array([0.0, log_sd]))
+        assert value > 1e300
+        assert np.isfinite(gradient).all()
 
 
 def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(

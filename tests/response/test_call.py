@@ -252,6 +252,11 @@ def test_retried_in_vain(kind: str, tmp_path: Path) -> None:
         run(fails_above_two, kind, on_failure=Retry(2, then=Abort()))
 
 
+def test_minus_infinity_is_refused_with_a_change_of_sign() -> None:
+    with pytest.raises(ValueError, match=r"got -inf, .*; for specimens that fail at the low end"):
+        Replace(-np.inf)
+
+
 def test_a_failure_says_where() -> None:
     def root(x: float, y: float) -> float:
         return math.sqrt(x) + y
@@ -259,7 +264,7 @@ def test_a_failure_says_where() -> None:
     points = Points([-X, X], [True, True])
     with pytest.raises(
         ResponseError,
-        match=r"failed at 1 point\(s\), the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
+        match=r"failed at 1 point, the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
         r"ValueError.*; repair it, keep priors and inputs where it has a response, or pass",
     ) as raised:
         run(root, points=points)

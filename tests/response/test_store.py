@@ -269,7 +269,7 @@ def test_a_full_disk_is_named_and_the_store_works_again_with_space(folder: Path)
     assert len(store) == 1300
 
 
-def test_a_writer_that_hangs_is_told_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_writer_that_hangs_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("prbayes.response.store._PATIENCE", 0.05)
     store = Store(folder, "y", columns=3)
     hanging = sqlite3.connect(file_of(folder), isolation_level=None)

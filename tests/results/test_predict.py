@@ -115,7 +115,7 @@ def test_a_posterior_of_stock_pymc() -> None:
     y = prb.predict(idata, identity, x, model=model, random_seed=1)
     assert y.shape == (2, 200, 500)
     assert y.mean() == pytest.approx(float(idata.posterior["mu"].mean()), abs=0.01)
-    with pytest.raises(ValueError, match="the very data of the calibration"):
+    with pytest.raises(ValueError, match="the data of the calibration"):
         prb.area_test(OBSERVED, y)
 
 

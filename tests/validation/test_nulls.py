@@ -230,7 +230,7 @@ def joint(optimum: prb.Optimum, replicates: int = 199, **keywords: Any) -> Any:
 def test_own_data_take_the_joint_null() -> None:
     optimum, x = calibrated()
     predicted = prb.predict(optimum, same, x, random_seed=1)
-    with pytest.raises(ValueError, match="the very data of the calibration"):
+    with pytest.raises(ValueError, match="the data of the calibration"):
         prb.area_test(DATA[::-1], predicted)
     test = prb.area_test(DATA[::-1], predicted, null=joint(optimum, 999))
     # A fitted normal distribution follows its own data. 1500 normal samples of 20, fitted by
