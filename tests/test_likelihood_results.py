@@ -330,6 +330,7 @@ def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) 
     for pull, text in ((0.1, "too little to matter"), (1.0, "no hyperparameter is in conflict")):
         checked = check_conflict(optimum, (optimum.theta + pull * errors)[None])
         assert text in str(checked.remarks[0])
+        assert "_log__" not in str(checked.remarks[0])
         assert not checked.findings
 
 

@@ -20,6 +20,7 @@ from prbayes.model.fingerprint import from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
 from prbayes.model.parameters import element_name, variable_of
 from prbayes.optimize.optimum import identity_in
+from prbayes.response.dims import is_random
 from prbayes.response.inputs import (
     Groups,
     event_shape,
@@ -79,6 +80,12 @@ class PopulationReader:
                 elements += self._predicted(x)
             elif isinstance(x, Condition):
                 elements += self._response(x)
+            elif isinstance(x, TensorVariable) and not is_random(x):
+                raise TypeError(
+                    f"{caller}: inputs: got an expression ({x}), expected a `.dist()`, or the name "
+                    f"of an input or element among {[m.name for m in available]}; an expression is "
+                    "a response: prb.decision.Condition(function, x)"
+                )
             elif isinstance(x, TensorVariable) and all(m.dist is not x for m in available):
                 elements += self._input(x.name or f"input {len(elements) + 1}", x)
             else:
@@ -116,8 +123,8 @@ class PopulationReader:
         names = ["mean", "sd", *self.levels]
         names += [f"correlation with {x}" for x in elements[: numbers.shape[2] - len(names)]]
         return [
-            Element(x, unit_of(dist), inputs.groups, _by_name(names, numbers[..., i]))
-            for i, x in enumerate(elements)
+            Element(x, unit_of(dist, index), inputs.groups, _by_name(names, numbers[..., i]))
+            for i, (x, index) in enumerate(zip(elements, np.ndindex(shape), strict=True))
         ]
 
     def _response(self, condition: Condition) -> list[Element]:

@@ -55,9 +55,9 @@ def population(
     result : Optimum or xarray.DataTree
         From `minimize`; or with a ``posterior`` group, from any sampler.
     inputs : str, TensorVariable, Condition, xarray.DataArray, or a sequence of such, optional
-        The name of an input, which is that of the ``.dist()`` or of the response's argument, or a
-        ``.dist()``; all inputs by default. A response is a `prbayes.decision.Condition`, or the
-        result of `predict` for a posterior.
+        The name of an input, which is that of the ``.dist()`` or of the response's argument, of an
+        element such as ``"x[0]"``, or a ``.dist()``; all inputs by default. A response is a
+        `prbayes.decision.Condition`, or the result of `predict` for a posterior.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     quantiles : sequence of float

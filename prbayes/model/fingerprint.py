@@ -19,6 +19,7 @@ import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
 
+from prbayes._validate import Floats
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
@@ -70,6 +71,8 @@ class SimulatorIdentity:
     discrepancies: tuple[float, ...] = ()  # at fixed thetas; empty where they would cost responses
     # Aleatory inputs of the first two responses; empty where the response has epistemic ones.
     points: tuple[tuple[float, ...], ...] = ()
+    # Of a specimen likelihood: digests of data, weights and labels as a metric has them.
+    with_metric: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -145,9 +148,7 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
         if simulator.reweighted is not None:
             design = simulator.reweighted.design
             batches = len(design.batch_sizes) + design.n_emulated_samples
-        order = np.lexsort((simulator.weights, *observed.reshape(len(observed), -1).T[::-1]))
-        observed, weights = observed[order], simulator.weights[order]
-        labels = None if labels is None else labels[order]
+        observed, weights, labels = _sorted(observed, simulator.weights, labels)
         fields = {
             "n_points": bound.n_runs,
             "batches": batches,
@@ -158,16 +159,33 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
         }
     else:
         of_specimens = simulator.groups, *simulator.covariates.values(), simulator.conditions
+        if all(values is None for values in of_specimens):
+            n = len(observed)
+            equal = np.full(n, 1 / n) if weights is None else weights / weights.sum()
+            fields = {"with_metric": _digests(*_sorted(observed, equal, labels))}
+    _, of_weights, of_labels = _digests(observed, weights, labels)
     return SimulatorIdentity(
         name=simulator.name,
         data=_digest(observed, *of_specimens),
-        weights=_digest(weights),
-        specimens=_digest(repr([] if labels is None else labels.tolist())),
+        weights=of_weights,
+        specimens=of_labels,
         inputs=_inputs(simulator.inputs),
         metric=without_addresses(simulator.metric),
         propagation=without_addresses(simulator.propagation),
         **fields,
     )
+
+
+def _sorted(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
+    """Return data in an order of their own: a metric's result does not depend on theirs."""
+    order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
+    return observed[order], weights[order], None if labels is None else labels[order]
+
+
+def _digests(observed: Floats, weights: Floats | None, labels: Any) -> tuple[str, str, str]:
+    """Return digests of observed values, weights and labels of specimens."""
+    of_labels = _digest(repr([] if labels is None else labels.tolist()))
+    return _digest(observed), _digest(weights), of_labels
 
 
 def _points(node: Node) -> tuple[tuple[float, ...], ...]:
@@ -359,20 +377,22 @@ def _simulator_differences(
     a: SimulatorIdentity, b: SimulatorIdentity, *, same_priors: bool
 ) -> dict[Level, list[str]]:
     """Return the differences of two simulators by level."""
-    data = {
-        "data": "observed values",
-        "weights": "weights of observed values",
-        "specimens": "labels of specimens",
-    }
+    data = "observed values", "weights of observed values", "labels of specimens"
+    # One with a metric, and one with the log-likelihood by specimen.
+    mixed = bool(a.with_metric) != bool(b.with_metric)
+    digests = [
+        x.with_metric if mixed and x.with_metric else (x.data, x.weights, x.specimens)
+        for x in (a, b)
+    ]
     populations = [
         f"other {text} of {a.name}"
-        for field, text in data.items()
-        if getattr(a, field) != getattr(b, field)
+        for text, *pair in zip(data, *digests, strict=True)
+        if pair[0] != pair[1]
     ]
     # Names of inputs do not matter to a population.
     inputs = [re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", simulator.inputs) for simulator in (a, b)]
     # Design points are drawn through the priors: other priors give other responses.
-    has_same_points = same_priors and a.propagation == b.propagation
+    has_same_points = same_priors and a.propagation == b.propagation and not mixed
     if inputs[0] != inputs[1]:
         populations.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
     elif has_same_points and not _close(a.responses, b.responses):

@@ -41,7 +41,7 @@ class Margin:
     @property
     def unit(self) -> str:
         """The unit that the simulator was given, or an empty text."""
-        return unit_of(self.dist)
+        return unit_of(self.dist, self.index)
 
 
 def margins(evaluator: Evaluator) -> list[Margin]:

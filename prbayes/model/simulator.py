@@ -152,8 +152,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         How populations become responses; ``Reweighted(1024)`` by default.
     units : mapping, optional
         Units for tables, pictures and the report: of aleatory inputs, by the name of the
-        ``.dist()`` or of the response's argument, and of the response, by the name of the
-        simulator or of an output. Those of the response are ``observed.attrs["units"]`` by default.
+        ``.dist()`` or of the response's argument (``"x[0]"`` is an element of a vector), and of
+        the response, by the name of the simulator or of an output. Those of the response are
+        ``observed.attrs["units"]`` by default.
     progressbar : bool
         Whether the first runs show a bar on stderr if they take more than two seconds.
 

@@ -201,15 +201,18 @@ def refuse_labels(
     if not labels:
         return
     names = list(dict.fromkeys(shown))
+    inputs: set[str] = set()
     allowed = {*names, *map(variable_of, names), *STATISTIC_LABELS, *METRIC_LABELS}
     if evaluator is not None:
         allowed |= set(map(str, evaluator.model.named_vars))
         for node in evaluator.simulators:
             allowed |= {node.name, node.outputs.dim, *map(str, node.outputs.names)}
-            inputs = set(map(variable_of, aleatory_names(node.inputs, node.responses.function)))
-            allowed |= inputs | {f"{name} of {node.name}" for name in inputs}
+            own = set(map(variable_of, aleatory_names(node.inputs, node.responses.function)))
+            allowed |= own | {f"{name} of {node.name}" for name in own}
+            inputs |= own
     unknown = [name for name in labels if not {name, variable_of(name)} & allowed]
     if unknown and (evaluator is not None or len(unknown) == len(labels)):
+        names += sorted(inputs - set(map(variable_of, names)))
         more = ", ..." if len(names) > 12 else ""
         raise KeyError(
             f"labels: got {unknown[0]!r:.60}, expected names that the picture shows, some of "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,8 @@ def sample(
     The first sampler is importance sampling from Laplace approximations of the modes, then from
     mixtures fitted to the weighted points [1]_. It is replaced if Pareto k is above .7, or the
     effective sample size below half of the draws. NUTS then starts at the optimum. Sequential Monte
-    Carlo serves models with a metric, several modes, or a likelihood that jumps at the optimum.
+    Carlo serves models with a metric, several modes, or a likelihood that jumps at the optimum,
+    and replaces chains of NUTS whose R-hat is above 1.1.
 
     With a metric, the posterior is prior times density of the metric's own estimate. The density is
     a saddlepoint approximation [2]_. It is that of the score if the gradient is a mean over
@@ -163,7 +165,11 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
                 break
             chains = importance_chains(target, modes, settings)
             if chains is None:
-                if len(modes) == 1 and not evaluator.nodes and evaluator.has_graph:
+                others = [
+                    mode for mode in getattr(optimum, "local_optima", ()) if mode["comparable"]
+                ]
+                has_one_mode = len(modes) == 1 and not others
+                if has_one_mode and not evaluator.nodes and evaluator.has_graph:
                     chains = _nuts_chains(evaluator, modes[0], settings)
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
@@ -238,8 +244,8 @@ def importance_chains(
     )
 
 
-def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Chains:
-    """Return draws by NUTS from the mode of the posterior."""
+def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Chains | None:
+    """Return draws by NUTS from the mode of the posterior, None if its chains disagree."""
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
@@ -256,6 +262,10 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
             compute_convergence_checks=False,
         )
     posterior = idata["posterior"].to_dataset()
+    if settings.chains > 1:
+        r_hat = import_module("arviz").rhat(posterior).to_array().max()
+        if not r_hat <= 1.1:  # chains in different modes
+            return None
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])
     return Chains(

@@ -147,6 +147,9 @@ def population_in_units(m: Material) -> list[Section]:
             value, interval = cells.get(quantity, ("", ""))
             percent = "%" if quantity == "cv" and value else ""
             text = f"{value}{percent} ({interval})" if interval else f"{value}{percent}"
+            other = quantity.removeprefix("correlation with ")
+            if other != quantity:
+                quantity = f"correlation with {named(other, m.labels)}"
             texts[words.get(quantity, quantity.replace("cv", "coefficient of variation"))] = text
         columns[with_unit(label, unit) if label == name else label] = texts
     if len(columns) <= 4:  # a line for each quantity, which fits on a page

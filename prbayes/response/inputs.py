@@ -329,17 +329,27 @@ def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
 
 
 def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, str]) -> list[str]:
-    """Store the units of aleatory inputs by their names; return the names of the inputs."""
+    """Store the units of inputs, or of their elements; return the names that have one."""
     names = aleatory_names(inputs, function)
-    for name, x in zip(names, inputs.aleatory, strict=True):
+    elements: list[str] = []
+    for name, x, shape in zip(names, inputs.aleatory, inputs.event_shapes, strict=True):
         if name in units:
             x.tag.units = units[name]
-    return names
+        indices = list(np.ndindex(shape)) if shape else []
+        by_index = {i: f"{name}[{','.join(map(str, i))}]" for i in indices}
+        elements += by_index.values()
+        if any(element in units for element in by_index.values()):
+            default = units.get(name, "")
+            x.tag.units = {i: units.get(element, default) for i, element in by_index.items()}
+    return [*names, *elements]
 
 
-def unit_of(x: Any) -> str:
-    """Return the unit of an aleatory input, or an empty text."""
-    return str(getattr(x.tag, "units", ""))
+def unit_of(x: Any, index: tuple[int, ...] = ()) -> str:
+    """Return the unit of an aleatory input, or of an element of it; an empty text without one."""
+    units = getattr(x.tag, "units", "")
+    if not isinstance(units, dict):
+        return str(units)
+    return str(units[index] if index else ", ".join(filter(None, units.values())))
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:

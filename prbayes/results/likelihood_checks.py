@@ -384,7 +384,7 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
         return _not_tested(_CONFLICT, unknown)
     if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
-    names = evaluator.hyperparameters.names
+    names = evaluator.hyperparameters.readable_names
     mean = thetas.mean(axis=0)
     errors = np.sqrt(np.diag(optimum.covariance))
     pulls = np.abs(mean - optimum.theta) / errors

@@ -11,6 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
+from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.margins import margins
 from prbayes.model.random_variable import simulators
@@ -250,3 +251,35 @@ def test_one_time_series_is_no_population() -> None:
         prb.Joint(prb.AreaMetric())(np.ones((50, 3)), series[None])
     with pm.Model(), pytest.raises(ValueError, match=f"none of them aleatory.*{advice}"):
         prb.Simulator("y", np.positive, pm.HalfNormal("a"), observed=series)
+
+
+def test_elements_of_a_vector_have_units_of_their_own() -> None:
+    def vector(x: Any) -> Any:
+        return x[..., 0] + x[..., 1]
+
+    def model_with(**units: str) -> tuple[pm.Model, Any]:
+        with pm.Model() as model:
+            mean = pm.Normal("mean", [3, 4], 1, shape=2)
+            x = pm.MvNormal.dist(mean, np.eye(2))
+            prb.Simulator("y", vector, x, observed=DATA, units=units, **FRESH)
+        return model, x
+
+    posterior = draws(mean=np.random.default_rng(1).normal([3.0, 4.0], 0.1, (50, 2)))
+    for units, expected in (
+        ({"x[1]": "mm", "x[0]": "N"}, ["N", "mm"]),
+        ({"x[1]": "mm"}, ["", "mm"]),
+        ({"x": "N", "x[1]": "mm"}, ["N", "mm"]),
+        ({"x": "N"}, ["N", "N"]),
+    ):
+        model, x = model_with(**units)
+        table = prb.population(posterior, model=model, quantiles=[0.05])
+        assert table.unit.values.tolist() == expected
+        assert [margin.unit for margin in margins(Evaluator.of(model))] == expected
+    (text,) = [s["inputs"] for s in describe(model_with(**{"x[1]": "mm"})[0])["simulators"]]
+    assert text.startswith("x (mm) ~ ")
+    with pytest.raises(KeyError, match=r"got 'x\[2\]', expected some of \['x', 'x\[0\]', 'x\[1\]'"):
+        model_with(**{"x[2]": "mm"})
+    with pytest.raises(
+        TypeError, match=r"element among \['x\[0\]', 'x\[1\]'\]; an expression is a"
+    ):
+        prb.population(posterior, x[0], model=model)

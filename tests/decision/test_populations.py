@@ -121,7 +121,7 @@ def test_an_output_is_found_by_label_or_name() -> None:
     for columns, output, message in (
         (values, "length", "expected one of"),
         (values, None, "expected output= to say which"),
-        (values[:, 0], 0, "one number"),
+        (values[:, 0], 0, "leave output= out"),
     ):
         with pytest.raises((KeyError, ValueError), match=message):
             output_column(responses, columns, output)

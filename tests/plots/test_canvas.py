@@ -45,7 +45,7 @@ def test_every_picture_is_drawn_with_labels(
 
 
 def test_one_mapping_serves_all_pictures_of_a_model(pictures: dict[str, Any]) -> None:
-    with pytest.raises(KeyError, match="'nu'"):
+    with pytest.raises(KeyError, match="'nu', expected names that the picture shows, some of y, x"):
         pictures["responses"](labels={"mu": "mean", "x": "input", "nu": "typing error"})
 
 

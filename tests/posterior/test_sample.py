@@ -101,6 +101,29 @@ def test_unreliable_importance_sampling_is_replaced() -> None:
     assert result.posterior.attrs["adjustment"] == "estimate"
 
 
+@pytest.mark.usefixtures("_unreliable")
+def test_chains_of_nuts_that_disagree_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    arviz = import_module("arviz")
+    monkeypatch.setattr(arviz, "rhat", lambda posterior: posterior.mean() * 0 + 1.5)
+    result = prb.sample(50, chains=2, model=linear_model(), progressbar=False)
+    assert result.posterior.attrs["sampler"] == "SMC"
+
+
+@pytest.mark.usefixtures("_unreliable")
+def test_an_optimum_with_another_mode_is_sampled_by_smc(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = import_module("prbayes.posterior.sample")
+    found = module.modes_of
+    monkeypatch.setattr(module, "modes_of", lambda target: found(target)[:1])
+    x = np.random.default_rng(1).normal(1.5, 0.3, 15)
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", 0, 1.5), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", lambda x: x**2, inputs, observed=x**2)
+    optimum = prb.minimize(model, progressbar=False)
+    assert any(mode["comparable"] for mode in optimum.local_optima)
+    result = prb.sample(50, chains=2, optimum=optimum, model=model, progressbar=False)
+    assert result.posterior.attrs["sampler"] == "SMC"
+
+
 def test_the_posterior_given_the_estimate_of_the_divergence_is_nearly_the_exact_one() -> None:
     model = linear_model(metric=DIVERGENCE)
     result = prb.sample(1000, model=model, progressbar=False)

@@ -258,3 +258,27 @@ def test_scores_that_compute_responses_have_to_be_requested() -> None:
     assert "KullbackLeibler" not in table
     # The area between the distribution functions of two normals of one width.
     assert float(table["AreaMetric"][0]) == pytest.approx(abs(data.mean() - 1.0), abs=0.15)
+
+
+def test_a_metric_and_the_likelihood_of_the_same_data_are_compared() -> None:
+    def fitted(**given: Any) -> prb.Optimum:
+        with pm.Model() as m:
+            x = pm.Normal.dist(pm.Normal("mu", 1, 2), pm.HalfNormal("sigma", 1))
+            prb.Simulator("y", np.positive, x, **{"observed": DATA[:, 0]} | given)
+        return prb.minimize(m, progressbar=False)
+
+    labels, counts = list(range(40)), np.arange(40) % 3 + 1
+    by_metric = {"metric": prb.ProbabilityResidual(), "propagation": prb.Resimulated(256)}
+    for data in ({}, {"specimens": labels}, {"weights": counts}):
+        pair = {"likelihood": fitted(**data), "metric": fitted(**by_metric, **data)}
+        for m in (None, *(optimum.model for optimum in pair.values())):
+            table = prb.compare(pair, model=m, metrics=[AREA])
+            assert table.estimate.sel(hyperparameter="mu").std() < 0.1
+    one = pair["metric"]
+    for data, message in (
+        ({"observed": DATA[:, 1]}, "other observed values of y;"),
+        ({"weights": counts[::-1]}, "observed values of y"),
+        ({"specimens": labels}, "labels of specimens of y"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            prb.compare({"metric": one, "other": fitted(**data)})
