@@ -20,15 +20,16 @@ def view(
     header: Sequence[str] = (),
     rows: Iterable[Sequence[str]] = (),
     sentences: Iterable[str] = (),
+    align: str = "right",
 ) -> str:
     """Return HTML without colours, which suits light and dark; all texts are escaped.
 
-    The first cell of a row is its name; the others are aligned right, as numbers are.
+    The first cell of a row is its name; the others are aligned right, as numbers are, or left.
     """
     cell = "padding: .2em .9em .2em 0"
     table = ""
     for name, *values in (map(html.escape, row) for row in rows):
-        cells = "".join(f'<td style="{cell}; text-align: right">{value}</td>' for value in values)
+        cells = "".join(f'<td style="{cell}; text-align: {align}">{value}</td>' for value in values)
         table += f'<tr><th scope="row" style="{cell}; text-align: left">{name}</th>{cells}</tr>'
     parts = [f"<p><b>{html.escape(heading)}</b></p>"]
     if table:

@@ -25,8 +25,8 @@ AT_ONCE = 1 << 22
 
 # Advice where a problem has no specimens.
 NO_POPULATION = (
-    "for one time series, or parameters common to all specimens, use pm.Simulator or a pm.Normal "
-    "likelihood"
+    "for one time series, which is one specimen, or parameters common to all specimens, use "
+    "pm.Simulator or a pm.Normal likelihood"
 )
 # Numbers of arrays that stay in the cache of a processor: 2 MiB.
 IN_CACHE = 1 << 18

@@ -42,6 +42,7 @@ from prbayes.decision.quantities import (
     interval_values,
 )
 from prbayes.model.locking import locked
+from prbayes.model.parameters import variables_at
 from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -382,8 +383,8 @@ def _rare_probability(
             "prb.decision.Interval"
         )
     evaluator = populations.evaluator
-    values = evaluator.hyperparameters.constrained(populations.thetas)
-    center = evaluator.hyperparameters.constrained(populations.center[None])
+    values = variables_at(evaluator.hyperparameters, populations.thetas)
+    center = variables_at(evaluator.hyperparameters, populations.center[None])
     names = [str(rv.name) for rv in responses.inputs.parents]
     transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
     sign = -1.0 if quantity.below else 1.0

@@ -16,16 +16,16 @@ from prbayes._validate import Floats, called
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
+from prbayes.model.evaluator import read_inputs_of_copy
 from prbayes.model.fingerprint import from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
-from prbayes.model.parameters import element_name, variable_of
+from prbayes.model.parameters import element_name, variable_of, variables_at
 from prbayes.optimize.optimum import identity_in
 from prbayes.response.dims import is_random
 from prbayes.response.inputs import (
     Groups,
     event_shape,
     is_group,
-    read_inputs,
     unit_of,
 )
 from prbayes.response.moments import InputMoments
@@ -62,7 +62,7 @@ class PopulationReader:
 
     @cached_property
     def _points(self) -> dict[str, Floats]:
-        return self.populations.evaluator.hyperparameters.constrained(self._thetas)
+        return variables_at(self.populations.evaluator.hyperparameters, self._thetas)
 
     def elements(self, requested: Any) -> list[Element]:
         """Return the requested elements, or those of all inputs of the model."""
@@ -101,7 +101,7 @@ class PopulationReader:
     def _input(self, name: str, dist: TensorVariable) -> list[Element]:
         """Return the elements of an input."""
         label = f"{self.populations.caller}: {name}"
-        inputs = read_inputs(label, [dist], self.populations.evaluator.model, fixed=True)
+        inputs = read_inputs_of_copy(label, [dist], self.populations.evaluator.model, fixed=True)
         at = {str(v.name): self.at[v.name] for v in inputs.covariates if v.name in self.at}
         points = dict(self._points)
         size = len(self._thetas)

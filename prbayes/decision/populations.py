@@ -30,9 +30,10 @@ from prbayes.decision.quantities import (
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
+from prbayes.model.parameters import variables_at
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import N_BLOCKS, DesignError
@@ -40,7 +41,7 @@ from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
-from prbayes.response.inputs import Inputs, read_inputs, refuse_several_populations
+from prbayes.response.inputs import Inputs, refuse_several_populations
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
@@ -107,7 +108,7 @@ class Populations:
     def responses(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Responses:
         """Return a response with its inputs."""
         name = named_response(response, self.calling, "write the response with def")
-        sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
+        sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model)
         refuse_several_populations(f"{self.caller}: {name}", sorted_inputs.parents)
         simulators = self.evaluator.simulators
         outputs = known_outputs(simulators, response)
@@ -415,7 +416,7 @@ class CentralSpecimens:
         """Return the inputs of the specimens."""
         if self.inputs is None:
             evaluator = self.populations.evaluator
-            center = evaluator.hyperparameters.constrained(self.populations.center[None])
+            center = variables_at(evaluator.hyperparameters, self.populations.center[None])
             parents = [center[str(rv.name)] for rv in responses.inputs.parents]
             rng = np.random.default_rng(0)
             self.inputs = new_specimens(responses.name, responses.inputs, parents, self.size, rng)

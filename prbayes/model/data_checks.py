@@ -59,6 +59,71 @@ def warn_out_of_range(
             return
 
 
+def outlier_findings(
+    name: str,
+    observed: Floats,
+    responses: Floats,
+    outputs: Sequence[str],
+    *,
+    gross_errors: bool = False,
+    apart: float = 8.0,
+    share: float = 0.1,
+) -> tuple[Finding, ...]:
+    """Return findings of codes for missing values, and of values that no response explains.
+
+    A code, such as -999, is farther from all other values than these are apart. Up to ``share`` of
+    the values are outliers if they are outside all simulated responses, and a gap of ``apart``
+    times the range of all other values separates them. Of samples of 25 lognormal values
+    (sigma = 1) .3 % have such a gap, of Student's t (3) .1 %. With gross errors in the likelihood
+    only codes are reported.
+    """
+    columns = observed.reshape(len(observed), -1).T
+    # A user's own propagation may store no response.
+    simulated = responses.reshape(len(responses), -1).T if responses.size else np.empty((0, 0))
+    labels = [f"{name}[{output}]" for output in outputs] or [name]
+    findings = []
+
+    def add(label: str, values: Floats, where: str, advice: str) -> None:
+        listed = ", ".join(f"{value:.6g}" for value in np.unique(values)[:3])
+        text = f"{label}: got {len(values)} of {len(observed)} observed values far from all others"
+        text += f"{where}, {listed}: {advice}"
+        findings.append(Finding("outlying-data", text, "my_data.md#outliers"))
+
+    for k, (label, column) in enumerate(zip(labels, columns, strict=False)):
+        values = np.sort(column[np.isfinite(column)])
+        is_code = np.isin(np.abs(values), [999.0, 9999.0, 99999.0])
+        codes, rest = values[is_code], values[~is_code]
+        gaps = np.abs(np.subtract.outer(codes, rest))
+        if codes.size and rest.size >= 3 and gaps.min() > np.ptp(rest):
+            advice = "such a number often stands for a missing value; leave the specimen out, or "
+            add(label, codes, "", f"{advice}write NaN where other outputs of it were measured.")
+        else:
+            rest = values
+        finite = simulated[k][np.isfinite(simulated[k])] if len(columns) == len(simulated) else rest
+        if gross_errors or len(rest) < 8 or len(finite) < 16:  # few do not show the range
+            continue
+        far = _separate(rest, apart, share)
+        far = far[(far < finite.min()) | (far > finite.max())]
+        if far.size:
+            where = f" and outside the first {len(finite)} responses"
+            advice = "look at units and typing errors, leave them out, or use "
+            add(label, far, where, f"{advice}metric=prb.LogLikelihood(gross_errors=True).")
+    return tuple(findings)
+
+
+def _separate(values: Floats, apart: float, share: float) -> Floats:
+    """Return values at an end, at most a share of all, behind the largest gap that is wide."""
+    for count in range(int(share * len(values)) or 1, 0, -1):  # of (n,) in ascending order
+        for far, rest in (
+            (values[:count], values[count:]),
+            (values[-count:], values[:-count]),
+        ):
+            gap = max(rest[0] - far[-1], far[0] - rest[-1])
+            if gap > apart * (rest[-1] - rest[0]):
+                return far
+    return values[:0]
+
+
 def check_constant(
     name: str, responses: Floats, outputs: Sequence[str], is_stored: bool
 ) -> tuple[Finding, ...]:
@@ -517,11 +582,18 @@ def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) 
 
 
 def misfit_findings(
-    name: str, readings: Readings, roots: Roots, error: Floats, largest: float = 50.0
+    name: str,
+    readings: Readings,
+    roots: Roots,
+    error: Floats,
+    largest: float = 50.0,
+    *,
+    gross_errors: bool = False,
 ) -> list[Finding]:
     """Report specimens whose readings no inputs reproduce.
 
     The largest misfit in nats is still an error of the emulator: ten standard deviations, (m,).
+    With gross errors in the likelihood half of the specimens may have such readings.
     """
     # The first root of each specimen with the smallest misfit.
     order = np.lexsort((roots.misfit, roots.specimen))
@@ -530,7 +602,7 @@ def misfit_findings(
     has_root = np.isfinite(roots.misfit[best])
     is_poor = has_root & (roots.misfit[best] > largest)
     poor, rows = specimens[is_poor], best[is_poor]
-    if not poor.size:
+    if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
     off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))

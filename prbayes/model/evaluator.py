@@ -6,6 +6,7 @@ It says as well whether a design supports the populations at theta, and where it
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -29,6 +30,7 @@ from prbayes.model.random_variable import (
     common_targets,
     log_kernel,
     nodes,
+    simulators,
 )
 from prbayes.model.specimen_likelihood import (
     log_likelihoods,
@@ -41,7 +43,7 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
-from prbayes.response.inputs import is_known
+from prbayes.response.inputs import Inputs, is_known, read_inputs
 
 # Points of a design from which on samplers start with an eighth of them.
 _LARGE = SIZES.first
@@ -98,6 +100,7 @@ class Evaluator:
     def of(cls, model: pm.Model) -> Evaluator:
         """Return the evaluator of a model with at least one `Simulator`."""
         require_simulator(model)
+        refuse_replaced_expressions(model)
         hyperparameters = Hyperparameters.of(model)  # refuses a model before its first runs
         computed = tuple(nodes(model).values())
         likelihoods = tuple(dict.fromkeys(specimen_likelihoods(model).values()))
@@ -137,7 +140,7 @@ class Evaluator:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
         if self.likelihoods:
-            values = self.hyperparameters.constrained(thetas)
+            values = variables_at(self.hyperparameters, thetas)
             for likelihood in self.likelihoods:
                 total += log_likelihoods(likelihood, values).sum(axis=1)
         observed = self.model.observed_RVs
@@ -266,7 +269,7 @@ class Evaluator:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
         if k >= len(self.nodes):
             simulator = self.emulated[k - len(self.nodes)]
-            values = self.hyperparameters.constrained(thetas)
+            values = variables_at(self.hyperparameters, thetas)
             numbers = specimen_numbers(simulator.likelihood, simulator.measurement)
             return simulator.likelihood.parents(values, simulator.place, numbers[simulator.rows])
         key = ("parents", *(node.name for node in self.nodes))
@@ -318,6 +321,43 @@ def _unpickled(payload: bytes) -> Evaluator:
 def _ordinary(model: pm.Model) -> list[Any]:
     """Return the observed variables without a metric of distributions."""
     return [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, SimulatorRV)]
+
+
+# Inputs in a copy of a model.
+
+
+def read_inputs_of_copy(
+    name: str, inputs: Sequence[Any], model: pm.Model, *, fixed: bool = False
+) -> Inputs:
+    """Sort the inputs of a response, as `read_inputs`.
+
+    Inputs may be those of the model's simulators, also where `pymc.do`, `pymc.observe` or a clone
+    made the model: its simulators have the variables of the first one.
+    """
+    parents = [v for inputs in _inputs_of_simulators(model) for v in inputs.parents]
+    originals = [v for v in dict.fromkeys(parents) if not is_known(v)]
+    return read_inputs(name, inputs, model, fixed=fixed, originals=originals)
+
+
+def refuse_replaced_expressions(model: pm.Model) -> None:
+    """Refuse `pymc.do` of an expression between hyperparameters and inputs: it has no effect."""
+    replaced = {str(v.name) for v in model.data_vars}
+    for inputs in _inputs_of_simulators(model):
+        parents = set(inputs.parents)
+        ends = [*inputs.aleatory, *inputs.epistemic]
+        for v in ancestors(ends, blockers=parents):
+            if v not in parents and v.owner is not None and str(v.name) in replaced:
+                raise ValueError(
+                    f"model: got pm.do of {v.name}, an expression in the parameters of an input, "
+                    "expected pm.do of variables with a prior alone; fix those that it is "
+                    "computed from, or write the model again with a number in its place"
+                )
+
+
+def _inputs_of_simulators(model: pm.Model) -> list[Inputs]:
+    """Return the inputs of the simulators of a model, computed or not."""
+    records = [*simulators(model).values(), *measurements_of(model).values()]
+    return [record.responses.inputs for record in records]
 
 
 # Compiled functions.
@@ -381,7 +421,7 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
     Of simulators with common specimens the last has those of all, and the first ones have none.
     """
     result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
-    values = evaluator.hyperparameters.constrained(thetas)
+    values = variables_at(evaluator.hyperparameters, thetas)
     for likelihood in evaluator.likelihoods:
         result[likelihood.measurements[-1].name] = log_likelihoods(likelihood, values)
     return result

@@ -358,9 +358,26 @@ class SpecimenLikelihood:
         )
         if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
             return self
+        return replace(self, measurements=changed, shared_emulation=self._emulation)
+
+    def in_model(self, model: Any) -> SpecimenLikelihood:
+        """Return the likelihood in a copy of the model, with the same runs.
+
+        It is the same object unless `pymc.do` or `pymc.observe` left other free variables, for
+        whose posterior points are drawn.
+        """
+        original = self.model()
+        if original is not None:
+            names = [{str(rv.name) for rv in m.free_RVs} for m in (original, model)]
+            if names[0] == names[1]:
+                return self
+        return replace(self, model=weakref.ref(model), shared_emulation=self._emulation)
+
+    @property
+    def _emulation(self) -> Emulation | None:
+        """The emulator, if there is one."""
         prepared = self.cache.get("preparation")
-        emulation = prepared.emulation if prepared else self.shared_emulation
-        return replace(self, measurements=changed, shared_emulation=emulation)
+        return prepared.emulation if prepared else self.shared_emulation
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:

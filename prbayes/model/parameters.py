@@ -22,7 +22,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._validate import Floats, called, real_array, refuse_single_precision
-from prbayes.model.random_variable import building
+from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
     compiled,
@@ -85,6 +85,11 @@ class Hyperparameters:
             raise TypeError(
                 f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
                 "use pm.sample, or fix them"
+            )
+        if not model.free_RVs:
+            raise ValueError(
+                "model: got no free variable, expected one at least to calibrate; give a parameter "
+                "of an input a prior, and leave it out of pm.do and pm.observe"
             )
         for name in {"chain", "draw"} & set(map(str, model.named_vars)):
             raise ValueError(
@@ -256,6 +261,26 @@ class Hyperparameters:
             return self.prior_thetas(size, seed)
         thetas = self.thetas_of(self.quantiles(sobol(size, self.quantiles.size, seed)))
         return np.where(np.isfinite(thetas), thetas, self.initial)
+
+
+def fixed_values(model: pm.Model) -> dict[str, Floats]:
+    """Return the values of variables that are not free, as `pymc.do` and `pymc.observe` fix them.
+
+    Observed variables of simulators are left out.
+    """
+    observed = [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, ObservedRV)]
+    values = {str(rv.name): known_value(model.rvs_to_values[rv]) for rv in observed}
+    values |= {str(v.name): v.get_value() for v in model.data_vars if hasattr(v, "get_value")}
+    numbers = {name: np.asarray(value) for name, value in values.items() if value is not None}
+    return {name: x.astype(np.float64) for name, x in numbers.items() if x.dtype.kind in "biuf"}
+
+
+def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+    """Return all variables of the model, with those of `fixed_values`, shapes (P, *shape)."""
+    size, fixed = len(thetas), fixed_values(hyperparameters.model).items()
+    return hyperparameters.constrained(thetas) | {
+        name: np.broadcast_to(value, (size, *value.shape)) for name, value in fixed
+    }
 
 
 def log_posterior(

@@ -5,8 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 
+from prbayes._display import Shown, View
+from prbayes._finding import counted
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.emulators.continued import Continued
 from prbayes.emulators.ranges import predictive_inputs
@@ -27,7 +30,7 @@ def propose_runs(
     n: int | None = None,
     runs: Runs | None = None,
     random_seed: Seed = 0,
-) -> Any:
+) -> ProposedRuns:
     """Return inputs of runs that a table needs.
 
     Specimens of the prior predictive population whose response is near a measured one: those
@@ -48,7 +51,8 @@ def propose_runs(
     Returns
     -------
     pandas.DataFrame
-        A row for each point, a column for each input of the table, in the units of the table.
+        A row for each point, a column for each input of the table, in the units of the table. It
+        prints with a sentence about the ranges of the runs; a notebook shows a table.
 
     Raises
     ------
@@ -99,9 +103,34 @@ def propose_runs(
     unit = np.where(scaled.std(axis=0) > 0, scaled.std(axis=0), 1.0)
     squares = np.min([(((scaled - x) / unit) ** 2).sum(axis=1) for x in at_runs], axis=0)
     rows = farthest_rows(scaled / unit, min(n, len(pool)), squares)
-    import pandas as pd
+    proposed = ProposedRuns(pool[rows], columns=runs.columns)
+    ranges = np.stack([domain.low, domain.high]).tolist()
+    count = int(domain.outside(pool[rows]).any(axis=1).sum())
+    proposed.attrs = {"runs": len(runs), "outside": count, "ranges": ranges}
+    return proposed
 
-    return pd.DataFrame(pool[rows], columns=runs.columns)
+
+class ProposedRuns(Shown, pd.DataFrame):  # type: ignore[misc]  # pandas has no types
+    """Points at which more runs of a table are needed; parts of it are plain DataFrames."""
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a plain DataFrame."""
+        return pd.DataFrame(self)
+
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        size, outside = self.attrs["runs"], self.attrs["outside"]
+        ranges = [
+            f"{name} from {low:.4g} to {high:.4g}"
+            for name, low, high in zip(self.columns, *self.attrs["ranges"], strict=False)
+        ]
+        heading = (
+            f"{counted(len(self), 'proposed run')} near the measured responses, {outside} of them "
+            f"outside the ranges of the {size} runs"
+        )
+        rows = [[str(k), *(f"{x:.6g}" for x in row)] for k, row in enumerate(self.to_numpy())]
+        sentences = [f"The runs have {', '.join(ranges)}.", "Make a prb.Runs of old and new runs."]
+        return View(heading, ["", *map(str, self.columns)], rows, sentences)
 
 
 def _arguments(

@@ -46,6 +46,7 @@ from prbayes.model.data_checks import (
     check_constant,
     check_failing_region,
     duplicate_findings,
+    outlier_findings,
     warn_out_of_range,
 )
 from prbayes.model.locking import lock
@@ -228,7 +229,10 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.max_lost,
                 remedy=simulator.responses.remedy,
             )
-            bound.findings = report(*constant, *findings)
+            outliers = outlier_findings(
+                simulator.name, target.observed, bound.first_responses, outputs.names
+            )
+            bound.findings = report(*constant, *findings, *outliers)
             if simulator.specimens is None:  # reported where the simulator was written
                 bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(

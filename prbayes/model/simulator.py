@@ -17,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, counted, report
 from prbayes._validate import (
+    NO_POPULATION,
     Floats,
     called,
     flag,
@@ -34,7 +35,7 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import SummaryLikelihood
 from prbayes.model.conditions import observed_at_conditions, stacked_values
-from prbayes.model.data_checks import duplicate_findings
+from prbayes.model.data_checks import duplicate_findings, outlier_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -574,7 +575,7 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
     if values.ndim not in (1, 2) or len(values) < 2:
         raise ValueError(
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
-            "2 specimens"
+            f"2 specimens; {NO_POPULATION}"
         )
     rows = values.reshape(len(values), -1)
     if np.isnan(rows).all(axis=1).any():
@@ -691,14 +692,18 @@ def _prepared_metric(
             observed = observed_sample(observed, minimum=least, failures=metric.counts_failures)
         elif len(observed) < 2:
             raise ValueError(
-                f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of them"
+                f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of "
+                f"them; {NO_POPULATION}"
             )
         target = metric.against(observed, weights)
         if not metric.symbolic:
             try_function(target)
         return target
     except (TypeError, ValueError) as error:
-        raise type(error)(f"{name}: {error}") from None
+        values = np.asarray(observed, dtype=np.float64)
+        causes = outlier_findings(name, values, np.empty(0), ()) if values.ndim == 1 else ()
+        cause = "".join(f" {finding.text}" for finding in causes)
+        raise type(error)(f"{name}: {error}{cause and f'.{cause}'}") from None
 
 
 def try_function(target: Discrepancy) -> None:

@@ -101,21 +101,30 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
         result -= log_shares(likelihood, values, share)
     if repeats is not None:
         result += [repeats.log_density(error, np) for error in errors]
-    gross_share = _gross_share(likelihood.measurements[0], values)
-    if gross_share is not False:
-        gross_share = np.reshape(gross_share, (-1, 1))
-        gross = np.log(gross_share) + likelihood.stacked.log_gross
-        result = np.logaddexp(np.log1p(-gross_share) + result, gross)
+    result = _with_gross_errors(likelihood, values, result, slice(None))
     weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights
+
+
+def _with_gross_errors(
+    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], logs: Floats, rows: Any
+) -> Floats:
+    """Return log-likelihoods of specimens, (P, n), that may have a gross error."""
+    share = _gross_share(likelihood.measurements[0], values)
+    if share is False:
+        return logs
+    share = np.reshape(share, (-1, 1))
+    gross = np.log(share) + likelihood.stacked.log_gross[rows]
+    return np.asarray(np.logaddexp(np.log1p(-share) + logs, gross))
 
 
 def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
     """Return the error of the log-likelihood of populations by finitely many points, (P,), in nats.
 
     It is that of the difference between two independent halves of the points of each specimen. A
-    population that is narrower than the distances between points has a large one. A specimen
-    without a point in one of the halves is left out; zero if the error of the readings is unknown.
+    population that is narrower than the distances between points has a large one. Specimens that
+    have a gross error have next to none. A specimen without a point in one of the halves is left
+    out; zero if the error of the readings is unknown.
     """
     shared, shared_log_a = arrays(likelihood)
     log_a = shared_log_a.get_value(borrow=True)
@@ -130,7 +139,8 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
         for part in (slice(half), slice(half, None)):
             of_half = [v[rows, part] for v in x]
             points = WeightedPoints.of(likelihood.inputs, of_half, log_a[rows, part])
-            logs.append(likelihood.density.log_likelihoods(parents, points))
+            of_points = likelihood.density.log_likelihoods(parents, points)
+            logs.append(_with_gross_errors(likelihood, values, of_points, rows))
         with np.errstate(invalid="ignore"):
             difference = logs[0] - logs[1]
         with np.errstate(over="ignore"):  # far from the data: an infinite error
@@ -522,7 +532,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
     result = {rv: rv.owner.op.record for rv in rvs}
-    current = {old: old.observing(data) for old in result.values()}
+    current = {old: old.observing(data).in_model(model.root) for old in result.values()}
     for rv, old in result.items():
         if current[old] is not old:
             rv.owner.op.assign(rv.owner, current[old])

@@ -22,13 +22,14 @@ from prbayes.model.data_checks import (
     data_findings,
     emulator_findings,
     misfit_findings,
+    outlier_findings,
     refuse_undetermined,
     refuse_unreachable,
     refuse_unused_inputs,
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood, output_columns
-from prbayes.model.parameters import Hyperparameters, log_posterior
+from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
@@ -227,7 +228,15 @@ def _emulate(
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
     is_known = likelihood.error_is_known
-    points = draw_points(emulation, readings, roots, options, error_is_known=is_known)
+    has_gross_errors = likelihood.measurements[0].gross_errors is not False
+    points = draw_points(
+        emulation,
+        readings,
+        roots,
+        options,
+        error_is_known=is_known,
+        gross_errors=has_gross_errors,
+    )
     return emulation, points, _findings(likelihood, emulation, points, roots)
 
 
@@ -243,7 +252,13 @@ def _findings(
     name, readings, error = likelihood.name, likelihood.readings, emulation.error
     return [
         *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
-        *misfit_findings(name, readings, roots, error),
+        *misfit_findings(
+            name,
+            readings,
+            roots,
+            error,
+            gross_errors=likelihood.measurements[0].gross_errors is not False,
+        ),
         *emulator_findings(name, readings, error),
     ]
 
@@ -251,7 +266,7 @@ def _findings(
 def _data_findings(
     likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
 ) -> tuple[Finding, ...]:
-    """Return findings of rounded, censored and repeated readings that are taken as exact.
+    """Return findings of outliers, and of rounded, censored and repeated exact readings.
 
     None of outputs, (n, M), that are the same in all runs.
     """
@@ -259,6 +274,11 @@ def _data_findings(
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
         values = m.readings.values
+        simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
+        has_gross_errors = m.gross_errors is not False
+        findings += outlier_findings(
+            m.name, values, simulated, m.outputs.names, gross_errors=has_gross_errors
+        )
         if len(finite):
             is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0
             values = np.where(is_constant, np.nan, values)
@@ -310,7 +330,7 @@ class Populations:
         result = np.empty((len(thetas), n))
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
-        values = self.hyperparameters.constrained(thetas)
+        values = variables_at(self.hyperparameters, thetas)
         contexts = likelihood.by_group if smoothing is None else likelihood.by_context
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
@@ -334,7 +354,7 @@ class Populations:
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
-        values = self.hyperparameters.constrained(thetas)
+        values = variables_at(self.hyperparameters, thetas)
         return log_shares(self.likelihood, values, share).sum(axis=1)
 
     def _normal_log_density(
@@ -437,7 +457,7 @@ class PopulationDraws:
         populations, likelihood = self.populations, self.populations.likelihood
         rng = np.random.default_rng([0, 3])
         parts = []
-        values = populations.hyperparameters.constrained(self.thetas)
+        values = variables_at(populations.hyperparameters, self.thetas)
         for group, rows in likelihood.by_group:
             if likelihood.inputs.covariates:
                 rows = rng.choice(rows, (len(self.thetas), n_of_each))

@@ -109,7 +109,12 @@ def points_of_tables(
         _require_accurate(likelihood, problem, emulation)
         try:
             points = draw_points(
-                emulation, readings, roots, options, error_is_known=likelihood.error_is_known
+                emulation,
+                readings,
+                roots,
+                options,
+                error_is_known=likelihood.error_is_known,
+                gross_errors=likelihood.measurements[0].gross_errors is not False,
             )
         except DesignError as error:
             outside = ~_is_inside(likely, ranges)

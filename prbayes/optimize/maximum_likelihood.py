@@ -37,6 +37,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
+from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
@@ -161,7 +162,7 @@ def _supported(
     size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     largest = max(largest, of_specimen * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
-    values = evaluator.hyperparameters.constrained(thetas)
+    values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
     return np.asarray(np.sqrt(variance) <= largest)
 
@@ -515,7 +516,8 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
-    points = draw_points(emulation, readings, roots, options, seed=1)
+    has_gross_errors = likelihood.measurements[0].gross_errors is not False
+    points = draw_points(emulation, readings, roots, options, gross_errors=has_gross_errors, seed=1)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)
 
@@ -612,7 +614,7 @@ class SpecimenRefits:
         """Yield estimates of simulated data sets, whether they converged, and the data."""
         evaluator = self.evaluator
         rng = np.random.default_rng([seed, 21])
-        values = evaluator.hyperparameters.constrained(self.theta[None])
+        values = variables_at(evaluator.hyperparameters, self.theta[None])
         pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):

@@ -511,6 +511,15 @@ def _number(value: Any) -> Any:
 # -- requirements ----------------------------------------------------------------------------------
 
 
+def refuse_model(result: object, caller: str) -> None:
+    """Raise if a model stands where a result is expected."""
+    if isinstance(result, pm.Model):
+        raise TypeError(
+            f"{caller}: got a Model, expected a result of prb.minimize or prb.sample; pass the "
+            "model as model="
+        )
+
+
 def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     """Return the optimum, or raise if it is at the edge of a support or at a jump."""
     findings = breakdown_findings(optimum.search.at_edge, optimum.search.at_jump)

@@ -30,6 +30,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
+from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST
@@ -280,7 +281,7 @@ def _emulated_responses(
     """Return emulated responses of new specimens at thetas, (chains, draws, d)."""
     chains, draws, d = thetas.shape
     responses = {}
-    values = evaluator.hyperparameters.constrained(thetas.reshape(-1, d))
+    values = variables_at(evaluator.hyperparameters, thetas.reshape(-1, d))
     for likelihood in evaluator.likelihoods:
         for measurement in likelihood.measurements:
             n = len(measurement.observed)

@@ -165,10 +165,9 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
                 break
             chains = importance_chains(target, modes, settings)
             if chains is None:
-                others = [
-                    mode for mode in getattr(optimum, "local_optima", ()) if mode["comparable"]
-                ]
-                has_one_mode = len(modes) == 1 and not others
+                optima = getattr(optimum, "local_optima", ())
+                is_ambiguous = any(mode["comparable"] for mode in optima)
+                has_one_mode = len(modes) == 1 and not is_ambiguous
                 if has_one_mode and not evaluator.nodes and evaluator.has_graph:
                     chains = _nuts_chains(evaluator, modes[0], settings)
                 break

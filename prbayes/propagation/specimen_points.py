@@ -96,15 +96,21 @@ def draw_points(
     options: PointOptions,
     *,
     error_is_known: bool = True,
+    gross_errors: bool = False,
     seed: int = 0,
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
+
+    With gross errors outlying specimens have no influence on the number of points.
 
     If ``error_is_known``, the weights around the root of certain readings are scaled to its mass,
     which 256 points measure; otherwise the error of the readings is approximate. Raise DesignError
     if `most_points` are not enough.
     """
-    sampler = _PointSampler(emulation, readings, options.degrees)
+    typical = np.ones(len(readings), dtype=bool)
+    if gross_errors:
+        typical = _typical(roots, len(readings))
+    sampler = _PointSampler(emulation, readings, options.degrees, typical)
     components = _fit_components(sampler, roots, seed)
     is_certain = np.isfinite(components.log_mass).all()
     count = options.points * (1 if is_certain and error_is_known else 16)
@@ -124,6 +130,10 @@ def draw_points(
             for k in scales
         }
         samples = {k: joined(*pair) for k, pair in of_error.items()}
+        whole = samples[1.0]
+        if gross_errors:
+            samples = {k: sample.rows(typical) for k, sample in samples.items()}
+            of_error = {k: [half.rows(typical) for half in pair] for k, pair in of_error.items()}
         fits = fits or {k: bootstrap_normals(x.z, x.log_a, 32, seed) for k, x in samples.items()}
         difference = 0.0
         while narrowing and difference <= options.half_difference:
@@ -147,7 +157,24 @@ def draw_points(
             "metric, such as prb.ProbabilityResidual()"
         )
     n_roots = np.bincount(roots.specimen, minlength=len(readings))
-    return replace(samples[1.0], n_roots=n_roots, difference=difference)
+    return replace(whole, n_roots=n_roots, difference=difference)
+
+
+def _typical(roots: Roots, n: int, far: float = 5.0, largest: float = 50.0) -> NDArray[np.bool_]:
+    """Return which specimens have no gross error, (n,), by the best root of each.
+
+    An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
+    """
+    order = np.lexsort((roots.misfit, roots.specimen))
+    specimens, first = np.unique(roots.specimen[order], return_index=True)
+    z, misfit = roots.z[order[first]], roots.misfit[order[first]]
+    away = np.abs(z - np.median(z, axis=0))
+    sd = 1.4826 * np.median(away, axis=0)
+    is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)
+    typical = np.ones(n, dtype=bool)
+    if 2 * is_outlier.sum() < len(specimens):
+        typical[specimens[is_outlier]] = False
+    return typical
 
 
 def _at_likely_error(
@@ -168,6 +195,7 @@ def _at_likely_error(
         totals = []
         for scale in scales:
             at_scale = sampler.with_error(sample, scale)
+            at_scale = at_scale.rows(np.flatnonzero(sampler.typical))
             normal = fit_normal(at_scale.z, at_scale.log_a)
             totals.append(float(_log_likelihoods(at_scale, [normal]).sum()))
         scale = max(s for s, total in zip(scales, totals, strict=True) if total > max(totals) - 4)
@@ -194,7 +222,7 @@ def _with_modes(sampler: _PointSampler, components: _Components, seed: int) -> _
     without points near the population does not count.
     """
     sample = sampler.draw(components, 256, (seed, 11))
-    mean, root = fit_normal(sample.z, sample.log_a)
+    mean, root = fit_normal(sample.z[sampler.typical], sample.log_a[sampler.typical])
     weights = normalised_weights(normal_log_density(sample.z, mean, root) + sample.log_a)
     means = np.einsum("nk,nkd->nd", weights, sample.z)
     mean = np.median(means, axis=0)
@@ -288,10 +316,11 @@ def _fit_components(
     solved = np.unique(roots.specimen)
     if solved.size:
         # Specimens without a root wait for the population of the others.
-        subset = replace(sampler, readings=readings.rows(solved))
+        subset = sampler.rows(solved)
+        typical = subset.typical
         ranked = replace(components, specimen=np.searchsorted(solved, roots.specimen))
         ranked, sample = _moment_matched(subset, ranked, seed)
-        mean, root = fit_normal(sample.z, sample.log_a)
+        mean, root = fit_normal(sample.z[typical], sample.log_a[typical])
         covariance = root @ root.T
         scatter = np.sqrt(np.diag(covariance))
         is_pulled = (_sd(ranked) > 0.2 * scatter).any()
@@ -299,7 +328,8 @@ def _fit_components(
             ranked = _given_population(ranked, mean, 4 * covariance)
         is_wide = (_sd(ranked) > share * scatter).any(axis=1)
         sd = subset.readings.comparison_sd(sampler.emulation.error)
-        is_noisy = (sd > share * readings.spread()) & subset.readings.is_measured
+        spread = subset.readings.rows(np.flatnonzero(typical)).spread()
+        is_noisy = (sd > share * spread) & subset.readings.is_measured
         is_uncertain = (is_noisy | subset.readings.is_censored).any(axis=1)
         has_mass = ~(is_wide | is_uncertain[ranked.specimen])
         if is_pulled and has_mass.any():
@@ -393,7 +423,7 @@ def _moment_matched(
         new_root[uneven] = np.linalg.cholesky(covariance + 1e-14 * previous)
         components = replace(components, center=new_center, root=new_root)
         changed = np.unique(components.specimen[uneven])
-        subset = replace(sampler, readings=sampler.readings.rows(changed))
+        subset = sampler.rows(changed)
         rows = np.isin(components.specimen, changed)
         ranks = np.searchsorted(changed, components.specimen[rows])
         of_changed = _Components(
@@ -413,6 +443,11 @@ class _PointSampler:
     emulation: Emulation
     readings: Readings
     degrees: float  # of the t distributions
+    typical: NDArray[np.bool_]  # (N,): specimens that populations are fitted to
+
+    def rows(self, index: NDArray[np.intp]) -> _PointSampler:
+        """Return the sampler of selected specimens."""
+        return replace(self, readings=self.readings.rows(index), typical=self.typical[index])
 
     def draw(self, components: _Components, count: int, seed: tuple[int, int]) -> SpecimenPoints:
         """Draw points from each component."""

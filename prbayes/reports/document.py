@@ -104,7 +104,7 @@ class Report:
     >>> optimum = prb.minimize(model)
     >>> report = prb.Report("Shaft stiffness", model=model, optimum=optimum, pictures=False)
     >>> [section.title for section in report.sections if section.level == 2][:3]
-    ['Not tested', 'Decision', 'Answer']
+    ['Not ready', 'Decision', 'Answer']
     """
 
     title: str

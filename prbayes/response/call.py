@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import Floats, unmasked
+from prbayes._validate import NO_POPULATION, Floats, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -280,6 +280,8 @@ def checked(
                 "reduce over the event axis only (the last one), or wrap a function of one "
                 "specimen in prb.scalar"
             )
+            if len(event) == 1 and not expected:  # values of one specimen, observed as specimens
+                remedy += f"; {NO_POPULATION}"
         if event and event in {np.shape(a)[len(batch) :] for a in arguments}:
             remedy = (
                 "it is as long as an input, which has several elements; reduce over them, or where "
@@ -321,7 +323,7 @@ PER_SPECIMEN = (
 def array_advice(reason: str) -> str:
     """Return advice where a response raised since its arrays do not fit together."""
     is_size = "broadcast" in reason or "ength of values" in reason
-    return f"; {PER_SPECIMEN}" if is_size else ""
+    return f"; {PER_SPECIMEN}; {NO_POPULATION}" if is_size else ""
 
 
 def shapes(arguments: Sequence[Any]) -> str:

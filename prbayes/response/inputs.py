@@ -153,13 +153,19 @@ class Inputs:
 
 
 def read_inputs(
-    name: str, inputs: Sequence[Any], model: pm.Model, *, fixed: bool = False
+    name: str,
+    inputs: Sequence[Any],
+    model: pm.Model,
+    *,
+    fixed: bool = False,
+    originals: Sequence[Variable] = (),
 ) -> Inputs:
     """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise.
 
-    ``fixed`` is whether they may depend on no hyperparameter.
+    ``fixed`` is whether they may depend on no hyperparameter. ``originals`` are variables of a
+    model that this one copies, on which inputs may depend too.
     """
-    tensors = {v: values_of(v) for v in model.basic_RVs}
+    tensors = {v: values_of(v) for v in (*model.basic_RVs, *originals)}
     model_variables: set[Variable] = {*tensors, *tensors.values()}
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []

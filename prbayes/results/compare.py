@@ -40,7 +40,7 @@ from prbayes.model.parameters import (
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
-from prbayes.optimize.optimum import Optimum, identity_in
+from prbayes.optimize.optimum import Optimum, identity_in, refuse_model
 from prbayes.response.inputs import event_shape
 from prbayes.results.predict import width_of_epsilon
 
@@ -107,6 +107,8 @@ def compare(
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
+    for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
+        refuse_model(result, "compare: results")
     if not isinstance(results, Mapping):
         raise TypeError(
             f"compare: results: got {called(results)}, expected a mapping such as "

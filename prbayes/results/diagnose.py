@@ -44,6 +44,7 @@ from prbayes.optimize.optimum import (
     SMALLEST_SHARE,
     Optimum,
     compared_in,
+    refuse_model,
     require_of_model,
 )
 from prbayes.response.inputs import model_on_context
@@ -133,13 +134,15 @@ class Diagnosis:
         return pd.DataFrame(rows, columns=["kind", "code", "text"])
 
     def _repr_html_(self) -> str:
-        """Show the sentences in a notebook, findings first."""
-        sentences = (*self.messages, *self.notes, *self.untested)
+        """Show a table of the findings and remarks in a notebook, and what was not tested."""
+        heading = f"Diagnosis: {counted(len(self.findings), 'problem')}"
         if self.ok:
             clear = self.all_clear.removesuffix(".")
-            return view(f"Diagnosis: {clear[0].lower()}{clear[1:]}", sentences=sentences)
-        count = len(self.findings)
-        return view(f"Diagnosis: {counted(count, 'problem')}", sentences=sentences)
+            heading = f"Diagnosis: {clear[0].lower()}{clear[1:]}"
+        rows = [(f.code, "problem", str(f)) for f in self.findings]
+        rows += [(f.code, "remark", str(f)) for f in self.remarks]
+        header = ("code", "kind", "text")
+        return view(heading, header=header, rows=rows, sentences=self.untested, align="left")
 
 
 @locked
@@ -194,6 +197,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
+    refuse_model(result, "diagnose: result")
     optimum = result if isinstance(result, Optimum) else None
     tree = result.to_datatree() if isinstance(result, Optimum) else result
     groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
@@ -217,7 +221,9 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         by_specimen = not evaluator.nodes
         every_draw = tree["posterior"].sizes["chain"] * tree["posterior"].sizes["draw"]
         points, _ = populations_of(tree, model, every_draw, "prb.diagnose")
-        thetas = evaluator.hyperparameters.thetas_of(list(points.values()))
+        thetas = evaluator.hyperparameters.thetas_of(
+            [points[str(rv.name)] for rv in model.free_RVs]
+        )
     coverage: _Coverage = {}
     if has_draws and calibration:
         coverage = _stored_coverage(calibration)

@@ -30,6 +30,7 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
@@ -261,7 +262,7 @@ def scored_specimens(
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
     result = []
-    at_theta = evaluator.hyperparameters.constrained(theta[None])
+    at_theta = variables_at(evaluator.hyperparameters, theta[None])
     for likelihood, functions, (points, log_a) in zip(
         evaluator.likelihoods, scores, data, strict=True
     ):
@@ -445,7 +446,7 @@ def _complete_covariance(
     """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
     step = 1e-3 * evaluator.hyperparameters.prior_sd
     around = cross(theta, step)
-    values = evaluator.hyperparameters.constrained(around)
+    values = variables_at(evaluator.hyperparameters, around)
     information = np.zeros((theta.size, theta.size))
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):

@@ -36,7 +36,7 @@ from prbayes.model.emulated import (
     PopulationSimulator,
     population_simulators,
 )
-from prbayes.model.evaluator import TOLERABLE, shortcoming
+from prbayes.model.evaluator import TOLERABLE, read_inputs_of_copy, shortcoming
 from prbayes.model.fingerprint import (
     Level,
     as_attributes,
@@ -44,9 +44,9 @@ from prbayes.model.fingerprint import (
     require_same_responses,
 )
 from prbayes.model.locking import locked
-from prbayes.model.parameters import element_name, finite_draws
+from prbayes.model.parameters import element_name, finite_draws, fixed_values
 from prbayes.model.random_variable import Node, has_default_epsilon, simulators
-from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
+from prbayes.optimize.optimum import Optimum, identity_in, refuse_model, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
@@ -54,7 +54,7 @@ from prbayes.response.condition import is_condition, known_covariates
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.failures import Abort, ResponseError
-from prbayes.response.inputs import Inputs, is_group, model_on_context, read_inputs
+from prbayes.response.inputs import Inputs, is_group, model_on_context
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
 
@@ -194,7 +194,7 @@ def predict(
         points = {key: np.repeat(value, n_samples, axis=0) for key, value in points.items()}
         coords["draw"] = np.arange(n_samples)
     n_samples = n_samples if conditions is None else len(conditions)
-    inputs_read = read_inputs(label, arguments, model)
+    inputs_read = read_inputs_of_copy(label, arguments, model)
     n_stored = sum(s.responses.count for s in sources)
     responses = Responses(
         label,
@@ -370,6 +370,7 @@ def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> st
 
 def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
     """Return the model of a result, the one passed, or on the context; raise if it differs."""
+    refuse_model(result, caller)
     if model is None and isinstance(result, Optimum):
         model = result.model
     model = model_on_context(model, caller)
@@ -382,7 +383,10 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
 def populations_of(
     result: Any, model: pm.Model, draws: int, caller: str
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
-    """Return the free variables, (k, *shape), at evenly thinned draws, and their coordinates."""
+    """Return variables, (k, *shape), at evenly thinned draws, and the coordinates of the draws.
+
+    These are the free variables, and those that `pymc.do` or `pymc.observe` fixed.
+    """
     names = [str(rv.name) for rv in model.free_RVs]
     values: Any
     if isinstance(result, Optimum):
@@ -405,8 +409,14 @@ def populations_of(
         )
     if isinstance(result, Optimum):
         points = {name: np.asarray(values[name], dtype=np.float64)[None] for name in names}
-        return points, {"chain": np.arange(1), "draw": np.arange(1)}
-    return finite_draws(values, names), {dim: np.asarray(values[dim]) for dim in ("chain", "draw")}
+        coords = {"chain": np.arange(1), "draw": np.arange(1)}
+    else:
+        points = finite_draws(values, names)
+        coords = {dim: np.asarray(values[dim]) for dim in ("chain", "draw")}
+    size = len(points[names[0]])
+    for name, value in fixed_values(model).items():
+        points[name] = np.broadcast_to(value, (size, *value.shape))
+    return points, coords
 
 
 def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:

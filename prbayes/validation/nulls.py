@@ -23,13 +23,12 @@ from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
-from prbayes.model.evaluator import shortcomings
+from prbayes.model.evaluator import read_inputs_of_copy, shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
-from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings, data_digest, in_order, serving, specimen_names
 from prbayes.validation.conditions import Case, Condition, Predictive, between
@@ -473,7 +472,7 @@ class JointNull(Null):
             )
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
-        read = read_inputs(condition.name, inputs, self.optimum.model)
+        read = read_inputs_of_copy(condition.name, inputs, self.optimum.model)
         responses = Responses(
             condition.name,
             response,

@@ -15,6 +15,7 @@ from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.margins import margins
 from prbayes.model.random_variable import simulators
+from prbayes.response.call import ResponseError
 
 DATA = np.random.default_rng(1).normal(3.0, 0.5, 20)
 FRESH: dict[str, Any] = {"metric": prb.AreaMetric(), "propagation": prb.Fresh(50)}
@@ -251,6 +252,15 @@ def test_one_time_series_is_no_population() -> None:
         prb.Joint(prb.AreaMetric())(np.ones((50, 3)), series[None])
     with pm.Model(), pytest.raises(ValueError, match=f"none of them aleatory.*{advice}"):
         prb.Simulator("y", np.positive, pm.HalfNormal("a"), observed=series)
+    times = np.linspace(0, 1, 20)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.1)
+        for metric in (prb.LogLikelihood(), prb.AreaMetric()):
+            with pytest.raises(ValueError, match=f"(1, 20)|1 specimen.*{advice}"):
+                prb.Simulator("y", np.positive, x, metric=metric, observed=times[None])
+        prb.Simulator("decay", lambda x: np.exp(-np.multiply.outer(x, times)), x, observed=times)
+    with pytest.raises(ResponseError, match=rf"returned shape \(64, 20\).*{advice}"):
+        prb.minimize(model, progressbar=False)
 
 
 def test_elements_of_a_vector_have_units_of_their_own() -> None:

@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
+import pymc as pm
 import pytest
 
+import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.data_checks import (
     DataCheckOptions,
@@ -18,6 +20,7 @@ from prbayes.model.data_checks import (
     data_findings,
     duplicate_findings,
     identical_specimens,
+    outlier_findings,
     resolution,
     warn_out_of_range,
 )
@@ -367,3 +370,70 @@ def test_duplicates_of_all_specimens_are_reported(values: Floats) -> None:
 )
 def test_ties_by_chance_are_no_duplicates(values: Floats) -> None:
     assert not duplicate_findings("y", np.asarray(values, dtype=float))
+
+
+@pytest.mark.parametrize("code", [-999.0, -9999.0, 9999.0])
+def test_codes_of_missing_values_are_reported_whatever_the_responses(code: float) -> None:
+    values = np.append(RNG.normal(3, 0.1, 24), code)
+    (finding,) = outlier_findings("y", values, np.empty(0), [])
+    assert f"y: got 1 of 25 observed values far from all others, {code:g}: such" in finding.text
+    (finding,) = outlier_findings(
+        "y", np.stack([values, values[::-1] ** 0], 1), SIMULATED, ["a", "b"], gross_errors=True
+    )
+    assert finding.text.startswith("y[a]: got 1 of 25")
+
+
+def test_values_apart_from_data_and_responses_are_reported() -> None:
+    values, responses = RNG.normal(3.1, 0.1, 25), RNG.normal(3, 1, 128)
+    values[[3, 7]] = 31.4, 31.0
+    (finding,) = outlier_findings("y", values, responses, [])
+    assert "got 2 of 25 observed values far from all others and outside the" in finding.text
+    assert "128 responses, 31, 31.4: look at units" in finding.text
+    assert not outlier_findings("y", values, 10 * responses, [])
+    assert not outlier_findings("y", values, responses, [], gross_errors=True)
+    assert not outlier_findings("y", values, responses[:15], [])  # too few for a range
+    (finding,) = outlier_findings("y", -values, -responses, [])
+    assert "-31.4, -31: look at units" in finding.text
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda rng: rng.normal(size=25),
+        lambda rng: np.exp(rng.normal(size=25)),
+        lambda rng: rng.standard_t(3, 25),
+        lambda rng: 1000 + rng.poisson(2, 25),
+        lambda rng: np.append(rng.uniform(500, 1500, 24), 999),
+    ],
+    ids=["normal", "lognormal", "t", "counts", "a number that is a code"],
+)
+def test_tails_are_no_outliers(draw: Callable[[np.random.Generator], Floats]) -> None:
+    """The rate of alarms is below .3 %, also with responses around the median alone."""
+    rng = np.random.default_rng(4)
+    alarms = 0
+    for _ in range(200):
+        values = draw(rng)
+        responses = np.median(values) + 1e-3 * rng.normal(size=64)
+        alarms += len(outlier_findings("y", values, responses, []))
+    assert alarms <= 2
+
+
+def test_a_metric_that_a_code_spoils_names_it() -> None:
+    values = np.append(RNG.normal(3, 0.1, 24), -999)
+    message = r"span below .*got 1 of 25 .*, -999: such"
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 3, 1), 0.1)
+        with pytest.raises(ValueError, match=message):
+            prb.Simulator("y", np.positive, x, metric=prb.ProbabilityResidual(), observed=values)
+
+
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood(error=0.05)])
+def test_a_diagnosis_reports_codes(metric: prb.Metric) -> None:
+    values = np.append(RNG.normal(3, 0.1, 24), -999)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
+        prb.Simulator(
+            "y", np.positive, x, metric=metric, observed=values, propagation=prb.Reweighted(64)
+        )
+    optimum = prb.minimize(model, progressbar=False)
+    assert "outlying-data" in {finding.code for finding in optimum.findings}

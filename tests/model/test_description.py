@@ -61,7 +61,7 @@ def test_variables_and_simulators_are_described(model: pm.Model) -> None:
     (simulator,) = found["simulators"]
     assert simulator["name"] == "y"
     assert simulator["response"] == "stiffness"
-    assert simulator["inputs"] == "Normal(mu, sigma), 2.5, an array of shape (3,)"
+    assert simulator["inputs"] == ("x ~ Normal(mu, sigma), a = 2.5, b = an array of shape (3,)")
     assert simulator["metric"].startswith("AreaMetric(")
     assert simulator["propagation"].startswith("Resimulated(")
     assert simulator["n_points"] == "32"
@@ -90,7 +90,7 @@ def test_arrays_of_constants_are_shown() -> None:
     assert texts["other"] == "LKJCholeskyCov(2, 2, HalfNormal(0, [0.4, 2]))"
     (simulator,) = describe(model)["simulators"]
     assert simulator["response"] == "lambda(x)"
-    assert simulator["inputs"] == "MultivariateNormal(f(location), [1, 0, 0, 2])"
+    assert simulator["inputs"] == "x ~ MultivariateNormal(f(location), [1, 0, 0, 2])"
 
 
 def test_a_description_comes_back_from_a_file(model: pm.Model) -> None:

@@ -1,8 +1,10 @@
 """The log-likelihood by specimen from a table of runs: as from the function, or refused."""
 
+import pickle
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 
@@ -70,6 +72,12 @@ def test_a_table_that_ends_within_the_data_is_refused_with_a_proposal() -> None:
         log_density(model)
     proposed = prb.propose_runs(model, n=12)
     assert list(proposed) == ["e", "t"]
+    assert repr(proposed).startswith("12 proposed runs near the measured responses, 12 of them")
+    assert "e from 50" in repr(proposed)
+    assert proposed._repr_html_().count("<tr>") == 13
+    assert repr(pickle.loads(pickle.dumps(proposed))) == repr(proposed)
+    for part in (proposed[["e"]], proposed.head(2), proposed.copy(), proposed.to_dataframe()):
+        assert type(part) is pd.DataFrame
     assert (proposed["e"] > narrow.points[:, 0].max()).all()
     # They reproduce the data, and the wider table is accepted.
     values = stiffness(*proposed.to_numpy().T)

@@ -86,6 +86,24 @@ def test_a_gross_error_leaves_the_population() -> None:
     assert float(x.mean()) == pytest.approx(float(mu), abs=5 * sigma / np.sqrt(2000))
 
 
+@pytest.mark.parametrize("error", [0.02, 0.1])
+@pytest.mark.parametrize("factor", [10.0, 100.0])  # within and beyond reach of the priors
+def test_the_population_of_data_with_a_gross_error_is_that_of_the_others(
+    factor: float, error: float
+) -> None:
+    y = 2 * np.random.default_rng(2).normal(1, 0.1, 25)
+    rest = np.delete(y, 3)
+    y[3] *= factor
+    metric = prb.LogLikelihood(error=error, gross_errors=True)
+    optimum = prb.minimize(normal_model(y, metric))
+    assert optimum.converged
+    assert not optimum.findings
+    sigma = np.sqrt(rest.var() - error**2) / 2
+    assert optimum.point["mu"] == pytest.approx(rest.mean() / 2, abs=0.002)
+    assert optimum.point["sigma"] == pytest.approx(sigma, rel=0.02)
+    assert optimum.point["y_gross_errors"] == pytest.approx(1 / 25, rel=0.05)
+
+
 def test_an_unknown_error_of_the_readings() -> None:
     """With the error fixed at its estimate, draws are those of the conjugate posterior."""
     rng = np.random.default_rng(3)
