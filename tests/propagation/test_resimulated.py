@@ -70,7 +70,7 @@ def test_a_response_that_accepts_tensors_becomes_part_of_the_graph() -> None:
 def test_too_few_responses_for_a_log_likelihood(caplog: pytest.LogCaptureFixture) -> None:
     likelihood = prb.LogLikelihood(density=prb.GaussianKDE())
     bound(np.positive, prb.Resimulated(1199), likelihood)
-    assert "expected at least 1200 responses, 300 for each observation" in caplog.text
+    assert "expected at least 1200, 300 for each observation" in caplog.text
     caplog.clear()
     bound(np.positive, prb.Resimulated(1200), likelihood)
     bound(np.positive, prb.Resimulated(64), prb.KullbackLeibler())
