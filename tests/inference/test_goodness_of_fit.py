@@ -297,6 +297,6 @@ def test_a_diagnosis_names_what_disagrees_and_is_quiet_otherwise(is_wrong: bool)
     before = found.evaluator.n_responses
     diagnosis = prb.diagnose(found)
     assert found.evaluator.n_responses == before
-    expected = any("farther from the best population" in text for text in diagnosis.messages)
+    expected = any("farther from their best population" in text for text in diagnosis.messages)
     assert is_wrong == expected
     assert is_wrong == ("y: these disagree with the best population" in str(diagnosis))

@@ -129,7 +129,7 @@ def test_the_right_family_is_identified_and_families_alike_are_not() -> None:
     assert table.significant.values.tolist() == [False, True]
     by = f"{float(table.difference[1]):.1f} nats (standard error {float(table.stderr[1]):.1f})"
     assert table.attrs["verdict"] == f"lognormal predicts better than normal by {by}"
-    assert table.to_dataframe().shape == (2, 6)
+    assert table.to_dataframe().shape == (2, 5)
     narrow = np.random.default_rng(2).normal(1.0, 0.1, 30)
     alike = prb.rank({f.__name__: minimized(f, narrow) for f in (normal, lognormal)}, **QUIET)
     assert not alike.significant.any()
