@@ -5,7 +5,6 @@ of other programs, and speed. Each is computed anew by the program that the page
 data sets, into a folder of its own. It takes about an hour of one core:
 
     OMP_NUM_THREADS=1 uv run python -m benchmarks.figures [--steps structure tests]
-    uv run python -m benchmarks.pages
 """
 
 from __future__ import annotations
@@ -127,6 +126,7 @@ def main() -> None:
     for name in parser.parse_args().steps:
         start = time.monotonic()
         record.save(FOLDER / f"{name}.json", STEPS[name]())
+        run("-m", "benchmarks.pages")  # a test compares the pages with the results
         print(f"{name}: {time.monotonic() - start:.0f} s", flush=True)
 
 
