@@ -1,7 +1,4 @@
-"""Results as sentences, tables of a notebook and data frames.
-
-Also the same as text, and numbers as a DataFrame.
-"""
+"""Results as sentences, tables of a notebook and data frames."""
 
 from __future__ import annotations
 
@@ -94,6 +91,7 @@ class ShownArray:
     # Dimensions, variables, groups and attributes of a whole result.
     _parts: ClassVar[tuple[str, ...]] = ()
 
+    # That of xarray has no annotations, by which type checkers would refuse each subclass.
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
 
