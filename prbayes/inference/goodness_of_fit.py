@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
@@ -191,7 +191,7 @@ def unpredicted_failures(evaluator: Evaluator, theta: Floats) -> list[Finding]:
             continue
         (values,), (weights,) = evaluator.populations(theta[None], k)
         share = float(weights[np.isposinf(values.reshape(len(values), -1)).any(axis=1)].sum())
-        if binom.sf(count - 1, n, min(share, 1.0)) < UNLIKELY:
+        if bdtrc(count - 1, n, min(share, 1.0)) < UNLIKELY:
             text = (
                 f"{node.name}: {count} of {n} measured values are +inf, specimens that failed, but "
                 f"the response fails at {share:.2g} of the best population: look at these values, "

@@ -15,7 +15,6 @@ from itertools import pairwise
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
-from scipy.stats import bartlett
 
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
@@ -483,6 +482,8 @@ def with_common_bandwidths(
     those of several, as deviations from their means, unless Bartlett's test finds that their
     spreads differ.
     """
+    from scipy.stats import bartlett  # takes a third of the import of the package
+
     result = list(targets)
     kinds: list[tuple[int, Any]] = []
     for response, target in zip(responses, targets, strict=True):

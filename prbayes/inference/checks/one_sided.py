@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
@@ -101,7 +101,7 @@ def _limit(
 ) -> float:
     """Return the i-th element at the limit, at most so many units away, NaN without a limit."""
     place, below = theta.copy(), (0.0, 0.0)  # distance and statistic
-    highest = float(norm.ppf(0.95))
+    highest = float(ndtri(0.95))
 
     def at(distance: float) -> float:
         place[i] = theta[i] + distance * unit

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize as scipy_minimize
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
@@ -244,6 +243,8 @@ def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr:
     weight and are farther from the data than all responses. No response is computed where they are
     stored; the minimum is searched by Nelder-Mead.
     """
+    from scipy.optimize import minimize as scipy_minimize
+
     unit = np.where(np.isfinite(stderr) & (stderr > 0), stderr, 1.0)
 
     def counted(t: Floats) -> float:

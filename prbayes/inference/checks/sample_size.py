@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import chi2, norm, t
+from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
@@ -39,10 +39,10 @@ def interval_ratios(n: float) -> tuple[float, float]:
     [1.0, 1.0]
     """
     upper = (1 + INTERVAL) / 2
-    z = float(norm.ppf(upper))
+    z = float(ndtri(upper))
     # The maximum of the likelihood divides the squares by n.
-    mean = np.sqrt(n / (n - 1)) * t.ppf(upper, n - 1) / z
-    longest, shortest = (np.sqrt(n / chi2.ppf(p, n - 1)) for p in (1 - upper, upper))
+    mean = np.sqrt(n / (n - 1)) * stdtrit(n - 1, upper) / z
+    longest, shortest = (np.sqrt(n / (2 * gammaincinv((n - 1) / 2, p))) for p in (1 - upper, upper))
     return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
 
 
