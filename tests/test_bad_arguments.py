@@ -383,7 +383,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "LogLikelihood": Row(
         error=("a", 0, -1.0, True),
         gross_errors=(-1.0, 2.0),
-        censored=((1.0,), ("a", "b")),
+        censored=((1.0,), ("a", "b"), [None, None]),
         rounded=("a", -1.0),
     ),
     "Joint": Row(metric=JOINED),

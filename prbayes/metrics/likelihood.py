@@ -106,7 +106,8 @@ class LogLikelihood(Metric):
             )
         limits: Any = self.censored
         if limits is not None:
-            if not isinstance(limits, tuple | list) or len(limits) != 2 or limits == (None, None):
+            is_pair = isinstance(limits, tuple | list) and len(limits) == 2
+            if not is_pair or all(x is None for x in limits):
                 raise ValueError(
                     f"LogLikelihood: censored: got {limits!r}, expected (lower, upper), one of "
                     "which may be None"

@@ -14,6 +14,7 @@ from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
+from prbayes.inference.checks.population import failing_share
 from prbayes.inference.refits import (
     SamplingDistribution,
     refit_obstacle,
@@ -599,6 +600,8 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
         by_simulator[key] = [
             optimum.search.support.get(name, {}).get(key, np.nan) for name in names
         ]
+    failing = failing_share(evaluator, optimum.theta)
+    by_simulator["failing_share"] = [failing.get(name, np.nan) for name in names]
     variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)

@@ -57,7 +57,8 @@ def verdict(m: Material) -> list[Section]:
     elif m.problems:
         title = "Not ready"
         problems = counted(len(m.problems), "problem")
-        text = [f"The calculation has {problems} (see Diagnostics). Solve them before use."]
+        pronoun = "it" if len(m.problems) == 1 else "them"
+        text = [f"The calculation has {problems} (see Diagnostics). Solve {pronoun} before use."]
     elif m.tests:
         title, mark = "Passed", "good"
         text = [f"Measurements of {_tested(m)} agree with the model. Small errors can remain."]
@@ -115,11 +116,13 @@ def _data(m: Material) -> str:
     data = []
     for name, sheet in m.sheets.items():
         data.append(f"a data sheet of {named(name, m.labels)} ({sheet})")
+    labelled = {s["name"]: s["specimens"].partition(":")[0] for s in m.simulators}
     for name, y in m.observed.items():
         measured = counted(y.size, "measured value")
         if y.ndim > 1:
             n, outputs = y.shape
-            measured = f"{counted(n, 'specimen')} with {counted(outputs, 'output')}"
+            specimens = labelled.get(name) or counted(n, "specimen")
+            measured = f"{specimens} with {counted(outputs, 'output')}"
         data.append(f"{measured} of {named(name, m.labels)}")
     return enumerated(data) if data else "measurements"
 

@@ -181,7 +181,8 @@ class Responses:
         self._n_reused = 0
         columns = column_names(argument_names(inputs, function), inputs.sizes)
         self._settings = CallSettings(
-            name, function, executor, database, policy, retry_failed, timeout, outputs, columns
+            *(name, function, executor, database, policy, retry_failed, timeout, outputs, columns),
+            takes_policy=on_failure is not None,
         )
         self._tally = Tally()
 

@@ -411,6 +411,16 @@ def test_arguments_without_a_meaning_are_refused(given: dict[str, Any], message:
         build(**given)
 
 
+def test_readings_may_have_limits_of_their_own() -> None:
+    upper = np.where(np.arange(N) % 2, 4.0, 3.0)
+    low = np.full(N, -9.0)
+    tail = stats.norm.logsf(upper, 1 + 2 * POINT["mu"], 2 * np.exp(POINT["sigma_log__"]))
+    expected = np.where(upper <= Y, tail, exact()).sum()
+    for limits in ((None, upper), (low, upper), (low, list(upper))):
+        model = build(metric=prb.LogLikelihood(censored=limits), observed=np.minimum(Y, upper))
+        assert values(model).sum() == pytest.approx(expected, abs=0.1)
+
+
 def test_censored_readings_alone_are_refused() -> None:
     model = build(metric=prb.LogLikelihood(censored=(None, Y.min())))
     with pytest.raises(DesignError, match="got no reading of the output within the limits"):
