@@ -255,7 +255,7 @@ class Draws:
     def of(cls, thetas: Floats, unit: Floats) -> Draws:
         """Return draws, (k, d), with a covariance in which outliers beyond 3 sd are drawn in."""
         d = unit.size
-        covariance = np.cov(drawn_in(thetas / unit, 3.0), rowvar=False).reshape(d, d)
+        covariance = np.cov(drawn_in(thetas / unit), rowvar=False).reshape(d, d)
         return cls(thetas, unit, covariance)
 
     def with_information(self, information: Floats) -> Floats:

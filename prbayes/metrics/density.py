@@ -487,10 +487,7 @@ def with_common_bandwidths(
     result = list(targets)
     kinds: list[tuple[int, Any]] = []
     for response, target in zip(responses, targets, strict=True):
-        metric = None
-        if _has_bandwidth_rule(target):
-            metric = target.metric
-        kinds.append((response, metric))
+        kinds.append((response, target.metric if _has_bandwidth_rule(target) else None))
     for kind in [kind for k, kind in enumerate(kinds) if kind not in kinds[:k]]:
         members = [k for k, second in enumerate(kinds) if second == kind]
         metric = kind[1]
@@ -499,8 +496,7 @@ def with_common_bandwidths(
         rule = metric.density.bandwidth
         pools = []
         for condition in dict.fromkeys(conditions[k] for k in members):
-            pool = [k for k in members if conditions[k] == condition]
-            pools.append(pool)
+            pools.append([k for k in members if conditions[k] == condition])
         samples = [_pooled([targets[k] for k in pool]) for pool in pools]
         if len(pools) > 1 and bartlett(*(values for values, _ in samples)).pvalue > 0.01:
             deviations = []

@@ -253,10 +253,10 @@ def kernel_width(target: Discrepancy) -> float:
     return float(getattr(target.cells, "bandwidth", 0.0))
 
 
-def with_narrower_kernel(target: Discrepancy, factor: float) -> Discrepancy:
-    """Return a log-likelihood with its kernel narrowed by a factor; others unchanged."""
+def with_narrower_kernel(target: Discrepancy) -> Discrepancy:
+    """Return a log-likelihood with a kernel of half the width; others unchanged."""
     width = kernel_width(target)
     if not width:
         return target
-    metric = LogLikelihood(density=GaussianKDE(factor * width))
+    metric = LogLikelihood(density=GaussianKDE(0.5 * width))
     return metric.against(target.observed, target.weights)

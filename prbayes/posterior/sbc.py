@@ -112,7 +112,7 @@ def simulation_based_calibration(
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
     require_adjustment(adjustment)
-    executes(executor, "executor")
+    executes(executor)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)

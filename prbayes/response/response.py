@@ -84,7 +84,7 @@ def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
     """Raise if a setting of the calls of a response has the wrong type."""
-    executes(executor, "executor")
+    executes(executor)
     if store is not None:
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
