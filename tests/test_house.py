@@ -581,7 +581,6 @@ INNER = {
     "propagation.ops": {
         "pytensor.gradient.grad_not_implemented",
         "pytensor.graph.basic.Apply",
-        "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",
         "pytensor.graph.replace._vectorize_node",
     },

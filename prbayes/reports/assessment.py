@@ -67,7 +67,7 @@ def verdict(m: Material) -> list[Section]:
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
     elif m.description is None:
         return []
-    questions = _risk_tables(m)
+    questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}
     requirements = {label: t for label, t in questions.items() if "requirement" in t.attrs}
     if m.is_usable:
         text += [f"{q}: {_expected(t)}." for q, t in questions.items() if q not in requirements]
@@ -98,10 +98,6 @@ def _expected(table: xr.Dataset) -> str:
     bounds = dict.fromkeys(in_percent(p, floor) for p in np.ravel(table["probability"].values))
     interval = f"{in_percent(float(table.lower), floor)} to {in_percent(float(table.upper), floor)}"
     return f"{' to '.join(bounds)} of the specimens are expected (interval {interval})"
-
-
-def _risk_tables(m: Material) -> dict[str, xr.Dataset]:
-    return {x: table for x, table in m.decisions.items() if kind_of_decision(table) == "risk"}
 
 
 def _tested(m: Material) -> str:

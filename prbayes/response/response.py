@@ -84,7 +84,7 @@ def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
     """Raise if a setting of the calls of a response has the wrong type."""
-    executes(executor, "executor")
+    executes(executor)
     if store is not None:
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
@@ -430,7 +430,7 @@ class Responses:
                     f"response {self._place(selected, changed)}, expected the same: it is random, "
                     "or keeps a state from one specimen to the next; fix its random seed or "
                     "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
-                    "prb.ProbabilityResidual() with prb.Fresh() for random responses"
+                    "prb.AreaMetric() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "
