@@ -126,12 +126,11 @@ def exceedance(
         the populations' probabilities, all in [0, 1]; ``error``, the standard error of
         ``probability`` from the points, the emulator and the draws; ``by_draw``, with dimension
         ``draw``. If no point is beyond the limit, or every point is, ``error`` is one over the
-        effective number of points, and the interval has the bound of that number (three of it at
-        95%). With intervals
-        ``probability``, ``error`` and ``by_draw`` have the dimension ``bound``, "lower" and
-        "upper"; ``lower`` and ``upper`` are the extremes over all points of the intervals, and the
-        attribute ``at`` has the points of the bounds.
-        It prints as sentences; a notebook shows a table. Attributes: ``prob``, ``limit``,
+        effective number of points, and the interval ends at a bound (three over that number at
+        95%). With intervals ``probability``, ``error`` and ``by_draw`` have the dimension
+        ``bound``, "lower" and "upper"; ``lower`` and ``upper`` are the extremes over all points of
+        the intervals, and the attribute ``at`` has the points of the bounds. It prints as
+        sentences; a notebook shows a table. Attributes: ``prob``, ``limit``,
         ``below``, ``response`` (its name), ``responses`` (number computed), ``source``,
         ``findings`` (as JSON), ``identity``, and with a requirement ``requirement`` and
         ``verdict``: "met", "not met" or "not decided".

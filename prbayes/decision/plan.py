@@ -89,7 +89,7 @@ def plan(
     The posterior has the precision :math:`\Lambda` of its draws. One specimen under a condition
     adds the metric's (Godambe) information :math:`a = H J^{-1} H`, with the Hessian H of its
     discrepancy at the centre and the covariance J of its gradient, both by the weights of stored
-    responses; it is at most the Fisher information of the response. After k specimens the expected
+    responses. It is at most the Fisher information of the response. After k specimens the expected
     covariance of the draws is :math:`(\Lambda + k a)^{-1}`.
 
     Parameters

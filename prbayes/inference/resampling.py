@@ -125,7 +125,7 @@ def _aligned_groups(nodes: Sequence[Node]) -> list[list[int]]:
             names = ", ".join([node.name for node in members])
             raise ValueError(
                 f"specimens: got the same labels in {names} with different inputs or designs, "
-                "expected the same .dist() objects, n and seed in all; then the model says how "
+                "expected the same .dist() objects, n and seed in all, which determine how "
                 "responses of one specimen depend on each other"
             )
     return result

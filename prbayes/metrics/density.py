@@ -96,9 +96,9 @@ class GaussianKDE(DensityEstimator):
     """Gaussian kernel density with one bandwidth, fixed by the observed side, for both sides.
 
     The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights,
-    and smoothed there; the kernel is narrowed by the spline's variance, so that the density's
-    variance is exact, its error is of fourth order in the spacing, and it is twice differentiable
-    in the sample, also where the grid ends.
+    and smoothed there. The kernel is narrowed by the spline's variance. The density thus has the
+    exact variance and an error of fourth order in the spacing. It is twice differentiable in the
+    sample, also where the grid ends.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ class GaussianKDE(DensityEstimator):
 
     Raises
     ------
-    ValueError
-        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so
-        many bandwidths that the grid would be unreasonably long.
+    TypeError, ValueError
+        If ``bandwidth`` is not as described; when prepared against observed values that are all
+        equal, or that span thousands of bandwidths.
 
     References
     ----------

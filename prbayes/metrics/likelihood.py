@@ -60,10 +60,9 @@ class LogLikelihood(Metric):
 
     Raises
     ------
-    TypeError
-        When called, or prepared against observed values, without a density.
-    ValueError
-        If a number is out of its range, or measurement arguments are given beside ``density``.
+    TypeError, ValueError
+        If an argument is not as described, or measurement arguments are given beside ``density``;
+        TypeError when called, or prepared against observed values, without a density.
 
     References
     ----------

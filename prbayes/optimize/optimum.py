@@ -298,7 +298,8 @@ class Optimum:
             If the optimum is at the edge of a support or at a jump, if the prior was part of the
             objective, or if the model has changed since.
         TypeError
-            If a metric does not declare its behaviour at the minimum, or a discrepancy is random.
+            If a discrepancy is random, or a metric without stored responses does not declare its
+            behaviour at the minimum.
         """
         require_sampling(self, "sampling")
         obstacle = sampling_obstacle(self.evaluator)

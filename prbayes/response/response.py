@@ -430,7 +430,7 @@ class Responses:
                     f"response {self._place(selected, changed)}, expected the same: it is random, "
                     "or keeps a state from one specimen to the next; fix its random seed or "
                     "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
-                    "prb.ProbabilityResidual() with prb.Fresh() for random responses"
+                    "prb.AreaMetric() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "

@@ -152,8 +152,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     Findings are about identification, the convergence of an optimiser, and the support of the
     answer by the stored responses of `Reweighted`. For draws they are about R-hat and effective
     sample size (by ArviZ), equal draws, and moves of `sample_smc` in its last stage. Optima on
-    stored responses are refitted: can the data come from the best population (p < .01)? Notes name
-    the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
+    stored responses are refitted: can the data come from the best population (p < .01)? Remarks
+    name the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
     Responses are computed for the test under `Resimulated`, if they take less than half a minute.
 
     With the log-likelihood by specimen, the family of the population of the inputs is tested. For

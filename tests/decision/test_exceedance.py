@@ -201,6 +201,7 @@ def test_a_requirement_takes_points_near_the_limit_where_the_error_matters() -> 
     assert stored.upper > 1e-3
     (finding,) = from_json(stored.attrs["findings"])
     assert finding.code == "rough-probability"
+    assert all("n_points=" in text for text in (finding.text, prb.help(finding.code)))
     decided = ask(12.0, requirement=1e-3)
     assert (decided.attrs["verdict"], decided.attrs["source"]) == ("met", "importance points")
     assert exact(12.0)[1][1] < float(decided.upper) < 1e-6

@@ -236,6 +236,8 @@ def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
         StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"
     ):
         Store(folder, "x")
+    with pytest.raises(StoreError, match="'x', expected a file with responses; look at name"):
+        Store(folder / "empty", "x")
     assert all_right(Store(folder, "y", columns=3))
     changed(folder, "PRAGMA user_version = 3")
     refused(folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote")
