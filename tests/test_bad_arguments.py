@@ -389,7 +389,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "Joint": Row(metric=JOINED),
     "MarginalCorrelation": Row(
         metric=JOINED,
-        weights=([1.0, 1.0], (1.0,), (1.0, 0.0), (1.0, -2.0), (np.nan, 1.0)),
+        weights=([1.0, 1.0], (1.0, "a"), (1.0, 0.0), (1.0,), (1.0, -2.0), (np.nan, 1.0)),
     ),
     "GaussianKDE": Row(bandwidth=POSITIVE),
     "Histogram": Row(bins=([3.0, 2.0, 1.0],)),
@@ -486,7 +486,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         call=with_inputs(prb.exceedance, "result", "response", "limit"),
         input=NO_INPUT,
         n_draws=(1,),
-        n_points=(*ZERO_OR_MORE, 5, None),
+        n_points=(*ZERO_OR_MORE, 5),
         requirement=(0, 2.0),
         steps=(1,),
         own="n_points",

@@ -212,7 +212,7 @@ def is_stored(evaluator: Evaluator) -> bool:
 
 
 def descent_of(
-    sampling: SamplingDistribution, objective: BatchObjective, *, is_rough: bool = False
+    sampling: SamplingDistribution, objective: BatchObjective, *, is_rough: bool
 ) -> Descent:
     """Return the minimisation of data sets whose objectives have about the same curvature."""
     r = sampling.stderr.size

@@ -241,7 +241,7 @@ def simulated_points(
     evaluator: Evaluator,
     populations: list[tuple[Floats, Floats]],
     n_sets: int,
-    seed: int = 0,
+    seed: int,
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
@@ -404,7 +404,7 @@ def one_set(
 
 
 def dirichlet_weights(
-    simulators: Sequence[PopulationSimulator], n_sets: int, seed: int = 0
+    simulators: Sequence[PopulationSimulator], n_sets: int, seed: int
 ) -> list[Floats]:
     """Return Dirichlet weights of the observed specimens, times their own, (n_sets, N) each.
 

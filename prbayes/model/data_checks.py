@@ -337,7 +337,7 @@ def identical_specimens(y: Floats) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(measured[group == index].tolist()) for index in np.flatnonzero(counts > 1))
 
 
-def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0) -> float:
+def chance_of_repeats(y: Floats, steps: Floats, draws: int, seed: int = 0) -> float:
     """Return the p-value of the number of repeats among specimens rounded in all outputs.
 
     Values of the null data sets move by -1, 0 or 1 step: the local density stays, copies part. Only
@@ -589,7 +589,7 @@ def misfit_findings(
     error: Floats,
     largest: float = 50.0,
     *,
-    gross_errors: bool = False,
+    gross_errors: bool,
 ) -> list[Finding]:
     """Report specimens whose readings no inputs reproduce.
 

@@ -519,9 +519,7 @@ def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
 
 
 def deduplicated_responses(
-    responses: Responses,
-    points: Sequence[Floats],
-    known: tuple[Sequence[Floats], Floats] | None = None,
+    responses: Responses, points: Sequence[Floats], known: tuple[Sequence[Floats], Floats] | None
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 

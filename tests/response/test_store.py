@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import prbayes
 from prbayes.response.store import (
     INSERT_RUN,
     Store,
@@ -30,7 +29,6 @@ from prbayes.response.store import (
 
 KEYS = np.random.default_rng(1).normal(size=(300, 3))
 VALUES = KEYS @ [1.0, 10.0, 100.0]
-PACKAGE = str(Path(prbayes.__file__).parent)
 
 
 @pytest.fixture
