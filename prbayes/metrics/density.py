@@ -110,7 +110,7 @@ class GaussianKDE(DensityEstimator):
     ------
     TypeError, ValueError
         If ``bandwidth`` is not as described; when prepared against observed values that are all
-        equal, or that span thousands of bandwidths.
+        equal, or that span more than 1024 bandwidths.
 
     References
     ----------
@@ -197,7 +197,7 @@ class Histogram(DensityEstimator):
     Raises
     ------
     TypeError, ValueError
-        If ``bins`` is not as described.
+        If ``bins`` is not as described; when prepared against observed values that are all equal.
 
     References
     ----------

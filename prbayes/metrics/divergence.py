@@ -134,8 +134,9 @@ class KullbackLeibler(Metric):
 
     Raises
     ------
-    TypeError
-        If ``density`` is no density estimator, or ``reverse`` is not True or False.
+    TypeError, ValueError
+        If an argument is not as described; when prepared against observed values that are all
+        equal (no bandwidth).
 
     References
     ----------

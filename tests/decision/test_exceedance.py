@@ -1,6 +1,7 @@
 """Probabilities of exceedance beside closed forms: common, rare, and with intervals."""
 
 import logging
+import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -179,6 +180,29 @@ def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) 
     assert "pass n_points=1000" in caplog.text
     with pytest.raises(prb.propagation.DesignError, match="lost mass"):
         ask(2.0, lambda x: np.where(x < 1, np.nan, x), n_points=200)
+
+
+@pytest.mark.parametrize("points", [0, 4000])
+def test_specimens_without_response_are_left_out_and_reported(points: int) -> None:
+    at = float((MU - 1.8 * SIGMA).mean())
+    lost = float(ndtr((at - MU) / SIGMA).mean())  # .038
+
+    def weakest_lost(x: Any) -> Any:
+        return np.where(x < at, np.nan, x)
+
+    tables = [
+        ask(float(MU.mean()), weakest_lost, n_points=points, below=below, random_seed=seed)
+        for seed in range(3)
+        for below in (False, True)
+    ]
+    total = sum(float(table.probability) for table in tables) / 3
+    # Five standard errors of three sums by importance points; the errors of stored ones cancel.
+    assert total == pytest.approx(1.0, abs=0.028 if points else 1e-9)
+    for table in tables:
+        (finding,) = from_json(table.attrs["findings"])
+        assert finding.code == "specimens-left-out"
+        percent = float(re.findall(r"([\d.]+)% of specimens have no", finding.text)[0])
+        assert percent == pytest.approx(100 * lost, rel=0.5)
 
 
 def test_probabilities_stay_between_zero_and_one() -> None:
