@@ -417,7 +417,7 @@ def test_the_table_of_the_readme_is_what_its_example_prints(tmp_path: Path) -> N
     environment = {**os.environ, "MPLBACKEND": "Agg"}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     printed = re.findall(r" (?:mu|sigma) +(\d\.\d{3})  (\d\.\d{3}) ", done.stdout)
-    rows = re.findall(r"^\| [\w-]+ (\|(?: \d\.\d{3} ± \d\.\d{3} \|){4})$", README, re.MULTILINE)
+    rows = re.findall(r"^\| [\w -]+ (\|(?: \d\.\d{3} ± \d\.\d{3} \|){4})$", README, re.MULTILINE)
     told = [tuple(cell.split(" ± ")) for row in rows for cell in row.strip("| ").split(" | ")]
     assert len(told) == 16
     assert told == printed
