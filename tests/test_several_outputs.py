@@ -170,7 +170,12 @@ def test_an_output_that_is_nan_costs_the_point_all_of_them():
 @pytest.mark.parametrize(
     ("response", "data", "expected"),
     [
-        (lambda a, b: a + b, None, r"shape \(64,\) .* expected \(64, 2\): 2 outputs per specimen"),
+        (
+            lambda a, b: a + b,
+            None,
+            r"shape \(64,\) .* expected \(64, 2\): 2 outputs per specimen; return outputs along a",
+        ),
+        (lambda a, b: a + b, observed()[:, :1], r"1 output per specimen; .* as observed\[:, 0\]"),
         (as_mapping, None, "keys .*sum.* outputs have no names"),
         (
             as_mapping,

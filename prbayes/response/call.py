@@ -282,6 +282,10 @@ def checked(
             )
             if len(event) == 1 and not expected:  # values of one specimen, observed as specimens
                 remedy += f"; {NO_POPULATION}"
+            if not event and expected:
+                remedy = "return outputs along a last axis, or as a mapping"
+                if expected == (1,):
+                    remedy += "; or pass observed= of shape (N,), as observed[:, 0]"
         if event and event in {np.shape(a)[len(batch) :] for a in arguments}:
             remedy = (
                 "it is as long as an input, which has several elements; reduce over them, or where "
@@ -289,7 +293,7 @@ def checked(
                 "prb.response.group"
             )
         inputs = f" for inputs of shapes {shapes(arguments)}" if arguments else ""
-        count = f"{expected[0]} outputs" if expected else "one response"
+        count = counted(expected[0], "output") if expected else "one response"
         raise ResponseError(
             f"the response returned shape {array.shape}{inputs}, expected {batch + expected}: "
             f"{count} per specimen; {remedy}"

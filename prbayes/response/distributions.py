@@ -363,10 +363,16 @@ class PopulationSampler:
 
     def refusal(self, error: Exception) -> TypeError:
         """Return the error of inputs that cannot be drawn."""
+        remedy = "give a pm.CustomDist its random="
+        if isinstance(error, ValueError):  # of a parameter out of its range
+            remedy = (
+                "keep parameters in their range, such as a standard deviation by pm.HalfNormal, or "
+                + remedy
+            )
         return TypeError(
             f"inputs: got {self._names}, one of which cannot be drawn "
             f"({str(error).splitlines()[0]}), expected distributions from which specimens can be "
-            "drawn; give a pm.CustomDist its random="
+            f"drawn; {remedy}"
         )
 
     def __call__(

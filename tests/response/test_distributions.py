@@ -235,6 +235,9 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     sampler = PopulationSampler(inputs)
     with pytest.raises(TypeError, match=r"inputs: got .* flat.* cannot be drawn \(.*expected"):
         sampler([np.zeros(1), np.ones(1)], 3, np.random.default_rng(0))
+    sampler = PopulationSampler(inputs_of(lambda mu, sigma: [pm.Normal.dist(mu, sigma)])[0])
+    with pytest.raises(TypeError, match=r"\(scale < 0\).*in their range, such as .*HalfNormal"):
+        sampler([np.zeros(1), -np.ones(1)], 3, np.random.default_rng(0))
 
 
 def test_populations_are_drawn_at_their_own_roots() -> None:
