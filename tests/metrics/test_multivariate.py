@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytensor
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm, qmc
@@ -30,7 +29,6 @@ from prbayes.metrics.multivariate import (
 )
 
 INF, NAN = np.inf, np.nan
-PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 
 
 def by_basis(d: Discrepancy, weights: Floats, basis: Any) -> Floats:

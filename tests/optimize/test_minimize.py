@@ -566,15 +566,6 @@ def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
     assert abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5
 
 
-def test_no_simulator_and_no_model() -> None:
-    with pm.Model() as model:
-        pm.Normal("mu")
-    with pytest.raises(ValueError, match=r"expected at least one; add prb\.Simulator"):
-        prb.minimize(model)
-    with pytest.raises(TypeError, match="no model on the context"):
-        prb.minimize()
-
-
 # -- determinism and storage -----------------------------------------------------------------------
 
 

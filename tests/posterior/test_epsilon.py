@@ -214,8 +214,6 @@ def test_problems_without_refits_are_refused() -> None:
         model = build(metric, propagation=propagation)
         with pytest.raises(TypeError, match=words):
             epsilon_of(model, method="Nelder-Mead", max_evaluations=5, refine=False)
-    with pytest.raises(TypeError, match="Optimum"):
-        prb.calibrate_epsilon({"mu": 1.0})  # type: ignore[arg-type]
 
 
 # -- several simulators

@@ -82,20 +82,6 @@ def test_priors_that_are_never_valid_are_refused() -> None:
         first_use(model)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_arguments_that_all_propagations_check(kind: Any) -> None:
-    for name, value, words in (
-        ("executor", 3, "executor: got int"),
-        ("store", 3, "store: got int"),
-        ("on_failure", "abort", "on_failure: got str 'abort'"),
-    ):
-        with pytest.raises(TypeError, match=words):
-            kind(64, **{name: value})
-    for keywords in ({"n": 0}, {"random_seed": -1}, {"max_lost": 1.0}):
-        with pytest.raises(ValueError, match=f"{kind.__name__}: {next(iter(keywords))}: got"):
-            kind(**keywords)
-
-
 def test_missing_shares_of_weighted_values() -> None:
     values, weights = np.full((1, 10), 1.0), np.full((1, 10), 0.1)
     values[0, :2], values[0, 2:6] = np.nan, np.inf

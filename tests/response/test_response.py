@@ -307,7 +307,7 @@ def random_response() -> Any:
         (lambda: running(max), "a state from one specimen to the next"),
         (lambda: running(min), "a state from one specimen to the next"),
         (beside_the_first, "has changed since then"),
-        (random_response, "it is random, .*prb.Fresh"),
+        (random_response, r"it is random, .*prb\.AreaMetric\(\) with prb\.Fresh"),
     ],
     ids=["warm start", "sum", "maximum", "minimum", "first", "random"],
 )
