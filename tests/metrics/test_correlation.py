@@ -86,8 +86,3 @@ def test_declarations() -> None:
     assert [is_differentiable(m.against(y)) for m in (quadratic, absolute)] == [True, False]
     assert not is_additive(quadratic.against(y))
     assert quadratic.like(AreaMetric()) == absolute
-
-
-def test_equal_values_of_an_output_are_refused() -> None:
-    with pytest.raises(ValueError, match="equal values of output 1"):
-        MarginalCorrelation(AreaMetric()).against(sample(20, 0) * [1, 0, 1])

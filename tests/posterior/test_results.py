@@ -323,9 +323,6 @@ def test_selected_variables_dimensions_and_groups() -> None:
         assert tree[group].coords["plate"].size == 40
     with pytest.raises(ValueError, match=r"got \[\], expected 1 names"):
         results.selected(tree, None, {"dims": {"second": []}})
-    x = pm.Normal.dist(model()["mean"][0], 1.0)
-    with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
-        prb.predict(tree, np.positive, x, model=model())
 
 
 def test_chains_begin_at_their_start(tmp_path: Path) -> None:

@@ -74,14 +74,6 @@ def test_the_error_of_random_draws_is_that_of_repetitions() -> None:
     assert np.isnan(discrepancy_error(bound(prb.Fresh(15)), at([1.0], [0.5])))  # too few points
 
 
-def test_priors_that_are_never_valid_are_refused() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(0.0, pm.Normal("sigma", -50.0, 0.1))
-        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=OBSERVED)
-    with pytest.raises(ValueError, match=r"invalid parameters of the inputs at all .* of sigma"):
-        first_use(model)
-
-
 def test_missing_shares_of_weighted_values() -> None:
     values, weights = np.full((1, 10), 1.0), np.full((1, 10), 0.1)
     values[0, :2], values[0, 2:6] = np.nan, np.inf
