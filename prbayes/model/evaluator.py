@@ -213,8 +213,10 @@ class Evaluator:
                     pt.as_tensor(node.bound.discrepancy(params))
                     for node, params in zip(self.nodes, _simulator_params(self), strict=True)
                 ]
-                pairs = zip(self.nodes, model.replace_rvs_by_values(graphs), strict=True)
-                graphs = [with_shared_arrays(g) if n.bound.stored else g for n, g in pairs]
+                graphs = model.replace_rvs_by_values(graphs)
+                for k, node in enumerate(self.nodes):
+                    if node.bound.stored:
+                        graphs[k] = with_shared_arrays(graphs[k])
                 scales = pt.dvector("scales")
                 scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
                 total = scaled - _log_other(model, _ordinary(model))

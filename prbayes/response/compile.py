@@ -195,11 +195,14 @@ def _is_stateless(op: Op) -> bool:
 
 def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
     """Replace constant arrays by shared variables: graphs for other data have one structure."""
-    arrays: dict[Any, Any] = {
-        v: pytensor.shared(v.data, shape=[n if n == 1 else None for n in v.data.shape], borrow=True)
-        for v in ancestors([graph])
-        if isinstance(v, TensorConstant) and v.type.dtype == "float64" and v.ndim and v.data.size
-    }
+    arrays: dict[Any, Any] = {}
+    for variable in ancestors([graph]):
+        if not isinstance(variable, TensorConstant):
+            continue
+        values = variable.data
+        if values.dtype == np.float64 and values.ndim and values.size:
+            shape = [n if n == 1 else None for n in values.shape]
+            arrays[variable] = pytensor.shared(values, shape=shape, borrow=True)
     (result,) = clone_replace([graph], arrays, rebuild_strict=False)
     return result
 
