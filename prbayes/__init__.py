@@ -1,4 +1,4 @@
-"""Statistical model calibration in PyMC: optimiser and ABC on one model, with one metric."""
+"""Statistical model calibration in PyMC: populations of inputs from measured responses."""
 
 from importlib import import_module
 from importlib.metadata import version

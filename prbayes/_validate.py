@@ -349,7 +349,7 @@ def file_path(value: object, name: str) -> Path:
     return path
 
 
-def executes(value: object, name: str) -> None:
+def executes(value: object) -> None:
     """Raise if ``value`` is neither None nor an executor of futures of the standard library."""
     if value is None or isinstance(value, Executor):
         return
@@ -357,5 +357,5 @@ def executes(value: object, name: str) -> None:
     is_dask = hasattr(value, "get_executor") and not isinstance(value, type)
     advice = "its get_executor(pure=False)" if is_dask else "ProcessPoolExecutor(4)"
     raise TypeError(
-        f"{name}: got {called(value)}, expected a concurrent.futures.Executor, such as {advice}"
+        f"executor: got {called(value)}, expected a concurrent.futures.Executor, such as {advice}"
     )

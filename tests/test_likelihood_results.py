@@ -379,7 +379,6 @@ def test_what_has_no_meaning_is_refused(optimum: prb.Optimum) -> None:
         (lambda: prb.refine(fresh.model), "leave the call out"),
         (lambda: prb.set_epsilon(fresh.model, {"y": 0.1}), "has no epsilon"),
         (lambda: prb.set_epsilon(fresh.model, 0.1), "has no epsilon"),
-        (lambda: prb.sample_smc(10, model=fresh.model, epsilon=0.1), "epsilon: got 0.1"),
         (lambda: prb.calibrate_epsilon(optimum), "has no epsilon"),
     ]
     for call, message in calls:

@@ -68,3 +68,13 @@ def test_help_of_a_class_shows_the_arguments_of_users() -> None:
         for name, parameter in parameters.items():
             assert not name.startswith("_"), cls
             assert "<factory>" not in str(parameter), cls
+
+
+def test_help_has_the_error_of_an_unknown_name() -> None:
+    for module in (prb, prb.decision, prb.plots):
+        for value in (getattr(module, name) for name in module.__all__):
+            if inspect.isfunction(value) and {"result", "var_names"} & {
+                *inspect.signature(value).parameters
+            }:
+                raised = str(value.__doc__).partition("Raises\n")[2]
+                assert "KeyError" in raised.partition("Examples\n")[0], value

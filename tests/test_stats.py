@@ -22,8 +22,6 @@ from prbayes._stats import (
 from prbayes._validate import Floats
 
 INF, NAN = np.inf, np.nan
-VALUES = np.array([3.0, 1.0, 2.0, 1.0])
-WEIGHTS = np.array([0.1, 0.2, 0.3, 0.4])
 
 
 def sample(seed: int, *batch: int, n: int = 30) -> tuple[Floats, Floats]:
@@ -32,12 +30,6 @@ def sample(seed: int, *batch: int, n: int = 30) -> tuple[Floats, Floats]:
     weights = rng.dirichlet(np.ones(n), batch)
     weights[..., ::7] = 0
     return np.round(rng.normal(size=n), 1), weights
-
-
-def test_a_value_counts_from_itself_on() -> None:
-    at = np.array([0.9, 1.0, 1.5, 2.0, 2.999, 3.0, 9.0])
-    expected = [0.0, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0]
-    np.testing.assert_allclose(distribution_function(VALUES, WEIGHTS, at), expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["stable", "quicksort"])
@@ -74,16 +66,6 @@ def test_a_value_of_weight_zero_changes_nothing() -> None:
     at = np.linspace(-2, 2, 9)
     found = distribution_function(np.append(x, at), np.append(w, np.zeros(9)), at)
     np.testing.assert_array_equal(found, distribution_function(x, w, at))
-
-
-def test_the_order_of_the_values_does_not_matter() -> None:
-    x, w = sample(4)
-    order = np.random.default_rng(5).permutation(x.size)
-    at = np.linspace(-2, 2, 9)
-    found = distribution_function(x[order], w[order], at)
-    np.testing.assert_allclose(found, distribution_function(x, w, at), rtol=1e-13, atol=1e-15)
-    levels = [0.1, 0.5, 0.9]
-    np.testing.assert_allclose(quantile(x[order], w[order], levels), quantile(x, w, levels))
 
 
 def test_both_steps_work_on_symbols_too() -> None:

@@ -225,7 +225,7 @@ class _DaskClient(_Lookalike):
 )
 def test_what_is_no_executor_is_refused(value: Any, advice: str) -> None:
     with pytest.raises(TypeError, match=f"executor: .*a concurrent.futures.Executor, .* {advice}"):
-        executes(value, "executor")
+        executes(value)
 
 
 def test_an_argument_is_told_on_one_line() -> None:

@@ -44,7 +44,7 @@ from prbayes.decision.quantities import (
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.model.random_variable import response_name
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings
@@ -126,12 +126,11 @@ def exceedance(
         the populations' probabilities, all in [0, 1]; ``error``, the standard error of
         ``probability`` from the points, the emulator and the draws; ``by_draw``, with dimension
         ``draw``. If no point is beyond the limit, or every point is, ``error`` is one over the
-        effective number of points, and the interval has the bound of that number (three of it at
-        95%). With intervals
-        ``probability``, ``error`` and ``by_draw`` have the dimension ``bound``, "lower" and
-        "upper"; ``lower`` and ``upper`` are the extremes over all points of the intervals, and the
-        attribute ``at`` has the points of the bounds.
-        It prints as sentences; a notebook shows a table. Attributes: ``prob``, ``limit``,
+        effective number of points, and the interval ends at a bound (three over that number at
+        95%). With intervals ``probability``, ``error`` and ``by_draw`` have the dimension
+        ``bound``, "lower" and "upper"; ``lower`` and ``upper`` are the extremes over all points of
+        the intervals, and the attribute ``at`` has the points of the bounds. It prints as
+        sentences; a notebook shows a table. Attributes: ``prob``, ``limit``,
         ``below``, ``response`` (its name), ``responses`` (number computed), ``source``,
         ``findings`` (as JSON), ``identity``, and with a requirement ``requirement`` and
         ``verdict``: "met", "not met" or "not decided".
@@ -153,6 +152,8 @@ def exceedance(
     inside an interval are searched with 4 to 32 specimens at 32 further values, and from the best
     of all by halved steps; one that is much narrower is not found. The result of the calibration is
     the same at all values: vary a constant that the calibration also used there.
+
+    Probabilities are those of specimens that have a response: NaN are left out, and reported.
 
     References
     ----------
@@ -234,7 +235,12 @@ def exceedance(
             "responses": n_searched + sum(estimate.responses for estimate in estimates),
             "source": estimates[bounds[1]].source,
             "random_seed": str(seed),
-            "findings": as_json(report(*_rough_finding(response, estimates, is_rough))),
+            "findings": as_json(
+                report(
+                    *_rough_finding(response, estimates, is_rough),
+                    *_left_out_finding(response, max(estimate.lost for estimate in estimates)),
+                )
+            ),
             **populations.provenance(),
         },
     )
@@ -295,6 +301,7 @@ class _Estimate:
     source: str
     runs: int = 0  # stored responses behind it
     points: int = 0  # near the limit
+    lost: float = 0.0  # share of the populations without response
 
     @property
     def mean(self) -> float:
@@ -369,7 +376,8 @@ def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estima
     error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
     kind = "stored" if sample.emulator is None else "emulated"
     source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
-    return _Estimate(by_draw, float(error), sample.responses.count, source, sample.n_runs)
+    count, n_runs = sample.responses.count, sample.n_runs
+    return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
 
 def _rare_probability(
@@ -403,9 +411,14 @@ def _rare_probability(
             f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
             "return +inf for specimens that fail"
         )
-    error = np.hypot(event.error, _error_of_draws(populations, event.by_draw))
-    source = "importance points"
-    return _Estimate(event.by_draw, float(error), responses.count, source, points=points)
+    # Of the specimens that have a response, as from stored responses
+    by_draw = np.minimum(event.by_draw / (1 - event.lost), 1.0)
+    error = np.hypot(event.error / (1 - event.lost), _error_of_draws(populations, by_draw))
+    return _Estimate(
+        *(by_draw, float(error), responses.count, "importance points"),
+        points=points,
+        lost=event.lost,
+    )
 
 
 def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
@@ -430,6 +443,17 @@ def _rough_finding(
         f"of {worst.error:.2g}; pass {more} responses where the limit is exceeded."
     )
     return [Finding("rough-probability", text)]
+
+
+def _left_out_finding(response: Any, lost: float) -> list[Finding]:
+    """Return a finding if a share of the populations has no response."""
+    if lost < SMALLEST_SHARE:
+        return []
+    text = (
+        f"{response_name(response)}: {lost:.1%} of specimens {NO_RESPONSE}: the probability is "
+        "that of the others. A response that returns +inf counts as a specimen that failed."
+    )
+    return [Finding("specimens-left-out", text, "distributed.md#when-a-response-fails")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -541,12 +565,13 @@ def rare_event(
         is_above = final.values >= np.median(values)
         above, above_error = weighted_share(mean_weights[None], is_above)
         error = min(error, float(above[0] + 2 * above_error) / 3)
-    log_weights = search.log_weights()
+    points = _concatenated([search, final])
+    log_weights = points.log_weights()
     shares = np.exp(log_weights - log_weights.max())
     return RareEvent(
         by_draw=weighted_share(weights, is_beyond)[0],
         error=error,
-        lost=float(shares[np.isnan(search.values)].sum() / shares.sum()),
+        lost=float(shares[np.isnan(points.values)].sum() / shares.sum()),
     )
 
 

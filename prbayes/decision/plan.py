@@ -89,7 +89,7 @@ def plan(
     The posterior has the precision :math:`\Lambda` of its draws. One specimen under a condition
     adds the metric's (Godambe) information :math:`a = H J^{-1} H`, with the Hessian H of its
     discrepancy at the centre and the covariance J of its gradient, both by the weights of stored
-    responses; it is at most the Fisher information of the response. After k specimens the expected
+    responses. It is at most the Fisher information of the response. After k specimens the expected
     covariance of the draws is :math:`(\Lambda + k a)^{-1}`.
 
     Parameters
@@ -255,7 +255,7 @@ class Draws:
     def of(cls, thetas: Floats, unit: Floats) -> Draws:
         """Return draws, (k, d), with a covariance in which outliers beyond 3 sd are drawn in."""
         d = unit.size
-        covariance = np.cov(drawn_in(thetas / unit, 3.0), rowvar=False).reshape(d, d)
+        covariance = np.cov(drawn_in(thetas / unit), rowvar=False).reshape(d, d)
         return cls(thetas, unit, covariance)
 
     def with_information(self, information: Floats) -> Floats:

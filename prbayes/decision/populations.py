@@ -277,6 +277,13 @@ class ResponseSample:
         """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
         return np.concatenate([quantity.of(self.values, w) for w in self.weight_batches(thetas)])
 
+    @cached_property
+    def lost(self) -> float:
+        """The share of a population that has no response, the median over populations."""
+        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
+        _, weights = self.design.populations(parents)
+        return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
+
     def refuse_unsupported(self) -> None:
         """Raise if the design does not support the populations, or too many responses are NaN."""
         parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
@@ -284,12 +291,10 @@ class ResponseSample:
             refuse_unsupported(self.responses.name, self.design, parents)
         else:
             self.design.refuse_unsupported(self.responses.name, parents)
-        _, weights = self.design.populations(parents)
-        lost = float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
-        if lost > self.design.max_lost:
+        if self.lost > self.design.max_lost:
             raise DesignError(
-                f"{self.responses.name}: lost mass: got {lost:.1%} of a population's weight on "
-                f"points whose response is NaN, expected at most {self.design.max_lost:.1%}; "
+                f"{self.responses.name}: lost mass: got {self.lost:.1%} of a population's weight "
+                f"on points whose response is NaN, expected at most {self.design.max_lost:.1%}; "
                 "repair it, or return +inf for specimens that fail"
             )
 

@@ -52,12 +52,12 @@ def sensitivity(
     r"""Return Sobol' indices of a decision quantity, by hyperparameter and by input.
 
     The quantity Q is uncertain because the hyperparameters are. For each hyperparameter the table
-    has the share of Q's variance that knowing it would remove on average (first order),
-    :math:`S_i = Var(E[Q | \theta_i]) / Var(Q)`, the share that remains when all others are known
-    (total order), :math:`T_i = E[Var(Q | \theta_{-i})] / Var(Q)`, and an upper bound of the total
-    from derivatives. Evaluating Q costs weights and no response. For each aleatory input the table
-    has the same shares of the response's variance in the population at the centre of the result;
-    for an `Exceedance` or a `Quantile`, shares of the variance of the indicator that a specimen is
+    has the share of Q's variance that knowing it would remove on average (first order), :math:`S_i
+    = Var(E[Q | \theta_i]) / Var(Q)`, the share that remains when all others are known (total
+    order), :math:`T_i = E[Var(Q | \theta_{-i})] / Var(Q)`, and an upper bound of the total from
+    derivatives. Evaluating Q costs weights and no response. For each aleatory input the table has
+    the same shares of the response's variance in the population at the centre of the result. For an
+    `Exceedance` or a `Quantile` they are shares of the variance of the indicator that a specimen is
     beyond.
 
     Hyperparameters depend on each other in the posterior. Their shares then need not sum to one,
@@ -116,10 +116,10 @@ def sensitivity(
 
     Notes
     -----
-    The posterior is approximated by a normal copula with its margins: draws of an element given
-    the others are exact if it is normal in unconstrained parameters. The derivative-based index of
-    an element is :math:`s_i^2 E[(dQ/dz_i)^2] / Var(Q)`, where z is the normal vector of the copula
-    and s_i the standard deviation of z_i given all others; by Poincaré's inequality for that
+    The posterior is approximated by a normal copula with its margins: draws of an element given the
+    others are exact if it is normal in unconstrained parameters. The derivative-based index of an
+    element is :math:`s_i^2 E[(dQ/dz_i)^2] / Var(Q)`, where z is the normal vector of the copula and
+    s_i the standard deviation of z_i given all others. By Poincaré's inequality for that
     conditional distribution it is at least the total. An input that is a vector is one factor.
 
     References

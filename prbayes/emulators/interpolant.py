@@ -119,7 +119,7 @@ class Interpolant:
         The two arrays are reused and stay in the cache of the processor.
         """
         n = len(self.z)
-        step = min(max(1, IN_CACHE // 2 // n), len(z))
+        step = max(1, min(IN_CACHE // 2 // n, len(z)))
         arrays = np.empty((2, n * step))
         runs = self.z - self.center
         # |a - b|^2 = |a|^2 + |b|^2 - 2 a'b; the digits that small ones lose do not matter in |r|^5.

@@ -261,6 +261,7 @@ class Surrogate(Shown):
             The design: even in all ranges, or with each random input distributed as its prior
             predictive distribution inside its range.
         prob : float
+            The central probability that ranges of distributions cover.
         name : str
             For messages, and of the store.
         executor, store, version, on_failure, retry_failed

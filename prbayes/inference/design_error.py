@@ -50,7 +50,7 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
 
 
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
-    """Return the error of the optimum by emulators, (r,); NaN without emulators.
+    """Return the error of the optimum by emulators, (r,).
 
     From minima of emulators that lack a block of the runs, less the minimum of the whole by the
     same descent, which may differ from the optimum for other reasons.
@@ -60,16 +60,13 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
         node.reweighted.design.without_each_block() if node.reweighted else []
         for node in evaluator.nodes
     ]
-    number = max(map(len, left_out))
-    if not number:
-        return np.full(sampling.stderr.size, np.nan)
     observed = observed_set(evaluator)
     whole = BatchObjective.of(evaluator, scales, observed)
     descent = descent_of(sampling, whole, is_rough=True)
     minimum = _minimum(sampling, whole, descent)
     minimum = np.where(np.isfinite(minimum), minimum, 0.0)
     shifts = []
-    for b in range(number):
+    for b in range(max(map(len, left_out))):
         stored = [values[b] if values else None for values in left_out]
         objective = BatchObjective.of(evaluator, scales, observed, stored=stored)
         shifts.append(_minimum(sampling, objective, descent) - minimum)

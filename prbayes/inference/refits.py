@@ -212,7 +212,7 @@ def is_stored(evaluator: Evaluator) -> bool:
 
 
 def descent_of(
-    sampling: SamplingDistribution, objective: BatchObjective, *, is_rough: bool = False
+    sampling: SamplingDistribution, objective: BatchObjective, *, is_rough: bool
 ) -> Descent:
     """Return the minimisation of data sets whose objectives have about the same curvature."""
     r = sampling.stderr.size
@@ -381,7 +381,7 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     d = points.shape[1]
     if d == 0:
         return np.empty((0, 0)), np.empty(0)
-    covariance = np.cov(drawn_in(points, 3.0), rowvar=False).reshape(d, d)
+    covariance = np.cov(drawn_in(points), rowvar=False).reshape(d, d)
     axes = oriented(np.linalg.eigh(covariance)[1])
     low, _, high = np.quantile(points @ axes, _QUANTILES, axis=0)
     sd = (high - low) / 3.2
@@ -390,14 +390,14 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     return axes, np.maximum(sd, 1e-4 * largest if largest > 0 else 1.0)
 
 
-def drawn_in(points: Floats, most: float) -> Floats:
-    """Return points, (n, d), at most so many robust standard deviations from the median.
+def drawn_in(points: Floats) -> Floats:
+    """Return points, (n, d), at most three robust standard deviations from the median.
 
     A few in a thousand far out, as where a bounded parameter comes near its bound, would otherwise
     decide about all others.
     """
     low, middle, high = np.quantile(points, _QUANTILES, axis=0)
-    far = most * (high - low) / 3.2
+    far = 3.0 * (high - low) / 3.2
     return np.clip(points, middle - far, middle + far)
 
 

@@ -125,7 +125,7 @@ def _aligned_groups(nodes: Sequence[Node]) -> list[list[int]]:
             names = ", ".join([node.name for node in members])
             raise ValueError(
                 f"specimens: got the same labels in {names} with different inputs or designs, "
-                "expected the same .dist() objects, n and seed in all; then the model says how "
+                "expected the same .dist() objects, n and seed in all, which determine how "
                 "responses of one specimen depend on each other"
             )
     return result
@@ -241,7 +241,7 @@ def simulated_points(
     evaluator: Evaluator,
     populations: list[tuple[Floats, Floats]],
     n_sets: int,
-    seed: int = 0,
+    seed: int,
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
@@ -404,7 +404,7 @@ def one_set(
 
 
 def dirichlet_weights(
-    simulators: Sequence[PopulationSimulator], n_sets: int, seed: int = 0
+    simulators: Sequence[PopulationSimulator], n_sets: int, seed: int
 ) -> list[Floats]:
     """Return Dirichlet weights of the observed specimens, times their own, (n_sets, N) each.
 

@@ -42,9 +42,9 @@ class AreaMetric(Metric):
     .. math:: g_N(p) = \int_0^p P(K < N q) - P(K > N q)\,dq, \quad K \sim \mathrm{Bin}(N, q).
 
     It is a strictly proper scoring rule, positive unless the functions are equal: for one specimen
-    the continuous ranked probability score [2]_, for many the area. Relative weights count as their
-    effective number, by which most of the bias goes. A simulator alone, a direct call and the area
-    test have the area itself.
+    the continuous ranked probability score [2]_, for many the area. With relative weights N is
+    their effective number, which removes most of the bias. A simulator alone, a direct call and
+    the area test have the area itself.
 
     References
     ----------

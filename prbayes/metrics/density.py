@@ -96,9 +96,9 @@ class GaussianKDE(DensityEstimator):
     """Gaussian kernel density with one bandwidth, fixed by the observed side, for both sides.
 
     The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights,
-    and smoothed there; the kernel is narrowed by the spline's variance, so that the density's
-    variance is exact, its error is of fourth order in the spacing, and it is twice differentiable
-    in the sample, also where the grid ends.
+    and smoothed there. The kernel is narrowed by the spline's variance. The density thus has the
+    exact variance and an error of fourth order in the spacing. It is twice differentiable in the
+    sample, also where the grid ends.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ class GaussianKDE(DensityEstimator):
 
     Raises
     ------
-    ValueError
-        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so
-        many bandwidths that the grid would be unreasonably long.
+    TypeError, ValueError
+        If ``bandwidth`` is not as described; when prepared against observed values that are all
+        equal, or that span more than 1024 bandwidths.
 
     References
     ----------
@@ -197,7 +197,7 @@ class Histogram(DensityEstimator):
     Raises
     ------
     TypeError, ValueError
-        If ``bins`` is not as described.
+        If ``bins`` is not as described; when prepared against observed values that are all equal.
 
     References
     ----------
@@ -487,10 +487,7 @@ def with_common_bandwidths(
     result = list(targets)
     kinds: list[tuple[int, Any]] = []
     for response, target in zip(responses, targets, strict=True):
-        metric = None
-        if _has_bandwidth_rule(target):
-            metric = target.metric
-        kinds.append((response, metric))
+        kinds.append((response, target.metric if _has_bandwidth_rule(target) else None))
     for kind in [kind for k, kind in enumerate(kinds) if kind not in kinds[:k]]:
         members = [k for k, second in enumerate(kinds) if second == kind]
         metric = kind[1]
@@ -499,8 +496,7 @@ def with_common_bandwidths(
         rule = metric.density.bandwidth
         pools = []
         for condition in dict.fromkeys(conditions[k] for k in members):
-            pool = [k for k in members if conditions[k] == condition]
-            pools.append(pool)
+            pools.append([k for k in members if conditions[k] == condition])
         samples = [_pooled([targets[k] for k in pool]) for pool in pools]
         if len(pools) > 1 and bartlett(*(values for values, _ in samples)).pvalue > 0.01:
             deviations = []

@@ -23,23 +23,25 @@ class ProbabilityResidual(Metric):
     r"""Probability residual: the scaled squared difference of two densities.
 
     With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both
-    sides; it equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth
-    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth. This does not hold for mass
-    beyond the grid, which counts as one tight cluster on either side. With a `Histogram` the sum
-    form, :math:`S \sum (p_i - q_i)^2` over densities in bins. The scale factor is :math:`S =
+    sides. It equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth
+    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth, except for mass beyond the
+    grid, which counts as one tight cluster on either side. With a `Histogram` the sum form,
+    :math:`S \sum (p_i - q_i)^2` over densities in bins. The scale factor is :math:`S =
     C^{-\lfloor \log_{10} \max q \rfloor}`.
 
     Parameters
     ----------
     density : GaussianKDE or Histogram
+        Estimates both densities.
     scale_base : float
         The constant C. It has no influence on the minimiser, only on an optimiser's absolute
         tolerances.
 
     Raises
     ------
-    ValueError
-        When prepared against observed values that are all equal (no bandwidth).
+    TypeError, ValueError
+        If an argument is not as described; when prepared against observed values that are all
+        equal (no bandwidth).
 
     References
     ----------
@@ -119,20 +121,22 @@ class KullbackLeibler(Metric):
     one depends on it, because the observed density vanishes quickly outside the data.
 
     Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points
-    with p the simulated density, is ill-posed as an objective: its terms are not normalised over
-    the points, so that it goes negative, and it is made small by moving the population away from
-    the data altogether. Hence the integral, and the forward direction, which is maximum likelihood
-    of smoothed data.
+    with p the simulated density, is ill-posed as an objective. Its terms are not normalised over
+    the points, so that it is negative and smallest for populations far from the data. Hence the
+    integral, and the forward direction, which is maximum likelihood of smoothed data.
 
     Parameters
     ----------
     density : GaussianKDE or Histogram
+        Estimates both densities.
     reverse : bool
+        Whether the divergence is the reverse one.
 
     Raises
     ------
-    TypeError
-        If ``density`` is no density estimator, or ``reverse`` is not True or False.
+    TypeError, ValueError
+        If an argument is not as described; when prepared against observed values that are all
+        equal (no bandwidth).
 
     References
     ----------

@@ -60,10 +60,9 @@ class LogLikelihood(Metric):
 
     Raises
     ------
-    TypeError
-        When called, or prepared against observed values, without a density.
-    ValueError
-        If a number is out of its range, or measurement arguments are given beside ``density``.
+    TypeError, ValueError
+        If an argument is not as described, or measurement arguments are given beside ``density``;
+        TypeError when called, or prepared against observed values, without a density.
 
     References
     ----------
@@ -106,7 +105,8 @@ class LogLikelihood(Metric):
             )
         limits: Any = self.censored
         if limits is not None:
-            if not isinstance(limits, tuple | list) or len(limits) != 2 or limits == (None, None):
+            is_pair = isinstance(limits, tuple | list) and len(limits) == 2
+            if not is_pair or all(x is None for x in limits):
                 raise ValueError(
                     f"LogLikelihood: censored: got {limits!r}, expected (lower, upper), one of "
                     "which may be None"
@@ -253,10 +253,10 @@ def kernel_width(target: Discrepancy) -> float:
     return float(getattr(target.cells, "bandwidth", 0.0))
 
 
-def with_narrower_kernel(target: Discrepancy, factor: float) -> Discrepancy:
-    """Return a log-likelihood with its kernel narrowed by a factor; others unchanged."""
+def with_narrower_kernel(target: Discrepancy) -> Discrepancy:
+    """Return a log-likelihood with a kernel of half the width; others unchanged."""
     width = kernel_width(target)
     if not width:
         return target
-    metric = LogLikelihood(density=GaussianKDE(factor * width))
+    metric = LogLikelihood(density=GaussianKDE(0.5 * width))
     return metric.against(target.observed, target.weights)

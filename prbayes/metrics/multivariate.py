@@ -268,7 +268,7 @@ class Joint(LiftedMetric):
     the robustness of the metric. Coordinates depend on the observed values alone.
 
     With the energy distance as metric, :math:`2 \int (F - S_N)^2`, the mean over all directions is
-    a multiple of the energy distance of several outputs [1]_; with the area metric it is the sliced
+    a multiple of the energy distance of several outputs [1]_. With the area metric it is the sliced
     Wasserstein distance [2]_.
 
     Parameters
@@ -294,8 +294,8 @@ class Joint(LiftedMetric):
     Notes
     -----
     Outputs of fewer inputs are on a surface, or a curve. Only as many coordinates are compared as
-    it has dimensions, if these leave out less than a hundredth of the outputs' variance, each in
-    units of its spread; whitening would give the bend of the surface the same weight as the rest.
+    it has dimensions, each in units of its spread, if these leave out less than a hundredth of the
+    outputs' variance. Whitening would give the bend of the surface the same weight as the rest.
 
     Few specimens, below 5 m and 3 m (m + 1) / 2, determine ratios of variances badly. These are
     shrunk, in units of the outputs' spreads, so that the metric is invariant under changes of units

@@ -159,8 +159,8 @@ def tabulated_scores(
     target: Discrepancy,
     population: ShiftedResponses,
     specimens: Floats,
-    options: ScoreOptions = ScoreOptions(),
-    total: int = 0,
+    options: ScoreOptions,
+    total: int,
 ) -> Callable[[Floats], Floats]:
     """Return the scores as a function of responses, (..., n) or (..., n, m) -> (..., n, d).
 

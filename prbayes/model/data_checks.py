@@ -21,7 +21,7 @@ from prbayes._finding import Finding, report
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
 from prbayes.emulators.interpolant import fit_interpolant
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.roots import Response, Roots
 
@@ -337,7 +337,7 @@ def identical_specimens(y: Floats) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(measured[group == index].tolist()) for index in np.flatnonzero(counts > 1))
 
 
-def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0) -> float:
+def chance_of_repeats(y: Floats, steps: Floats, draws: int, seed: int = 0) -> float:
     """Return the p-value of the number of repeats among specimens rounded in all outputs.
 
     Values of the null data sets move by -1, 0 or 1 step: the local density stays, copies part. Only
@@ -589,7 +589,7 @@ def misfit_findings(
     error: Floats,
     largest: float = 50.0,
     *,
-    gross_errors: bool = False,
+    gross_errors: bool,
 ) -> list[Finding]:
     """Report specimens whose readings no inputs reproduce.
 
@@ -616,6 +616,34 @@ def misfit_findings(
             "mean square, by output), expected less than the error of the readings; pass "
             "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
             "single specimens, or look at the response and the priors.",
+            "likelihood.md#readings-that-no-inputs-reproduce",
+        )
+    ]
+
+
+def repeat_findings(name: str, repeats: Repeats, largest: float = 50.0) -> list[Finding]:
+    """Report repeated readings that scatter more than the stated error allows.
+
+    ``repeats`` are in units of that error, which costs n (r - 1 - log r) / 2 nats beside the best
+    one, where n squares have the mean r: of an output of a specimen, or of all. By chance this is
+    half a chi-squared number of one degree of freedom.
+    """
+    count = np.concatenate([repeats.count, repeats.count.sum(axis=0, keepdims=True)])
+    within = np.concatenate([repeats.within, repeats.within.sum(axis=0, keepdims=True)])
+    ratio = np.maximum(within / np.maximum(count, 1.0), 1.0)
+    is_poor = count / 2 * (ratio - 1 - np.log(ratio)) > largest
+    if not is_poor.any():
+        return []
+    specimens = int(is_poor[:-1].any(axis=1).sum())
+    which = f"{specimens} of {len(repeats.count)} specimens" if specimens else "the specimens"
+    times = ", ".join(f"{value:.2g}" for value in np.sqrt(ratio[-1][count[-1] > 0]))
+    return [
+        Finding(
+            "readings-misfit",
+            f"{name}: repeated readings of {which} scatter more than their error: by {times} "
+            "times the error (root mean square, by output), expected about once; correct the "
+            "readings, pass prb.LogLikelihood(error=...) with their standard deviation, or an "
+            "unknown one as a variable, or gross_errors=True for single specimens.",
             "likelihood.md#readings-that-no-inputs-reproduce",
         )
     ]

@@ -323,10 +323,7 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, N
 
 
 def parent_values(
-    values: Mapping[str, Floats],
-    inputs: Inputs,
-    group: int | None,
-    covariates: Sequence[Floats] = (),
+    values: Mapping[str, Floats], inputs: Inputs, group: int | None, covariates: Sequence[Floats]
 ) -> list[Floats]:
     """Return the parents of inputs, in the group with this index, shapes (P, *shape).
 

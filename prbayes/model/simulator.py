@@ -109,8 +109,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         of a DataArray or DataFrame are matched to those of ``observed``. NaN, or a masked number,
         is a point without response, +inf a specimen that failed; -inf is refused. The response of a
         specimen depends on the inputs of that specimen alone: three of the first ones are computed
-        again, by themselves, and a difference is refused, and so is a function that takes one
-        number of specimens. Where inputs repeat, as discrete ones do, a design computes the
+        again, by themselves, and a difference is refused. So is a function that takes one number
+        of specimens. Where inputs repeat, as discrete ones do, a design computes the
         response once. Model random scatter of the response as an input, such as ``pm.Normal.dist(0,
         1)``, or use `Fresh`. Simulators with the same response object, inputs and propagation, and
         metrics of distributions, share runs. Variables that the response reads have to stay as they
@@ -150,7 +150,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     dims : str or sequence of str, optional
         Names of the observed dimensions.
     propagation : Propagation, optional
-        How populations become responses; ``Reweighted(1024)`` by default.
+        How populations become responses; with a metric ``Reweighted(1024)`` by default.
     units : mapping, optional
         Units for tables, pictures and the report: of aleatory inputs, by the name of the
         ``.dist()`` or of the response's argument (``"x[0]"`` is an element of a vector), and of
@@ -540,7 +540,7 @@ def _refuse_by_specimen(
     name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation | None
 ) -> None:
     """Raise where the log-likelihood by specimen does not apply, and name the metric that does."""
-    remedy = "use metric=prb.ProbabilityResidual()"
+    remedy = "use metric=prb.AreaMetric()"
     if epsilon is not None:
         raise ValueError(
             f"{name}: epsilon: got {epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
@@ -587,7 +587,7 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
     if np.isinf(rows).any():
         raise ValueError(
             f"{name}: observed: got infinite values, expected finite ones for prb.LogLikelihood(); "
-            "use metric=prb.ProbabilityResidual(), which counts specimens that failed"
+            "use metric=prb.AreaMetric(), which counts specimens that failed"
         )
     return values
 

@@ -26,6 +26,7 @@ from prbayes.model.data_checks import (
     refuse_undetermined,
     refuse_unreachable,
     refuse_unused_inputs,
+    repeat_findings,
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood, output_columns
@@ -291,6 +292,9 @@ def _data_findings(
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
         )
+    repeats, gross_errors = likelihood.stacked.repeats, likelihood.measurements[0].gross_errors
+    if repeats is not None and likelihood.error_is_known and gross_errors is False:
+        findings += repeat_findings(likelihood.name, repeats)
     return tuple(findings)
 
 
@@ -363,6 +367,9 @@ class Populations:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
         sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
         sample = self.likelihood.coordinates.of(sampler(parents, specimens, rng)[0], 2)
+        # Populations far from the prior may have inputs whose squares overflow.
+        is_finite = (np.abs(sample) < 1e100).all(axis=(1, 2))
+        sample[~is_finite] = 0.0
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
         root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
@@ -376,6 +383,7 @@ class Populations:
             result += np.square(standard, out=standard)
         result *= -0.5
         result -= log_det + constant
+        result[~is_finite] = -np.inf
         return result
 
     def posterior(

@@ -103,9 +103,10 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
+    n_known = len(modes) if is_supported.any() else 1  # the others are spurious
     if not is_supported.any():
         findings += report(_UNSUPPORTED)
-    findings += report(*_findings(evaluator, objective, modes, weights))
+    findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
     local_optima = tuple(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
         | {"weight": float(weight)}

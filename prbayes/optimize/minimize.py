@@ -121,6 +121,9 @@ def refine(
 
     Raises
     ------
+    TypeError, ValueError
+        If there is no model, its simulators have no design or no optimum, or an argument is not as
+        described.
     DesignError
         If a design does not support them after eight more batches, or at ``max_points``.
     BudgetError
@@ -267,8 +270,7 @@ def minimize(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0,
-    ...     4.0])
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
     >>> optimum = prb.minimize(model)
     >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
     True

@@ -14,6 +14,7 @@ from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
+from prbayes.inference.checks.population import failing_share
 from prbayes.inference.refits import (
     SamplingDistribution,
     refit_obstacle,
@@ -297,7 +298,8 @@ class Optimum:
             If the optimum is at the edge of a support or at a jump, if the prior was part of the
             objective, or if the model has changed since.
         TypeError
-            If a metric does not declare its behaviour at the minimum, or a discrepancy is random.
+            If a discrepancy is random, or a metric without stored responses does not declare its
+            behaviour at the minimum.
         """
         require_sampling(self, "sampling")
         obstacle = sampling_obstacle(self.evaluator)
@@ -440,12 +442,6 @@ def n_computed(evaluator: Evaluator) -> int:
     return sum(r.computed for r in responses)
 
 
-def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
-    """Return variables and deterministics at theta in the user's units."""
-    values = evaluator.hyperparameters.constrained(theta[None])
-    return {name: _number(value[0]) for name, value in values.items()}
-
-
 def point_text(evaluator: Evaluator, theta: Floats) -> str:
     """Return the free variables at theta in words, without constants."""
     hyperparameters = evaluator.hyperparameters
@@ -461,7 +457,8 @@ def local_optimum(
     evaluator: Evaluator, theta: Floats, value: float, *, comparable: bool
 ) -> dict[str, Any]:
     """Return the record of a local optimum in `Optimum.local_optima`."""
-    point = point_at(evaluator, theta)
+    values = evaluator.hyperparameters.constrained(theta[None])
+    point = {name: _number(value[0]) for name, value in values.items()}
     return {"point": point, "discrepancy": value, "theta": theta, "comparable": comparable}
 
 
@@ -604,6 +601,8 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
         by_simulator[key] = [
             optimum.search.support.get(name, {}).get(key, np.nan) for name in names
         ]
+    failing = failing_share(evaluator, optimum.theta)
+    by_simulator["failing_share"] = [failing.get(name, np.nan) for name in names]
     variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)

@@ -66,8 +66,8 @@ def plot_comparison(
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no comparison, or has no scores.
+    TypeError, KeyError, ValueError
+        If it is no comparison, has no scores, or an argument is not as described.
 
     Examples
     --------

@@ -76,8 +76,8 @@ def plot_optimizer(
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no optimum, or one without a trace.
+    TypeError, KeyError, ValueError
+        If it is no optimum, has no trace, or an argument is not as described.
 
     Examples
     --------
@@ -166,8 +166,8 @@ def plot_stages(
 
     Raises
     ------
-    TypeError, ValueError
-        If there is no group with statistics by stage.
+    TypeError, KeyError, ValueError
+        If there is no group with statistics by stage, or an argument is not as described.
 
     Examples
     --------

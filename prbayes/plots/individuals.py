@@ -69,7 +69,7 @@ def plot_individuals(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described.
 
     Examples

@@ -66,6 +66,7 @@ def plot_population(
         Labels by dimension: of groups, such as ``{"supplier": ["Adler"]}``; ``{"x_dim_0": [0]}``
         is the first element of a multivariate input.
     prob : float
+        Share of the populations in the band.
     n_draws : int, optional
         Number of populations in the band; 200 by default.
     labels : mapping, optional

@@ -101,6 +101,7 @@ def plot_responses(
         Draw distribution functions, which need no bandwidth, instead of densities; without effect
         on lines.
     prob : float
+        Share of the populations in the band.
     n_draws : int, optional
         Number of populations in the band; by default 200 where they cost no response
         (`Reweighted`), otherwise 40, each of which costs n responses per simulator.

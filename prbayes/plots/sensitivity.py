@@ -58,8 +58,8 @@ def plot_sensitivity(
 
     Raises
     ------
-    TypeError
-        If it is no table of `sensitivity`.
+    TypeError, KeyError
+        If it is no table of `sensitivity`, or an argument is not as described.
 
     Examples
     --------

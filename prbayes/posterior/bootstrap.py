@@ -46,7 +46,9 @@ def bootstrap(
     optimum : Optimum
         From `minimize`, without the prior.
     draws : int
+        Number of data sets.
     parametric : bool
+        Whether data sets are drawn from the model at the optimum.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
@@ -63,9 +65,9 @@ def bootstrap(
     TypeError
         If ``optimum`` is no Optimum.
     ValueError
-        If the data do not identify a direction; if a metric or propagation does not allow refits
-        (`FunctionMetric`, `Fresh`); if the prior was part of the optimum, or its model has changed
-        since.
+        If the data do not identify a direction; if a metric or propagation does not allow it
+        (`Fresh`, or a `FunctionMetric`, except ``parametric`` with `Reweighted`); if the prior was
+        part of the optimum, or its model has changed since.
 
     References
     ----------

@@ -12,6 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, called, flag
+from prbayes.inference.checks.population import failing_share
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import (
     arviz_attributes,
@@ -168,8 +169,10 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
     preparations = [prepared(likelihood_of(evaluator, m)) for m in measurements]
     n_runs = [len(preparation.emulation.z) for preparation in preparations]
+    failing = failing_share(evaluator, thetas.reshape(-1, d).mean(axis=0))
     by_simulator = {
         "epsilon": np.ones(len(names)),
+        "failing_share": [failing.get(name, np.nan) for name in names],
         "max_lost": np.full(len(names), MAX_LOST),
         "metric": [without_addresses(m.metric) for m in measurements],
         "compared": [""] * len(names),

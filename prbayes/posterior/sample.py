@@ -58,10 +58,10 @@ def sample(
     """Draw from the posterior of any model, by the fastest sampler that is exact for it.
 
     The first sampler is importance sampling from Laplace approximations of the modes, then from
-    mixtures fitted to the weighted points [1]_. It is replaced if Pareto k is above .7, or the
-    effective sample size below half of the draws. NUTS then starts at the optimum. Sequential Monte
-    Carlo serves models with a metric, several modes, or a likelihood that jumps at the optimum,
-    and replaces chains of NUTS whose R-hat is above 1.1.
+    mixtures fitted to the weighted points [1]_. If Pareto k is above .7, or the effective sample
+    size below half of the draws, NUTS starts at the mode. Sequential Monte Carlo takes its place if
+    the model has a metric, several modes, or a likelihood that jumps at the optimum, or if R-hat of
+    the chains is above 1.1.
 
     With a metric, the posterior is prior times density of the metric's own estimate. The density is
     a saddlepoint approximation [2]_. It is that of the score if the gradient is a mean over
@@ -76,7 +76,8 @@ def sample(
     model : pymc.Model, optional
         The one on the context by default.
     optimum : Optimum, optional
-        Where to begin; by default the best of 1024 points of the prior.
+        Where to begin, by default the best of 1024 points of the prior. With a metric it is the
+        estimate, by default from `minimize`.
     idata_kwargs, var_names
         As in `sample_smc`.
     max_seconds : float, optional
@@ -86,6 +87,7 @@ def sample(
         Largest number of responses to compute, the first runs included.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -97,7 +99,7 @@ def sample(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described.
     DesignError
         If the points of the specimens cannot be computed.

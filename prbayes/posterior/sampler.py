@@ -101,7 +101,7 @@ class Sampler(_BASE):  # type: ignore[misc]
             As in `prb.sample`.
         chains : int, optional
             Four by default.
-        cores, blas_cores : int, optional
+        cores, blas_cores : int or "auto", optional
             Largest number of threads of linear algebra, ``blas_cores`` if it is a number: chains
             are drawn in this process.
         progressbar, quiet : bool

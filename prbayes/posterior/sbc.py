@@ -75,11 +75,11 @@ def simulation_based_calibration(
     -------
     xarray.DataTree
         Group ``prior_sbc`` with dimensions (chain, draw), chain of length one and a draw per data
-        set: ranks scaled to the unit interval, for `arviz.plot_ecdf_pit`, which adds the envelope
-        or a test of uniformity. Group ``envelope``: the ECDF of the ranks of each variable, and
-        ArviZ's simultaneous 95% envelope for uniform ones; the attribute ``outside`` names the
-        variables that leave it. Groups ``truth`` and ``posterior_sd`` alike. Data sets that could
-        not be analysed are left out and counted in the attribute ``failed``.
+        set: ranks scaled to the unit interval, for `arviz.plot_ecdf_pit`. Group ``envelope``: the
+        ECDF of the ranks of each variable, and ArviZ's simultaneous 95% envelope for uniform ones;
+        the attribute ``outside`` names the variables that leave it. Groups ``truth`` and
+        ``posterior_sd`` alike. Data sets that could not be analysed are left out and counted in the
+        attribute ``failed``.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def simulation_based_calibration(
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
     require_adjustment(adjustment)
-    executes(executor, "executor")
+    executes(executor)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)

@@ -143,6 +143,7 @@ def sample_smc(
         responses of the search for the optimum.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -163,7 +164,7 @@ def sample_smc(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described, no prior draw has a finite density, or the optimum is
         needed and at an edge or a jump (``search.at_edge``, ``search.at_jump``).
     DesignError

@@ -500,7 +500,7 @@ def _moved_inside(
     at_median = SamplingDistribution.of(evaluator, points[-1], scales, options.weak)
     if at_median.stderr.size <= weak.stderr.size:
         return None
-    for point in points:
+    for point in points[:-1]:
         inside = SamplingDistribution.of(evaluator, point, scales, options.weak)
         if inside.stderr.size >= at_median.stderr.size:
             return inside

@@ -85,9 +85,7 @@ def responding_weights(values: Floats, weights: Floats) -> Floats:
     return np.divide(responding, total, out=responding, where=total > 0)
 
 
-def refuse_lost_share(
-    name: str, share: float, limit: float, remedy: str = "repair the response"
-) -> None:
+def refuse_lost_share(name: str, share: float, limit: float, remedy: str) -> None:
     """Raise DesignError if a larger share of the population than the limit has no response."""
     if share > limit:
         raise DesignError(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.gradient import grad_not_implemented
-from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
@@ -61,12 +61,8 @@ class OwnOp(Op):
         return Apply(self, tensors, [result])
 
 
-def _on_batches(op: Any, node: Apply[Any, Any], *batched: Variable) -> Any:
-    """Operations that take leading axes themselves: a batch is one call."""
-    return op.make_node(*batched)
-
-
-_vectorize_node.register(OwnOp, _on_batches)
+# Operations that take leading axes themselves: a batch is one call.
+_vectorize_node.register(OwnOp, lambda op, _, *batched: op.make_node(*batched))
 
 
 class ResponseOp(OwnOp):

@@ -212,8 +212,8 @@ class Fresh(Propagation):
     n : int
         Number of draws for each theta.
     random_seed : int
-        Seed of the draws. They depend as well on the number of evaluations, on the seed of
-        `sample_smc`, and on the hyperparameters: chains in processes of their own draw different
+        Seed of the draws. They also depend on the number of evaluations, on the seed of
+        `sample_smc`, and on the hyperparameters. Chains in other processes draw different
         specimens, and the same ones when they are run again.
     max_lost : float
         Largest share of a population whose response is NaN, at the answer.

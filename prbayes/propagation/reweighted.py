@@ -78,11 +78,11 @@ class Reweighted(Propagation):
         Largest number of responses, refinement included; 32 n by default.
     emulator : str, Surface or regressor, optional
         Predicts the response between the runs: a few dozen or hundred runs are then enough for
-        several inputs. ``"auto"`` takes the best of a few surfaces for each output, by their errors
-        at runs that were left out, mixed with the weighted runs as far as these errors require;
-        not with one input, discrete ones, or an n above 2000, where runs alone are as good. Or a
-        surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and ``predict(X)``. With
-        None the runs are used alone.
+        several inputs. ``"auto"`` takes the better of two Gaussian processes for each output, by
+        errors at runs that were left out, and mixes it with the weighted runs as far as these
+        errors require. With one input, discrete ones, or an n above 2000 it uses the runs alone, as
+        None does. Or a surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and
+        ``predict(X)``.
     coarse : callable, optional
         A cheap response of the same inputs and outputs that approximates the expensive one, such as
         that of a coarser mesh. The emulator then models the difference of the two, for each output
@@ -95,14 +95,13 @@ class Reweighted(Propagation):
         process by default.
     store : path-like, optional
         A folder with every computed response, by simulator: none is computed again, also in
-        another run. A few are recomputed at the first use of each simulator, the smallest, the
-        middle and the largest response, and one that is NaN or infinite: a changed response, by
-        its code or by variables that it reads, is refused.
+        another run. At the first use of each simulator the smallest, the middle and the largest
+        response are recomputed, and one that is NaN or infinite. A changed response, by its code or
+        by variables that it reads, is refused.
     version : str, optional
-        Name of the response as it is, such as ``"2"`` or ``"mesh 3"``: the store separates runs of
-        different versions, and of other names or another order of several outputs, and recomputes
-        none, nor for `predict` or `exceedance`. You are then responsible for a new name whenever
-        the response changes; for a response that is minutes long.
+        Name of the response as it is, such as ``"2"`` or ``"mesh 3"``. The store separates runs of
+        different versions, and of other names or another order of several outputs. It recomputes
+        none, nor for `predict` or `exceedance`: give a new name whenever the response changes.
     on_failure : Abort, Replace or Retry
         Policy for a response that raises, and by option for one that is NaN: by default NaN is a
         specimen without response.

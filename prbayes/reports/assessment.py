@@ -57,7 +57,8 @@ def verdict(m: Material) -> list[Section]:
     elif m.problems:
         title = "Not ready"
         problems = counted(len(m.problems), "problem")
-        text = [f"The calculation has {problems} (see Diagnostics). Solve them before use."]
+        pronoun = "it" if len(m.problems) == 1 else "them"
+        text = [f"The calculation has {problems} (see Diagnostics). Solve {pronoun} before use."]
     elif m.tests:
         title, mark = "Passed", "good"
         text = [f"Measurements of {_tested(m)} agree with the model. Small errors can remain."]
@@ -66,7 +67,7 @@ def verdict(m: Material) -> list[Section]:
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
     elif m.description is None:
         return []
-    questions = _risk_tables(m)
+    questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}
     requirements = {label: t for label, t in questions.items() if "requirement" in t.attrs}
     if m.is_usable:
         text += [f"{q}: {_expected(t)}." for q, t in questions.items() if q not in requirements]
@@ -99,10 +100,6 @@ def _expected(table: xr.Dataset) -> str:
     return f"{' to '.join(bounds)} of the specimens are expected (interval {interval})"
 
 
-def _risk_tables(m: Material) -> dict[str, xr.Dataset]:
-    return {x: table for x, table in m.decisions.items() if kind_of_decision(table) == "risk"}
-
-
 def _tested(m: Material) -> str:
     """Return the number of tested specimens, with their conditions where these have names."""
     labels = {label for test in m.tests.values() for label in test.specimens.tolist()}
@@ -119,11 +116,13 @@ def _data(m: Material) -> str:
     data = []
     for name, sheet in m.sheets.items():
         data.append(f"a data sheet of {named(name, m.labels)} ({sheet})")
+    labelled = {s["name"]: s["specimens"].partition(":")[0] for s in m.simulators}
     for name, y in m.observed.items():
         measured = counted(y.size, "measured value")
         if y.ndim > 1:
             n, outputs = y.shape
-            measured = f"{counted(n, 'specimen')} with {counted(outputs, 'output')}"
+            specimens = labelled.get(name) or counted(n, "specimen")
+            measured = f"{specimens} with {counted(outputs, 'output')}"
         data.append(f"{measured} of {named(name, m.labels)}")
     return enumerated(data) if data else "measurements"
 

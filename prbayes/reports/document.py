@@ -53,6 +53,7 @@ class Report:
     Parameters
     ----------
     title : str
+        Heading of the report.
     sections : tuple of Section
         By default those of the results; with sections, results are not read.
     author : str
@@ -91,7 +92,7 @@ class Report:
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described, or results are of other populations or data than the
         model or each other.
 

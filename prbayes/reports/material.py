@@ -297,7 +297,7 @@ def _require_kinds(
             "prb.compare"
         )
     expected = (
-        "expected by condition what was measured and what prb.predict says of it, such as "
+        "expected by condition the measured responses and their prediction, such as "
         '{"80 000 cycles": (lengths, prb.predict(...))}'
     )
     if not isinstance(validation, Mapping):

@@ -120,7 +120,7 @@ def _labelled_inputs(text: str, labels: Mapping[str, str]) -> str:
         comma, name, unit = found.groups(default="")
         return comma + labels.get(name, name + unit)
 
-    return re.sub(r"(^|, )(\w+)( \([^)]*\))?(?= [=~] )", labelled_name, text)
+    return re.sub(r"(^|, )(\w+)( \(.*?\))?(?= [=~] )", labelled_name, text)
 
 
 def _runs(propagation: str) -> str:

@@ -393,6 +393,7 @@ class CallSettings:
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
     columns: tuple[str, ...] = ()  # names of the numbers of a point
+    takes_policy: bool = True  # whether the caller of the public function can pass on_failure
 
 
 @dataclass
@@ -663,14 +664,14 @@ def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str
     store_text = ""
     if settings.store is not None:
         store_text = f"; {len(settings.store)} responses are kept in {settings.store.folder}"
-    policies = "on_failure=prb.response.Replace() or prb.response.Retry()"
-    advice = (
-        "repair it, keep priors and inputs where it has a response, or pass "
-        f"{policies} to the propagation or surrogate"
-    )
+    remedy = "pass on_failure=prb.response.Replace() or prb.response.Retry()"
+    receiver = " to the propagation or surrogate"
+    if not settings.takes_policy:
+        remedy, receiver = "return NaN (no response) or inf (the specimen failed) there", ""
+    advice = f"repair it, keep priors and inputs where it has a response, or {remedy}{receiver}"
     advice += array_advice(reason)
     if is_wrong_result(reason):
-        advice = f"repair it; if this is what a run that failed returns, pass {policies}"
+        advice = f"repair it; if this is what a run that failed returns, {remedy}"
     return ResponseError(
         f"{settings.name}: the response failed at {counted(len(raised), 'point')}{place}: {reason}"
         f"{store_text}; {advice}"

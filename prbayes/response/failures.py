@@ -105,6 +105,7 @@ class Retry(OnFailure):
     Parameters
     ----------
     times : int
+        Number of further tries.
     then : OnFailure
         `Abort` or `Replace`.
 

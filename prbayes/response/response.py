@@ -84,7 +84,7 @@ def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
     """Raise if a setting of the calls of a response has the wrong type."""
-    executes(executor, "executor")
+    executes(executor)
     if store is not None:
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
@@ -181,7 +181,8 @@ class Responses:
         self._n_reused = 0
         columns = column_names(argument_names(inputs, function), inputs.sizes)
         self._settings = CallSettings(
-            name, function, executor, database, policy, retry_failed, timeout, outputs, columns
+            *(name, function, executor, database, policy, retry_failed, timeout, outputs, columns),
+            takes_policy=on_failure is not None,
         )
         self._tally = Tally()
 
@@ -429,7 +430,7 @@ class Responses:
                     f"response {self._place(selected, changed)}, expected the same: it is random, "
                     "or keeps a state from one specimen to the next; fix its random seed or "
                     "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
-                    "prb.ProbabilityResidual() with prb.Fresh() for random responses"
+                    "prb.AreaMetric() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "
@@ -518,9 +519,7 @@ def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
 
 
 def deduplicated_responses(
-    responses: Responses,
-    points: Sequence[Floats],
-    known: tuple[Sequence[Floats], Floats] | None = None,
+    responses: Responses, points: Sequence[Floats], known: tuple[Sequence[Floats], Floats] | None
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 

@@ -292,7 +292,9 @@ class Store:
         if name not in responses:
             raise _FileError(
                 f"which has no responses of simulator {_name_text(*name)}",
-                f"one of [{', '.join(_name_text(*response) for response in responses)}]",
+                f"one of [{', '.join(_name_text(*response) for response in responses)}]"
+                if responses
+                else "a file with responses",
                 "look at name, version and folder",
             )
         _, columns = responses[name]

@@ -152,8 +152,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     Findings are about identification, the convergence of an optimiser, and the support of the
     answer by the stored responses of `Reweighted`. For draws they are about R-hat and effective
     sample size (by ArviZ), equal draws, and moves of `sample_smc` in its last stage. Optima on
-    stored responses are refitted: can the data come from the best population (p < .01)? Notes name
-    the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
+    stored responses are refitted: can the data come from the best population (p < .01)? Remarks
+    name the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
     Responses are computed for the test under `Resimulated`, if they take less than half a minute.
 
     With the log-likelihood by specimen, the family of the population of the inputs is tested. For
@@ -255,7 +255,10 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
-    failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
+    # Of the log-likelihood by specimen
+    failing = _stored_shares(calibration, "failing_share")
+    failed = _stored_shares(calibration, "failed_mass")
+    failures, harmless = _failure_findings(tree, lost | failing, failed | failing)
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
     compared += [] if optimum is None else rough_emulators(optimum.evaluator)
     later = (*checked.findings, *failures, *_lost_mass(optimum, lost), *_unsupported(coverage))
@@ -351,7 +354,10 @@ def _seconds_of_test(optimum: Optimum) -> float:
 
 
 def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
-    """Return the share without response, or that fails, at the optimum or over the draws."""
+    """Return the share without response, or that fails, at the optimum or over the draws.
+
+    Only where it is known.
+    """
     if key not in calibration:
         return {}
     shares = calibration[key].transpose("simulator", ...).values
@@ -360,7 +366,8 @@ def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
     if f"{key}_at_best" in calibration:
         means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
     names = calibration["simulator"].values.tolist()
-    return dict(zip(names, means.tolist(), strict=True))
+    pairs = zip(names, means.tolist(), strict=True)
+    return {name: share for name, share in pairs if not np.isnan(share)}
 
 
 def _failure_findings(

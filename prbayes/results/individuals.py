@@ -65,9 +65,9 @@ def individuals(
 
     Raises
     ------
-    TypeError, ValueError
-        If the model has no simulator with the log-likelihood by specimen, or the result is of
-        another model.
+    TypeError, KeyError, ValueError
+        If an argument is not as described, the model has no simulator with the log-likelihood by
+        specimen, or the result is of another model.
 
     References
     ----------

@@ -163,8 +163,8 @@ def area_test(
     observed : array_like, shape (n,) or (n, m); or a mapping or list of such, by condition
         Measured on specimens that were not used in the calibration, except with `JointNull`. +inf
         is a specimen that had failed. Several outputs of a specimen, (n, m), are projected on
-        directions of the whitened predicted ones; the statistic is the mean over these of the areas
-        of u and ``|2u - 1|``, since a wrong correlation is a wrong spread in some of them.
+        directions of the whitened predicted ones. The statistic is the mean over these of the areas
+        of u and ``|2u - 1|``: a wrong correlation is a wrong spread in some directions.
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
         NaN are left out.
@@ -175,7 +175,7 @@ def area_test(
         `ExactModel`. `JointNull` for the calibration's own specimens.
     specimens : as ``observed``, optional
         Labels. Values with the same label, also of several conditions, are of one specimen, and
-        replicates of the null are equally dependent: sample i of a draw must be the same specimen
+        replicates of the null are equally dependent. Sample i of a draw must be the same specimen
         in all conditions, as in results of `predict` with the same seed. Without labels all values
         are of different specimens.
     folded : bool
@@ -285,7 +285,7 @@ def _require_same_samples(case: Case) -> None:
     got = f"shapes {shapes}" if len(set(shapes)) > 1 else "different specimens"
     raise ValueError(
         f"specimens: got the same labels in several conditions, predicted with {got}, expected the "
-        "same specimens in all; pass the same inputs, n_samples, draws and random_seed to "
+        "same specimens in all; pass the same inputs, n_samples, n_draws and random_seed to "
         "prb.predict, and stored=False if designs differ"
     )
 

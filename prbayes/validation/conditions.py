@@ -184,8 +184,8 @@ def read_case(
     if len(set(draws)) > 1:
         raise ValueError(
             f"predicted: got {draws} draws for the conditions {[c.name for c in conditions]}, "
-            "expected the same draws of one posterior in all; pass the same result and draws= to "
-            "prb.predict"
+            "expected the same draws of one posterior in all; pass the same result and n_draws= "
+            "to prb.predict"
         )
     identities = {f"{c.name}: predicted": from_attributes(c.attributes) for c in conditions}
     # Projections of one condition have the same specimens.

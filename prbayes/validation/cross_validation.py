@@ -75,8 +75,8 @@ def cross_validate(
     ------
     TypeError, ValueError
         If an argument is not as described, there are fewer specimens than two per fold, or a metric
-        or propagation does not allow refits (`FunctionMetric`, `Fresh`); if the prior was part of
-        the optimum, or its model has changed since.
+        or propagation does not allow refits (`Fresh`, or a `FunctionMetric` without `Reweighted`);
+        if the prior was part of the optimum, or its model has changed since.
 
     References
     ----------
@@ -292,9 +292,9 @@ def rank(
     """Compare how well several models of the same data predict new specimens.
 
     Models may differ in the family of an input, in its parameters, in the response or in the
-    metric. Each is cross-validated by `cross_validate` with the same folds; every specimen has a
-    score under the population that was calibrated without it, and candidates are compared specimen
-    by specimen.
+    metric. Each is cross-validated by `cross_validate` with the same folds. Every specimen has a
+    score under the population that was calibrated without it; candidates are compared specimen by
+    specimen.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def rank(
     penalty of a candidate with more hyperparameters is its loss on held-out specimens.
 
     The standard error ignores that folds share their calibrations, and rare specimens that happen
-    to be absent: of normal and lognormal candidates it is right to a quarter in most cases, and up
+    to be absent. For normal and lognormal candidates it is right to a quarter in most cases, and up
     to 1.7 times too small where the truth has a long tail (``benchmarks/families.py``).
 
     References

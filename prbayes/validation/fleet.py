@@ -119,7 +119,7 @@ def calibrate_each(
     model = model_on_context(model, caller)
     positive_integer(draws, "draws", minimum=10)
     share(alpha, "alpha")
-    executes(executor, "executor")
+    executes(executor)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)

@@ -112,6 +112,7 @@ class PosteriorNull(Null):
     Parameters
     ----------
     replicates : int
+        Number of data sets.
     random_seed : int
 
     Raises
@@ -232,8 +233,8 @@ class ExactModel(Null):
 
     The distribution of the area is exact for n = 1 to 20, interpolated in 1/sqrt(n) from exact ones
     up to 1000, and that of 1000, scaled, beyond. The table is made by ``benchmarks/area_null.py``.
-    If the model was fitted to data of its own, this test rejects a right model too often: with 15
-    data and 20 fresh ones in 21% of cases at nominal 5%.
+    If the model was fitted to data, this test rejects a right model too often: with 15 of them and
+    20 fresh ones in 21% of cases at nominal 5%.
 
     Examples
     --------
@@ -301,10 +302,10 @@ class JointNull(Null):
 
     The model is recalibrated in each replicate.
 
-    For tests on the calibration's own specimens, under the same conditions or others: a model that
-    was fitted to them follows them more closely than fresh ones. Each replicate draws specimens
-    from the population at the optimum, minimises the discrepancy for their calibration data, and
-    tests their responses against that population. The predicted population is that of
+    For tests on the specimens of the calibration, under the same conditions or others. A model
+    follows specimens that it was fitted to more closely than fresh ones. Each replicate draws
+    specimens from the population at the optimum, minimises the discrepancy for their calibration
+    data, and tests their responses against that population. The predicted population is that of
     `predict` with the optimum. Minimisations are those of the parametric `bootstrap`: with
     `Reweighted` they compute no response.
 
@@ -317,6 +318,7 @@ class JointNull(Null):
         as passed to `predict`. Conditions without one are the model's simulators, by name; a single
         condition is the only simulator.
     replicates : int
+        Number of data sets.
     executor : concurrent.futures.Executor, optional
         Where the response is computed.
     store : path-like, optional
@@ -330,8 +332,8 @@ class JointNull(Null):
     TypeError
         If ``optimum`` is no Optimum, or a response cannot be called.
     ValueError
-        If a metric or propagation does not allow refits (`FunctionMetric`, `Fresh`); if the prior
-        was part of the optimum, or its model has changed since.
+        If a metric or propagation does not allow refits (`Fresh`, or a `FunctionMetric` without
+        `Reweighted`); if the prior was part of the optimum, or its model has changed since.
 
     Examples
     --------

@@ -1,6 +1,7 @@
 """Probabilities of exceedance beside closed forms: common, rare, and with intervals."""
 
 import logging
+import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -77,8 +78,6 @@ def test_a_requirement_is_met_or_not_or_not_decided() -> None:
     ):
         attributes = ask(2.0, requirement=requirement, n_points=0).attrs
         assert (attributes["requirement"], attributes["verdict"]) == (requirement, verdict)
-    with pytest.raises(ValueError, match="requirement"):
-        ask(2.0, requirement=1.5)
 
 
 @pytest.mark.parametrize("points", [0, 500])
@@ -183,6 +182,29 @@ def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) 
         ask(2.0, lambda x: np.where(x < 1, np.nan, x), n_points=200)
 
 
+@pytest.mark.parametrize("points", [0, 4000])
+def test_specimens_without_response_are_left_out_and_reported(points: int) -> None:
+    at = float((MU - 1.8 * SIGMA).mean())
+    lost = float(ndtr((at - MU) / SIGMA).mean())  # .038
+
+    def weakest_lost(x: Any) -> Any:
+        return np.where(x < at, np.nan, x)
+
+    tables = [
+        ask(float(MU.mean()), weakest_lost, n_points=points, below=below, random_seed=seed)
+        for seed in range(3)
+        for below in (False, True)
+    ]
+    total = sum(float(table.probability) for table in tables) / 3
+    # Five standard errors of three sums by importance points; the errors of stored ones cancel.
+    assert total == pytest.approx(1.0, abs=0.028 if points else 1e-9)
+    for table in tables:
+        (finding,) = from_json(table.attrs["findings"])
+        assert finding.code == "specimens-left-out"
+        percent = float(re.findall(r"([\d.]+)% of specimens have no", finding.text)[0])
+        assert percent == pytest.approx(100 * lost, rel=0.5)
+
+
 def test_probabilities_stay_between_zero_and_one() -> None:
     for limit, probability in ((-50.0, 1.0), (50.0, 0.0)):
         for options in ({}, {"n_points": 200}, {"n_points": 200, "below": True}, {"below": True}):
@@ -203,6 +225,7 @@ def test_a_requirement_takes_points_near_the_limit_where_the_error_matters() -> 
     assert stored.upper > 1e-3
     (finding,) = from_json(stored.attrs["findings"])
     assert finding.code == "rough-probability"
+    assert all("n_points=" in text for text in (finding.text, prb.help(finding.code)))
     decided = ask(12.0, requirement=1e-3)
     assert (decided.attrs["verdict"], decided.attrs["source"]) == ("met", "importance points")
     assert exact(12.0)[1][1] < float(decided.upper) < 1e-6

@@ -225,13 +225,6 @@ def outputs(x: Any) -> dict[str, Any]:
     return {"a": x, "b": x**2}
 
 
-def test_unknown_names_are_refused() -> None:
-    with pytest.raises(KeyError, match=r"units: got 'force', expected some of \['k', 'y'\]"):
-        normal_model(units={"force": "N"})
-    with pytest.raises(KeyError, match=r"inputs: got nothing, expected some of \['k'\]"):
-        prb.population(reference_posterior(10, 1), "nothing", model=normal_model())
-
-
 def test_pictures_have_the_units() -> None:
     model = normal_model(propagation=prb.Reweighted(64), units={"k": "kN/mm", "y": "mm"})
     posterior = reference_posterior(40, 7)

@@ -127,6 +127,11 @@ def test_points_in_blocks_have_the_same_values(monkeypatch: pytest.MonkeyPatch) 
     values_in_blocks, jacobian_in_blocks = surface(points)
     np.testing.assert_allclose(values_in_blocks, values, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(jacobian_in_blocks, jacobian, rtol=1e-10, atol=1e-12)
+    assert [x.shape for x in surface(points[:0])] == [
+        (0, values.shape[1]),
+        (0, *jacobian.shape[1:]),
+    ]
+    assert surface.values(points[:0]).shape == (0, values.shape[1])
 
 
 def test_runs_nearby_select_the_degree() -> None:

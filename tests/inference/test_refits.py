@@ -468,7 +468,7 @@ def test_principal_axes_of_normal_points_with_outliers() -> None:
     np.testing.assert_allclose(np.abs(axes.T @ turn), np.eye(2), atol=0.03)
     points = rng.normal([1.0, -2.0], [0.5, 3.0], (4000, 2))
     points[0] = [1e6, -1e6]
-    drawn = drawn_in(points, 3.0)
+    drawn = drawn_in(points)
     np.testing.assert_allclose(drawn[0], [1 + 3 * 0.5, -2 - 3 * 3], rtol=0.05)
     near = np.abs((points - [1.0, -2.0]) / [0.5, 3.0]).max(axis=1) < 2.8
     np.testing.assert_array_equal(drawn[near], points[near])

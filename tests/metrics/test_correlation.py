@@ -86,20 +86,3 @@ def test_declarations() -> None:
     assert [is_differentiable(m.against(y)) for m in (quadratic, absolute)] == [True, False]
     assert not is_additive(quadratic.against(y))
     assert quadratic.like(AreaMetric()) == absolute
-
-
-@pytest.mark.parametrize(
-    ("weights", "error"),
-    [
-        (1.0, TypeError),
-        ((1.0,), TypeError),
-        ((1.0, "a"), TypeError),
-        ((0.0, 1.0), ValueError),
-        ((np.inf, 1.0), ValueError),
-    ],
-)
-def test_weights_are_two_positive_numbers(weights: Any, error: type[Exception]) -> None:
-    with pytest.raises(error, match="weights: got"):
-        MarginalCorrelation(AreaMetric(), weights=weights)
-    with pytest.raises(ValueError, match="equal values of output 1"):
-        MarginalCorrelation(AreaMetric()).against(sample(20, 0) * [1, 0, 1])

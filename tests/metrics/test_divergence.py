@@ -102,16 +102,6 @@ def test_other_observed_values_keep_the_scale_factor_and_the_cells() -> None:
     np.testing.assert_allclose(other.density, d.cells.density(tight, np.full(5, 0.2)))
 
 
-@pytest.mark.parametrize("metric", [KullbackLeibler, ProbabilityResidual])
-def test_wrong_settings(metric: Any) -> None:
-    with pytest.raises(TypeError, match=r"density: got .*, expected prb.GaussianKDE\(\)"):
-        metric(GaussianKDE)
-    with pytest.raises(ValueError, match="scale_base: got 0, expected a positive finite number"):
-        ProbabilityResidual(scale_base=0)
-    with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
-        metric()([0.0, 1.0], [0.1])
-
-
 def test_mass_away_from_the_data_costs_the_floor_in_reverse() -> None:
     d = prepared(KullbackLeibler(GaussianKDE(0.4), reverse=True), np.array([0.0, 1.0, 2.0]))
     widths = d.cells.widths

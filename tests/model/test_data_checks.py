@@ -12,6 +12,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.metrics.readings import Repeats
 from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
@@ -21,6 +22,7 @@ from prbayes.model.data_checks import (
     duplicate_findings,
     identical_specimens,
     outlier_findings,
+    repeat_findings,
     resolution,
     warn_out_of_range,
 )
@@ -437,3 +439,47 @@ def test_a_diagnosis_reports_codes(metric: prb.Metric) -> None:
         )
     optimum = prb.minimize(model, progressbar=False)
     assert "outlying-data" in {finding.code for finding in optimum.findings}
+
+
+# -- repeated readings -----------------------------------------------------------------------------
+
+
+def scattered(error: float, n: int, count: int = 3, outlier: float = 0.0) -> Repeats:
+    """Return repeated readings of n specimens with two outputs, in units of the stated error."""
+    y = error * np.random.default_rng(1).standard_normal((n, count, 2))
+    y[0, 0, 1] += outlier
+    within = ((y - y.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    return Repeats(np.full((n, 2), count - 1.0), within, np.zeros((n, 2)))
+
+
+def test_repeated_readings_that_scatter_more_than_their_error_are_reported() -> None:
+    for given in (
+        scattered(1.0, 15),
+        scattered(0.01, 15),
+        scattered(1.0, 5000),
+        scattered(1.3, 15),
+    ):
+        assert repeat_findings("y", given) == []
+    (wrong,) = repeat_findings("y", scattered(4.0, 15))
+    assert wrong.code == "readings-misfit"
+    assert "repeated readings of the specimens scatter more than their error: by 3.7" in wrong.text
+    (single,) = repeat_findings("y", scattered(1.0, 15, outlier=100.0))
+    assert "readings of 1 of 15 specimens" in single.text
+
+
+def test_an_impossible_repeated_reading_is_reported_by_the_optimum() -> None:
+    rng = np.random.default_rng(2)
+    y = np.repeat(rng.normal(1, 0.5, 8), 3) + rng.normal(0, 0.1, 24)
+    y[4] *= 10
+
+    def found(y: Floats, **keywords: object) -> list[str]:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
+            metric = prb.LogLikelihood(**{"error": 0.1} | keywords)  # type: ignore[arg-type]
+            specimens = np.repeat(np.arange(8), 3)
+            prb.Simulator("y", np.positive, x, metric=metric, observed=y, specimens=specimens)
+        return [finding.code for finding in prb.minimize(model, progressbar=False).findings]
+
+    assert found(y) == ["readings-misfit"]
+    assert "readings-misfit" not in found(y, gross_errors=True)
+    assert found(np.delete(y, 4).take(np.r_[0:4, 4, 4:23])) == []

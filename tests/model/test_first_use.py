@@ -95,8 +95,6 @@ def test_these_are_no_uses(propagation: Any, runs: int, calls: int) -> None:
 def test_arguments_are_checked_when_the_model_is_written() -> None:
     with pytest.raises(TypeError, match="progressbar"):
         build(Counted(), progressbar="no")
-    with pytest.raises(TypeError, match="emulator: got RadialBasis for aleatory inputs"):
-        build(Counted(), prb.Reweighted(32, emulator=prb.surrogate.RadialBasis()))
 
 
 def sampled_by(sampler: str) -> Callable[[pm.Model], object]:

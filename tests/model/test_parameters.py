@@ -97,13 +97,6 @@ def test_invalid_points_are_refused(
         hyperparameters.unconstrained(point)
 
 
-def test_discrete_hyperparameters_are_refused() -> None:
-    with pm.Model() as model:
-        pm.Poisson("k", 3)
-    with pytest.raises(TypeError, match=r"discrete hyperparameters \['k'\]"):
-        Hyperparameters.of(model)
-
-
 def test_draws_of_the_prior(hyperparameters: Hyperparameters) -> None:
     first = hyperparameters.prior_thetas(16, 3)
     first[:] = np.nan  # a copy

@@ -371,19 +371,17 @@ def test_other_data_of_the_same_model() -> None:
     assert response.runs == 128
 
 
-def test_data_of_another_shape_and_two_samples_are_refused() -> None:
+def test_data_of_another_shape_are_refused() -> None:
     (likelihood,) = specimen_likelihoods(shared()).values()
     with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
         likelihood.observing({"y": Y[:, None]})
-    with pytest.raises(TypeError, match=r"prb.LogLikelihood\(density=prb.GaussianKDE\(\)\)"):
-        prb.LogLikelihood()([1.0, 2.0], [1.0, 2.0])
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"epsilon": 0.1}, r"epsilon: got 0\.1, expected none.*leave epsilon= out"),
-        ({"propagation": prb.Fresh(64)}, r"got Fresh .*metric=prb\.ProbabilityResidual"),
+        ({"propagation": prb.Fresh(64)}, r"got Fresh .*metric=prb\.AreaMetric"),
         (
             {"propagation": prb.Reweighted(64, emulator=None)},
             r"got Reweighted\(emulator=.*leave emulator= out",
@@ -392,13 +390,13 @@ def test_data_of_another_shape_and_two_samples_are_refused() -> None:
             {"propagation": prb.Reweighted(64, max_points=4096)},
             r"got Reweighted\(max_points=.*leave max_points= out",
         ),
-        ({"observed": np.append(Y, np.inf)}, "got infinite values, expected finite"),
+        ({"observed": np.append(Y, np.inf)}, r"infinite values, .*metric=prb\.AreaMetric\(\)"),
         ({"observed": np.append(Y, np.nan)}, "got no measured output of specimen 20.*leave"),
         ({"observed": Y[:1]}, r"got shape \(1,\), expected \(N,\) or .* with at least 2 specimens"),
         ({"dims": "specimen"}, "dims: got 'specimen' of length 3, expected 20"),
         (
             {"inputs": lambda: [pm.Poisson.dist(pm.math.exp(pm.Normal("mu")))]},
-            r"poisson.* is discrete.*prb\.ProbabilityResidual",
+            r"poisson.* is discrete.*prb\.AreaMetric",
         ),
         (
             {"inputs": lambda: [*normal(), pm.Normal("c")]},
@@ -409,6 +407,16 @@ def test_data_of_another_shape_and_two_samples_are_refused() -> None:
 def test_arguments_without_a_meaning_are_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises((TypeError, ValueError), match=message):
         build(**given)
+
+
+def test_readings_may_have_limits_of_their_own() -> None:
+    upper = np.where(np.arange(N) % 2, 4.0, 3.0)
+    low = np.full(N, -9.0)
+    tail = stats.norm.logsf(upper, 1 + 2 * POINT["mu"], 2 * np.exp(POINT["sigma_log__"]))
+    expected = np.where(upper <= Y, tail, exact()).sum()
+    for limits in ((None, upper), (low, upper), (low, list(upper))):
+        model = build(metric=prb.LogLikelihood(censored=limits), observed=np.minimum(Y, upper))
+        assert values(model).sum() == pytest.approx(expected, abs=0.1)
 
 
 def test_censored_readings_alone_are_refused() -> None:

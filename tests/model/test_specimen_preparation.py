@@ -79,6 +79,17 @@ def test_smoothing_widens_populations() -> None:
     assert draws.thetas.std() == pytest.approx(precision**-0.5, rel=0.25)
 
 
+def test_populations_of_infinite_size_are_impossible_without_a_warning() -> None:
+    with pm.Model() as model:
+        x = pm.LogNormal.dist(pm.Normal("mu", 0, 1), 1.0)
+        prb.Simulator("y", np.positive, x, observed=np.exp(X))
+    populations = populations_of(model)
+    z, log_a = points_at(populations, np.exp(X))
+    thetas = np.array([[0.5], [1e4]])
+    logs = populations.log_likelihoods(thetas, z, log_a, np.array([[0.1]])).sum(axis=1)
+    np.testing.assert_array_equal(np.isfinite(logs), [True, False])
+
+
 def test_groups_have_populations_of_their_own() -> None:
     groups = np.arange(N) % 2
     data = xr.DataArray(

@@ -29,12 +29,6 @@ from prbayes.optimize.objective import Method, Objective
 # -- budgets, tolerances, trace --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("keywords", [{"tolerance": 0.0}, {"max_evaluations": 0}], ids=str)
-def test_tolerance_and_budget_are_checked(keywords: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(keywords))):
-        prb.minimize(model(), **keywords)
-
-
 @pytest.mark.parametrize(
     ("method", "box"),
     [("BFGS", False), ("BFGS", True), ("L-BFGS-B", True), ("Nelder-Mead", False)],

@@ -437,21 +437,6 @@ def test_the_start_is_honoured() -> None:
     np.testing.assert_allclose(trace["discrepancy"][0], first, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("start", "error", "words"),
-    [
-        ({"mu": 1.0}, KeyError, "expected a value for each of \\['mu', 'sigma'\\]"),
-        ({"mu": 1.0, "sigma": 1.0, "tau": 1.0}, KeyError, "tau"),
-        ({"mu": 1.0, "sigma": -1.0}, ValueError, "inside the support"),
-        ({"mu": np.nan, "sigma": 1.0}, ValueError, "inside the support"),
-        ({"mu": [1.0, 2.0], "sigma": 1.0}, ValueError, "mu"),
-    ],
-)
-def test_a_start_that_does_not_fit_is_refused(start: Any, error: Any, words: str) -> None:
-    with pytest.raises(error, match=words):
-        prb.minimize(fitted("pr").model, start=start)
-
-
 @pytest.mark.parametrize("name", ["pr", "area"])
 def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
     # All weight is on the outermost design point: nothing changes any more.
@@ -555,24 +540,13 @@ def test_a_black_box_response_under_resimulated() -> None:
     assert symbolic.n_responses == 1024 * symbolic.search.n_evaluations + extra
 
 
-def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
+def test_fresh_draws_have_no_standard_errors() -> None:
     model = normal_model("area", prb.Fresh(200))
-    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
-        prb.minimize(model)
     start = {"mu": 1.0, "sigma": 0.5}
     optimum = prb.minimize(model, method="Nelder-Mead", start=start, max_evaluations=60)
     assert np.isnan(errors(optimum)).all()
     # The noise of 200 draws is half that of the data.
     assert abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5
-
-
-def test_no_simulator_and_no_model() -> None:
-    with pm.Model() as model:
-        pm.Normal("mu")
-    with pytest.raises(ValueError, match=r"expected at least one; add prb\.Simulator"):
-        prb.minimize(model)
-    with pytest.raises(TypeError, match="no model on the context"):
-        prb.minimize()
 
 
 # -- determinism and storage -----------------------------------------------------------------------

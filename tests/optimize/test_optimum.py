@@ -20,7 +20,6 @@ from prbayes.optimize.minimize import optimum_findings
 from prbayes.optimize.optimum import (
     delta_method,
     point_and_stderr,
-    require_refits,
     require_sampling,
 )
 
@@ -33,11 +32,6 @@ def test_where_nothing_is_known_an_optimum_is_refused(kind: str) -> None:
         ValueError, match=r"bootstrap: got an optimum without .*sigma.*adjustment=None"
     ):
         require_sampling(optimum, "bootstrap")
-
-
-def test_something_else_than_an_optimum_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"JointNull: got dict, expected an Optimum"):
-        require_refits({}, "JointNull", "")
 
 
 SCRIPT = """

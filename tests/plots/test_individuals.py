@@ -60,8 +60,3 @@ def test_some_specimens_and_outputs(read: SimpleNamespace) -> None:
         plot_individuals(tree(2), coords={"specimen": 9})
     with pytest.raises(KeyError, match=r"got \['depth'\], expected some of the dimensions"):
         plot_individuals(tree(2), coords={"depth": 9})
-
-
-def test_another_tree_is_refused() -> None:
-    with pytest.raises(TypeError, match="expected the DataTree"):
-        plot_individuals(xr.DataTree())

@@ -214,8 +214,6 @@ def test_problems_without_refits_are_refused() -> None:
         model = build(metric, propagation=propagation)
         with pytest.raises(TypeError, match=words):
             epsilon_of(model, method="Nelder-Mead", max_evaluations=5, refine=False)
-    with pytest.raises(TypeError, match="Optimum"):
-        prb.calibrate_epsilon({"mu": 1.0})  # type: ignore[arg-type]
 
 
 # -- several simulators
@@ -257,7 +255,7 @@ def test_specimens_that_count_twice_are_reported(caplog: pytest.LogCaptureFixtur
     assert text in caplog.text
 
 
-def test_set_epsilon_changes_named_simulators_and_nothing_on_error() -> None:
+def test_set_epsilon_changes_named_simulators() -> None:
     model = pair(AREA, [None, None], n=16)
 
     def values() -> list[float]:
@@ -267,15 +265,6 @@ def test_set_epsilon_changes_named_simulators_and_nothing_on_error() -> None:
     np.testing.assert_array_equal(values(), [np.nan, 0.5])
     prb.set_epsilon(model, {"y": np.float64(0.1), "z": 2})
     assert values() == [0.1, 2.0]
-    for wrong, error in (
-        ({"y": 0.7, "c": 1.0}, KeyError),
-        ({"y": 0.7, "z": 0.0}, ValueError),
-        ({"y": 0.7, "z": np.inf}, ValueError),
-        ({"y": 0.7, "z": "wide"}, TypeError),
-    ):
-        with pytest.raises(error):
-            prb.set_epsilon(model, wrong)  # type: ignore[arg-type]
-        assert values() == [0.1, 2.0]
 
 
 def test_set_epsilon_scales_the_log_density() -> None:

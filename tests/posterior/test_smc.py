@@ -227,13 +227,7 @@ def test_an_unset_epsilon_is_calibrated_for_the_run() -> None:
         assert np.isnan(epsilons(model)).all()
 
 
-def test_invalid_epsilons() -> None:
-    model = area_run()[0]
-    with pytest.raises(KeyError, match=r"\['z'\], expected names of simulators: \['y'\]"):
-        sample(model, 50, chains=1, epsilon={"z": 0.1})
-    with pytest.raises(ValueError, match="y: epsilon"):
-        sample(model, 50, chains=1, epsilon=0.0)
-    assert epsilons(model) == [0.02]
+def test_one_epsilon_for_two_simulators_is_refused() -> None:
     with pm.Model() as two:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
         for name in "ab":

@@ -74,28 +74,6 @@ def test_the_error_of_random_draws_is_that_of_repetitions() -> None:
     assert np.isnan(discrepancy_error(bound(prb.Fresh(15)), at([1.0], [0.5])))  # too few points
 
 
-def test_priors_that_are_never_valid_are_refused() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(0.0, pm.Normal("sigma", -50.0, 0.1))
-        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=OBSERVED)
-    with pytest.raises(ValueError, match=r"invalid parameters of the inputs at all .* of sigma"):
-        first_use(model)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_arguments_that_all_propagations_check(kind: Any) -> None:
-    for name, value, words in (
-        ("executor", 3, "executor: got int"),
-        ("store", 3, "store: got int"),
-        ("on_failure", "abort", "on_failure: got str 'abort'"),
-    ):
-        with pytest.raises(TypeError, match=words):
-            kind(64, **{name: value})
-    for keywords in ({"n": 0}, {"random_seed": -1}, {"max_lost": 1.0}):
-        with pytest.raises(ValueError, match=f"{kind.__name__}: {next(iter(keywords))}: got"):
-            kind(**keywords)
-
-
 def test_missing_shares_of_weighted_values() -> None:
     values, weights = np.full((1, 10), 1.0), np.full((1, 10), 0.1)
     values[0, :2], values[0, 2:6] = np.nan, np.inf

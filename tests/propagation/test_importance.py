@@ -306,12 +306,6 @@ def test_an_optimum_from_few_runs_is_that_of_many() -> None:
     assert np.abs(off).max() < 0.15
 
 
-@pytest.mark.parametrize("emulator", [3, "cubic", object()])
-def test_other_objects_are_no_emulators(emulator: Any) -> None:
-    with pytest.raises((TypeError, ValueError), match="Reweighted: emulator: got"):
-        prb.Reweighted(64, emulator=emulator)
-
-
 @pytest.mark.parametrize("discrete", [False, True])
 def test_one_input_and_discrete_ones_are_not_emulated(discrete: bool) -> None:
     calls: list[int] = []

@@ -77,15 +77,6 @@ def test_too_few_responses_for_a_log_likelihood(caplog: pytest.LogCaptureFixture
     assert not caplog.text
 
 
-def test_discrete_inputs_are_refused() -> None:
-    words = r"is discrete, expected a continuous one; use propagation=prb.Reweighted\(\)"
-    with pm.Model(), pytest.raises(TypeError, match=words):
-        prb.Simulator(
-            "y", np.square, pm.Poisson.dist(pm.Exponential("rate", 1.0)), metric=prb.AreaMetric(),
-            observed=OBSERVED, propagation=prb.Resimulated(64),
-        )  # fmt: skip
-
-
 def fresh_bound(n: int = 40, random_seed: int = 0) -> Bound:
     return bound(np.square, prb.Fresh(n, random_seed=random_seed))
 

@@ -171,6 +171,22 @@ def test_the_answer_has_the_estimates(calibrated: Any, report: prb.Report, secti
     assert "is fitted to 30 measured values of y." in of_answer.text[0]
 
 
+def test_repeated_readings_are_those_of_their_specimens() -> None:
+    y = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))
+    with pm.Model() as model:
+        a, b = pm.Normal.dist(pm.Normal("mu", 5, 1), 0.5), pm.Normal.dist(70, 3.0)
+        prb.Simulator(
+            "frame",
+            lambda a, b: np.stack([a, b], axis=-1),
+            *(a, b),
+            metric=prb.LogLikelihood(error=0.1),
+            observed=y,
+            specimens=np.repeat(np.arange(10), 2),
+        )
+    (section,) = answer(gather(model=model, posterior=draws(mu=np.full((1, 3), 5.0))))
+    assert "is fitted to 10 specimens with 2 outputs of frame." in section.text[0]
+
+
 def test_problems_are_counted_on_page_one(calibrated: Any, section: Any) -> None:
     posterior = calibrated[2].copy(deep=True)
     posterior["posterior"]["mu"][0] += 5.0

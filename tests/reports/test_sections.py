@@ -313,7 +313,7 @@ def test_sections_depend_on_the_results_and_come_in_order(
 
 def test_inputs_and_runs_are_in_words() -> None:
     labels = {"k": "stiffness (kN/mm)", "load": "load (kN)", "mean": "never"}
-    text = "k (N/m) ~ Normal(mean, sd), load = 10"
+    text = "k (N/(m s^(1/3))) ~ Normal(mean, sd), load = 10"
     assert _labelled_inputs(text, labels) == (
         "stiffness (kN/mm) ~ Normal(mean, sd), load (kN) = 10"
     )

@@ -131,18 +131,6 @@ def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> No
     np.testing.assert_allclose(root, np.linalg.cholesky(COVARIANCE), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("dist", "reason"),
-    [
-        (pm.Poisson.dist(2.0), "got poisson.* is discrete, .*; use propagation=prb.Reweigh"),
-        (pm.VonMises.dist(0.0, 1.0), "got vonmises.* has no inverse distribution function .*Fresh"),
-    ],
-)
-def test_what_has_no_quantiles_is_refused(dist: Any, reason: str) -> None:
-    with pytest.raises(TypeError, match=f"y: {reason}"):
-        quantiles("y", dist, 0.5)
-
-
 def test_priors_are_drawn_together_and_the_seed_decides() -> None:
     with pm.Model() as model:
         center = pm.Normal("center", 5, 1)
@@ -243,14 +231,10 @@ def test_a_distribution_without_density_is_refused_and_says_nothing_of_its_param
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
-    inputs, model = inputs_of(lambda mu, sigma: [pm.Normal.dist(mu, sigma), pm.Flat.dist()])
+    inputs, _ = inputs_of(lambda mu, sigma: [pm.Normal.dist(mu, sigma), pm.Flat.dist()])
     sampler = PopulationSampler(inputs)
     with pytest.raises(TypeError, match=r"inputs: got .* flat.* cannot be drawn \(.*expected"):
         sampler([np.zeros(1), np.ones(1)], 3, np.random.default_rng(0))
-    with model:
-        flat = pm.Flat("flat")
-    with pytest.raises(TypeError, match=r"priors: got flat, .*cannot be drawn .*replace pm.Flat"):
-        PriorSampler([flat])(3, 1)
 
 
 def test_populations_are_drawn_at_their_own_roots() -> None:

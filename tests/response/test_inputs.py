@@ -27,7 +27,6 @@ from prbayes.response.inputs import (
     is_group,
     is_random,
     read_inputs,
-    refuse_several_populations,
 )
 
 with pm.Model():
@@ -285,12 +284,7 @@ def test_a_group_is_an_index_that_is_drawn_evenly() -> None:
 
 
 def test_groups_in_the_wrong_place_are_refused() -> None:
-    with pytest.raises(TypeError, match="got no model on the context"):
-        prb.response.group("supplier")
     with pm.Model(coords={"supplier": ["a", "b"], "batch": [1, 2]}):
         both = [prb.response.group(dim) for dim in ("supplier", "batch")]
     with pytest.raises(ValueError, match=r"2 calls of .* \['supplier', 'batch'\], expected one"):
         groups_of("y", both)
-    with pytest.raises(TypeError, match=r"depends on prb.response.group\('supplier'\), expected"):
-        refuse_several_populations("prb.sensitivity: f", both[:1])
-    refuse_several_populations("prb.sensitivity: f", [])

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import prbayes
 from prbayes.response.store import (
     INSERT_RUN,
     Store,
@@ -30,7 +29,6 @@ from prbayes.response.store import (
 
 KEYS = np.random.default_rng(1).normal(size=(300, 3))
 VALUES = KEYS @ [1.0, 10.0, 100.0]
-PACKAGE = str(Path(prbayes.__file__).parent)
 
 
 @pytest.fixture
@@ -238,6 +236,8 @@ def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
         StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"
     ):
         Store(folder, "x")
+    with pytest.raises(StoreError, match="'x', expected a file with responses; look at name"):
+        Store(folder / "empty", "x")
     assert all_right(Store(folder, "y", columns=3))
     changed(folder, "PRAGMA user_version = 3")
     refused(folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote")

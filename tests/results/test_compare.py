@@ -132,8 +132,6 @@ def test_the_posterior_of_any_sampler() -> None:
 @pytest.mark.parametrize(
     ("results", "error", "words"),
     [
-        ({}, ValueError, "got no results"),
-        ({"a": {"mu": 1.0}}, TypeError, "a: got dict, expected an Optimum or a DataTree"),
         ({"a": xr.DataTree()}, TypeError, "a: got DataTree, expected"),
         ({"a": tree_of(x=[[1.0, 2.0]]), "b": tree_of(y=[[1.0, 2.0]])}, ValueError, "share no"),
     ],

@@ -357,14 +357,19 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     assert str([*findings, *harmless][0]).startswith(text)
 
 
-def test_a_harmless_failure_is_a_remark() -> None:
-    model = one_mean(replaced(prb.Reweighted, 64), breaks_above(3.5), epsilon=0.1)
+@pytest.mark.parametrize("metric", [AREA, None])
+@pytest.mark.parametrize(("limit", "is_harmless"), [(3.5, True), (2.25, False)])
+def test_a_harmless_failure_is_a_remark(metric: Any, limit: float, is_harmless: bool) -> None:
+    propagation = replaced(prb.Reweighted, 64)
+    model = one_mean(propagation, breaks_above(limit), metric=metric)
     best = prb.minimize(model, starts=0, **QUIET)
     assert best.failures.sizes["failure"] > 0
-    for result in (best, best.to_datatree()):
+    draws = prb.sample(100, chains=2, model=model, optimum=best, random_seed=1, **QUIET)
+    for result in (best, best.to_datatree(), draws):
         diagnosis = prb.diagnose(result)
-        assert "harmless-failures" in [remark.code for remark in diagnosis.remarks]
-        assert "failed-responses" not in codes(result)
+        remarks = [remark.code for remark in diagnosis.remarks]
+        assert ("harmless-failures" in remarks) == is_harmless
+        assert ("failed-responses" in codes(result)) == (not is_harmless)
 
 
 @pytest.mark.parametrize("components", [None, 1])

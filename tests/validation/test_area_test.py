@@ -110,7 +110,7 @@ def test_shared_specimens_that_were_not_predicted_together_are_refused() -> None
     labels = [range(5), range(5)]
     other = [as_array([GRID], specimens_id="x"), as_array([GRID], specimens_id="y")]
     same, different = [other[0], other[0]], other
-    with pytest.raises(ValueError, match="predicted with different specimens, expected the same"):
+    with pytest.raises(ValueError, match=r"with different specimens, .*, n_draws and"):
         prb.area_test([y, y], different, specimens=labels)
     with pytest.raises(ValueError, match="predicted with shapes"):
         prb.area_test([y, y], [GRID, GRID[::2]], specimens=labels)
@@ -150,12 +150,8 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
     ("observed", "predicted", "keywords", "match"),
     [
         ([1.0] * 10, GRID[::20], {}, "predicted: got 50 values for 10 observed ones"),
-        ([1.0], GRID, {"alpha": 1.0}, "alpha: got 1.0, expected a number between"),
         ([1.0, 2.0], GRID, {"specimens": [1, 1], "null": EXACT}, "2 values of 1 specimens"),
-        ([1.0], GRID, {"random_seed": -1}, "random_seed: got -1"),
         ([1.0], GRID, {"null": "exact"}, r"null: got str 'exact', expected prb\.validation\.Pos"),
-        ([1.0], GRID, {"null": prb.validation.ExactModel}, "null: got ABCMeta"),
-        (["a"], GRID, {}, "expected real numbers"),
     ],
 )
 def test_refusals(observed: Any, predicted: Any, keywords: dict[str, Any], match: str) -> None:

@@ -102,26 +102,6 @@ def test_a_failure_leaves_the_other_products(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ([1.0, 2.0], "expected a mapping"),
-        ({"a": [1.0]}, "data_sets: a: got shape"),
-        ({"a": [[1.0, 2.0], [1.0, 2.0]]}, "expected .'N',. with at least 2"),
-    ],
-)
-def test_bad_data_are_refused(data: Any, message: str) -> None:
-    with pytest.raises((TypeError, ValueError), match=message):
-        prb.calibrate_each(data, model=model_of([1.0, 2.0]))
-
-
-def test_further_specimens_are_of_a_product() -> None:
-    with pytest.raises(KeyError, match=r"\['b'\], expected products"):
-        prb.calibrate_each(
-            {"a": [1.0, 2.0]}, model=model_of([1.0, 2.0]), validation={"b": [1.0]}, **QUIET
-        )
-
-
-@pytest.mark.parametrize(
     ("settings", "name"),
     [
         ({"weights": [0.5, 1.5, 1.0]}, "weights="),

@@ -1,5 +1,6 @@
 """Null distributions: replicates of a posterior, an exact population, the calibration's own data."""
 
+import re
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -141,6 +142,11 @@ def test_a_seed_gives_the_same_replicates() -> None:
 def test_published_critical_values_and_closed_forms() -> None:
     for n, published in PUBLISHED.items():
         assert EXACT.critical_value(n) == pytest.approx(published, abs=4e-4)
+    page = (Path(__file__).parents[2] / "docs" / "validity.md").read_text(encoding="utf-8")
+    on_page = re.findall(r"(\d+) (\.\d{4})(?=[,.] )", page)
+    assert len(on_page) == 6
+    for size, value in on_page:
+        assert f"{EXACT.critical_value(int(size)):.4f}" == f"0{value}"
     scaled = [np.sqrt(n) * EXACT.critical_value(n) for n in (500, 1000, 10_000)]
     np.testing.assert_allclose(scaled, 0.5821, atol=2e-4)
     # Sizes between those of the table have quantiles between theirs.

@@ -262,7 +262,7 @@ def _gain_of_half_width(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     total = np.zeros(len(thetas))
     for part in single_output_parts(evaluator.nodes[k].target):
         projection = part.of(values)
-        total += part.share * with_narrower_kernel(part.target, 0.5).of(projection, weights)
+        total += part.share * with_narrower_kernel(part.target).of(projection, weights)
         total -= part.share * part.target.of(projection, weights)
     return total
 

@@ -270,6 +270,15 @@ def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 
             refuse_lost_share(simulator.name, share, simulator.max_lost, remedy)
 
 
+def failing_share(evaluator: Evaluator, theta: Floats, specimens: int = 4096) -> dict[str, float]:
+    """Return the share of a population, at theta (d,), without a finite response; no run.
+
+    By simulator, of the log-likelihood by specimen alone.
+    """
+    shares = dict.fromkeys((simulator.name for simulator in evaluator.emulated), 0.0)
+    return shares | {s.name: share for s, share in _failing_shares(evaluator, theta, specimens)}
+
+
 def _failing_shares(
     evaluator: Evaluator, theta: Floats, specimens: int
 ) -> Iterator[tuple[EmulatedSimulator, float]]:
