@@ -426,8 +426,8 @@ def _findings(
                 "likelihood.md#identification",
             )
         )
-    others = [(m, w) for m, w in zip(modes[1:], weights[1:], strict=True) if w >= 0.01]
-    for mode, weight in others:
+    second_modes = [(m, w) for m, w in zip(modes[1:], weights[1:], strict=True) if w >= 0.01]
+    for mode, weight in second_modes:
         findings.append(
             Finding(
                 "second-mode",
@@ -439,7 +439,7 @@ def _findings(
         )
     is_too_small = _too_small_errors(evaluator.hyperparameters, objective, best)
     too_small = [name for name in names[is_too_small] if name not in excluded]
-    if too_small and not others:
+    if too_small and not second_modes:
         findings.append(
             Finding(
                 "flat-likelihood",
@@ -461,17 +461,23 @@ def _too_small_errors(
     with the distance in the user's units where that is shorter, as from a spread to zero. Where a
     population is normal, the root is at least half as large, also with three specimens.
     """
-    variances = np.diag(best.covariance)
-    is_too_small = np.zeros(best.theta.size, dtype=bool)
-    for i in np.flatnonzero(np.isfinite(variances) & (variances > 0)).tolist():
+    size = best.theta.size
+    is_too_small = np.zeros(size, dtype=bool)
+    for i in range(size):
+        variance = best.covariance[i, i]
+        if not 0 < variance < np.inf:
+            continue
         # Other elements follow as they would under a normal likelihood.
-        step = np.nan_to_num(best.covariance[:, i], posinf=0.0) / np.sqrt(variances[i])
-        shifts = np.array([0.0, 0.01, -4.0, 4.0])
-        thetas = best.theta + shifts[:, None] * step
-        value, near, *far = (ends_of_prior(hyperparameters, theta)[0][i] for theta in thetas)
-        distances = np.fmin(np.abs(np.subtract(far, value) / (near - value)) * 0.01, 4)
-        roots = [_signed_root(objective, best, theta, i) for theta in thetas[2:]]
-        is_too_small[i] = (np.array(roots) < distances / 3).any()
+        step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
+        value = ends_of_prior(hyperparameters, best.theta)[0][i]
+        near = ends_of_prior(hyperparameters, best.theta + 0.01 * step)[0][i]
+        unit = np.abs(near - value) / 0.01
+        for shift in (-4.0, 4.0):
+            theta = best.theta + shift * step
+            far = ends_of_prior(hyperparameters, theta)[0][i]
+            distance = np.fmin(np.abs(far - value) / unit, 4.0)
+            if _signed_root(objective, best, theta, i) < distance / 3:
+                is_too_small[i] = True
     return is_too_small
 
 
