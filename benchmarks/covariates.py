@@ -19,8 +19,8 @@ import pytensor.tensor as pt
 from scipy.special import logsumexp
 
 import prbayes as prb
-from benchmarks.likelihood_coverage import Functions, Problem, figures_of, posterior, thetas_of
-from benchmarks.readings_coverage import FOLDED, MONOTONE, Response, table
+from benchmarks.likelihood_coverage import Functions, Problem, thetas_of
+from benchmarks.readings_coverage import FOLDED, MONOTONE, Response, figures_of_both, table
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import half_normal, normal, truncated
 from benchmarks.study import Study
@@ -33,7 +33,6 @@ from prbayes.model.specimen_likelihood import (
 from prbayes.model.specimen_preparation import prepared
 
 COVARIATE = np.linspace(-1.0, 1.0, 30)
-_POINTS = 1024  # of the importance sampling
 RESPONSES = {"monotone": MONOTONE, "folded": FOLDED}
 
 
@@ -100,19 +99,7 @@ def data_set(name: str, number: int) -> dict[str, Any]:
         graph = log_likelihood_graph(other, {v: params.get(str(v.name)) for v in other.variables()})
         np.testing.assert_allclose(by_package(truth[None]), graph.sum().eval(), rtol=1e-8)
     exact = exact_log_likelihood(RESPONSES[name], y)
-    # Both on the same points, unless the posteriors are too different.
-    u, weights, k = posterior(problem, exact, start, _POINTS)
-    theta = thetas_of(problem, u)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.log(weights) + by_package(theta) - exact(theta)
-    logs = np.where(weights > 0, logs, -np.inf)
-    reweighted = np.exp(logs - logsumexp(logs))
-    results = {"exact": (u, weights, k), "prbayes": (u, reweighted, k)}
-    if 1 / (reweighted**2).sum() < 0.2 * _POINTS:
-        results["prbayes"] = posterior(problem, by_package, start, _POINTS)
-    for label, (u, weights, k) in results.items():
-        row[label] = figures_of(problem, u, weights, start, thetas_of(problem, u)) | {"k": k}
-    return row
+    return row | figures_of_both(problem, exact, by_package, start)
 
 
 STUDY = Study("covariates", __doc__, RESPONSES, data_set, 200, table, has_rows=False)

@@ -357,19 +357,26 @@ def data_set(case: Case, likelihood: SpecimenLikelihood, number: int) -> dict[st
     functions = {"prbayes": log_likelihood(other), "exact": exact_log_likelihood(case, y)}
     if number == 0:
         check(case, other, functions["prbayes"], truth)
-    # Both on the same points, unless the posteriors are too different.
-    u, weights, k = posterior(problem, functions["exact"], start, _POINTS)
+    return row | figures_of_both(problem, functions["exact"], functions["prbayes"], start)
+
+
+def figures_of_both(
+    problem: Problem, exact: Functions, by_package: Functions, start: Any
+) -> dict[str, Any]:
+    """Return figures of both posteriors, on the same points unless these are too different."""
+    u, weights, k = posterior(problem, exact, start, _POINTS)
     theta = thetas_of(problem, u)
     with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.log(weights) + functions["prbayes"](theta) - functions["exact"](theta)
+        logs = np.log(weights) + by_package(theta) - exact(theta)
     logs = np.where(weights > 0, logs, -np.inf)
     reweighted = np.exp(logs - logsumexp(logs))
     results = {"exact": (u, weights, k), "prbayes": (u, reweighted, k)}
     if 1 / (reweighted**2).sum() < 0.2 * _POINTS:
-        results["prbayes"] = posterior(problem, functions["prbayes"], start, _POINTS)
-    for name, (u, weights, k) in results.items():
-        row[name] = figures_of(problem, u, weights, start, thetas_of(problem, u)) | {"k": k}
-    return row
+        results["prbayes"] = posterior(problem, by_package, start, _POINTS)
+    return {
+        name: figures_of(problem, u, weights, start, thetas_of(problem, u)) | {"k": k}
+        for name, (u, weights, k) in results.items()
+    }
 
 
 def table(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -281,7 +281,6 @@ def two_calls() -> None:
         (lambda: as_in_pymc(HARDNESS, True), r"write hardness = prb.response.condition"),
         (named_expression, "expected an expression without a name"),
         (two_calls, "got two calls"),
-        (lambda: build(hardness=HARDNESS[1:]), "got 11 values of hardness, expected 12"),
         (lambda: build(metric=prb.AreaMetric()), "use metric=prb.LogLikelihood"),
     ],
 )

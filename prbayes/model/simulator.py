@@ -355,6 +355,7 @@ def _with_units(
     names = [*set_units(inputs, response, units), name, *outputs.names]
     unknown = [key for key in units if key not in names]
     if unknown:
+        refuse_misfit(name, response, inputs.sizes, outputs)  # names other arguments than these
         raise KeyError(
             f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
         )

@@ -516,12 +516,12 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
         return obstacle
     for likelihood in evaluator.likelihoods:
         if likelihood.readings.is_censored.any():
-            return f"{likelihood.name} has censored readings, of which new ones cannot be drawn"
+            return f"readings of {likelihood.name} are censored, and new ones cannot be drawn"
         is_measured = likelihood.readings.is_measured
         if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
-            return f"{likelihood.name} has specimens with fewer readings than inputs"
+            return f"specimens of {likelihood.name} have fewer readings than inputs"
         if not likelihood.error_is_known:
-            return f"{likelihood.name} has an unknown reading error"
+            return f"the error of the readings of {likelihood.name} is unknown"
     return None
 
 

@@ -121,8 +121,10 @@ def _data(m: Material) -> str:
         measured = counted(y.size, "measured value")
         if y.ndim > 1:
             n, outputs = y.shape
-            specimens = labelled.get(name) or counted(n, "specimen")
-            measured = f"{specimens} with {counted(outputs, 'output')}"
+            # Of a group the specimens are not known where they have labels.
+            is_labelled = bool(labelled.get(name.partition("[")[0]))
+            rows = counted(n, "reading" if is_labelled else "specimen")
+            measured = f"{labelled.get(name) or rows} with {counted(outputs, 'output')}"
         data.append(f"{measured} of {named(name, m.labels)}")
     return enumerated(data) if data else "measurements"
 

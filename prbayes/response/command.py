@@ -193,18 +193,7 @@ class Program:
 
     def __call__(self, *values: float) -> Any:
         """Run the program for one specimen, and read the response."""
-        if len(values) != len(self.inputs):
-            hint = ""
-            if len(values) == 1 and np.size(values[0]) == len(self.inputs):
-                elements = ", ".join(f"x[{i}]" for i in range(len(self.inputs)))
-                hint = (
-                    "; for one input with these elements, such as correlated ones, pass "
-                    f"prb.scalar(lambda x: program({elements}))"
-                )
-            raise ValueError(
-                f"{self.__name__}: got {len(values)} inputs, expected {len(self.inputs)}: "
-                f"{', '.join(self.inputs)}{hint}"
-            )
+        self.refuse_misfit(self.__name__, [np.size(value) for value in values])
         by_name = dict(zip(self.inputs, values, strict=True))
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -222,6 +211,22 @@ class Program:
             if not (self.keep or (has_failed and self.folder is not None)):
                 shutil.rmtree(folder, ignore_errors=True)
         return outputs
+
+    def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any = None) -> None:
+        """Raise if there are other inputs, of these sizes, than the program has."""
+        if len(sizes) == len(self.inputs):
+            return
+        hint = ""
+        if list(sizes) == [len(self.inputs)]:
+            elements = ", ".join(f"x[{i}]" for i in range(len(self.inputs)))
+            hint = (
+                "; for one input with these elements, such as correlated ones, pass "
+                f"prb.scalar(lambda x: program({elements}))"
+            )
+        raise ValueError(
+            f"{name}: got {len(sizes)} inputs, expected {len(self.inputs)}: "
+            f"{', '.join(self.inputs)}{hint}"
+        )
 
     def _run(self, arguments: list[str], folder: Path) -> None:
         """Run the program to its end, or end it."""

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._display import Shown, View, without_constructor
+from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
 from prbayes.model.description import versions
@@ -87,7 +88,7 @@ class ValidityTest(Shown):
         area = "area of |2u - 1|" if self.folded else "area"
         n_specimens = np.unique(self.specimens).size
         n_conditions = len(self.of_conditions)
-        conditions = "1 condition" if n_conditions == 1 else f"{n_conditions} conditions"
+        conditions = counted(n_conditions, "condition")
         n_directions = np.unique(self.conditions).size
         directions = f", seen in {n_directions} directions" if n_directions > n_conditions else ""
         rows = [
@@ -96,7 +97,8 @@ class ValidityTest(Shown):
             ["p-value", f"{self.p_value:.3g}"],
         ]
         sentences = [
-            f"{self.u_values.size} values of {n_specimens} specimens, {conditions}{directions}",
+            f"{counted(self.u_values.size, 'value')} of {counted(n_specimens, 'specimen')}, "
+            f"{conditions}{directions}",
             f"null: {self.null}",
         ]
         return View(f"ValidityTest: {verdict} at level {self.alpha:g}", (), rows, sentences)

@@ -401,11 +401,6 @@ def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
         ("weights: got weights of b", {"weights": [1.0, 2.0, 3.0]}, {}),
         ("propagation: got Resimulated", {"propagation": prb.Resimulated(64)}, {}),
         ("got 'p', which a has too with AreaMetric", {}, {"metric": prb.AreaMetric()}),
-        (
-            "got the label '1' and, in a, 1",
-            {"specimens": ["1", "2", "3"]},
-            {"specimens": [1, 2, 3]},
-        ),
     ],
 )
 def test_simulators_that_cannot_be_combined_are_refused(

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import xarray as xr
 
 from prbayes.plots import plot_individuals
@@ -56,7 +55,3 @@ def test_some_specimens_and_outputs(read: SimpleNamespace) -> None:
     figure = plot_individuals(tree(2), coords=coords, var_names="y")
     assert [axis.get_label() for axis in figure.axes] == ["y[0.5]"]
     assert read.xy(figure, "observed", "y[0.5]")[0].tolist() == [5.0, 6.0]
-    with pytest.raises(KeyError, match="got 9, expected some of"):
-        plot_individuals(tree(2), coords={"specimen": 9})
-    with pytest.raises(KeyError, match=r"got \['depth'\], expected some of the dimensions"):
-        plot_individuals(tree(2), coords={"depth": 9})

@@ -81,10 +81,6 @@ def test_a_landscape_that_costs_responses_says_how_many(
     ):
         prb.plots.plot_landscape(found, points=5)
     assert read.panels(prb.plots.plot_landscape(found, points=5, responses=1600), "landscape")
-    with pytest.raises(
-        KeyError, match=r"var_names: got \['nu'\], expected some of \['mu', 'sigma'\]"
-    ):
-        prb.plots.plot_landscape(found, var_names=["mu", "nu"])
 
 
 def test_the_landscape_of_another_metric(

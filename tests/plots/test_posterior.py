@@ -85,10 +85,6 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
     adler = prb.plots.plot_posterior(tree, coords={"supplier": "Adler"}, labels={"mu": "MEAN"})
     assert list(adler.viz["dist"]) == ["mu", "sigma", "rate[Adler]"]
     assert adler.viz["plot"]["mu"].item().get_title() == "MEAN"
-    with pytest.raises(KeyError, match=r"var_names: got \['nu'\], expected some of \['mu'"):
-        drawn(["mu", "nu"])
-    with pytest.raises(KeyError, match="var_names: got none"):
-        drawn([])
 
 
 def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:

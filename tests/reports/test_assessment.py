@@ -171,10 +171,16 @@ def test_the_answer_has_the_estimates(calibrated: Any, report: prb.Report, secti
     assert "is fitted to 30 measured values of y." in of_answer.text[0]
 
 
-def test_repeated_readings_are_those_of_their_specimens() -> None:
-    y = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))
-    with pm.Model() as model:
-        a, b = pm.Normal.dist(pm.Normal("mu", 5, 1), 0.5), pm.Normal.dist(70, 3.0)
+@pytest.mark.parametrize("grouped", [False, True])
+def test_repeated_readings_are_those_of_their_specimens(grouped: bool) -> None:
+    values = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))
+    kind = np.repeat(["one", "two"], 10)
+    y = xr.DataArray(values, dims=("i", "output"), coords={"kind": ("i", kind)})
+    with pm.Model(coords={"kind": ["one", "two"]}) as model:
+        mu = pm.Normal("mu", 5, 1, dims="kind" if grouped else None)
+        if grouped:
+            mu = mu[prb.response.group("kind")]
+        a, b = pm.Normal.dist(mu, 0.5), pm.Normal.dist(70, 3.0)
         prb.Simulator(
             "frame",
             lambda a, b: np.stack([a, b], axis=-1),
@@ -183,8 +189,13 @@ def test_repeated_readings_are_those_of_their_specimens() -> None:
             observed=y,
             specimens=np.repeat(np.arange(10), 2),
         )
-    (section,) = answer(gather(model=model, posterior=draws(mu=np.full((1, 3), 5.0))))
-    assert "is fitted to 10 specimens with 2 outputs of frame." in section.text[0]
+    tree = draws(mu=np.full((1, 3), 5.0))
+    fitted_to = "10 specimens with 2 outputs of frame."
+    if grouped:
+        tree["posterior"] = xr.Dataset({"mu": (["chain", "draw", "kind"], np.full((1, 3, 2), 5.0))})
+        fitted_to = "10 readings with 2 outputs of frame[one] and 10 readings with"
+    (section,) = answer(gather(model=model, posterior=tree))
+    assert f"is fitted to {fitted_to}" in section.text[0]
 
 
 def test_problems_are_counted_on_page_one(calibrated: Any, section: Any) -> None:

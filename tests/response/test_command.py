@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pymc as pm
 import pytest
 
 import prbayes as prb
@@ -221,3 +222,12 @@ def test_inputs_that_occur_nowhere_and_formats_of_no_number_are_refused() -> Non
         square()(1.0, 2.0)
     with pytest.raises(FileNotFoundError, match=r"'no such solver', which is missing or not"):
         prb.command(["no such solver", "{x}"], inputs=["x"], read=printed)
+
+
+def test_a_program_with_other_inputs_than_the_simulator_is_refused_before_it_runs() -> None:
+    two = prb.command(["true", "{a}", "{b}"], inputs=["a", "b"], read=lambda folder: 1.0)
+    for units in (None, {"a": "mm"}):
+        with pm.Model():
+            x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+            with pytest.raises(ValueError, match="y: got 1 inputs, expected 2: a, b"):
+                prb.Simulator("y", two, x, observed=[1.0, 2.0, 3.0], units=units)

@@ -382,12 +382,6 @@ def test_labels_of_the_response_are_those_of_the_prediction() -> None:
     np.testing.assert_allclose(stored[:, 1], np.exp(stored[:, 0]) + 20)
 
 
-def test_an_array_of_values_of_specimens_is_no_population() -> None:
-    load = np.linspace(1, 2, 100)
-    with pytest.raises(ResponseError, match="takes 600 specimens, but not one or 2"):
-        predict(lambda x: x * load, n_samples=100, stored=False)
-
-
 def test_a_prediction_with_failures_shows_moments_of_the_others() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)

@@ -150,7 +150,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
     ("observed", "predicted", "keywords", "match"),
     [
         ([1.0] * 10, GRID[::20], {}, "predicted: got 50 values for 10 observed ones"),
-        ([1.0, 2.0], GRID, {"specimens": [1, 1], "null": EXACT}, "2 values of 1 specimens"),
+        ([1.0, 2.0], GRID, {"specimens": [1, 1], "null": EXACT}, "2 values of 1 specimen"),
         ([1.0], GRID, {"null": "exact"}, r"null: got str 'exact', expected prb\.validation\.Pos"),
     ],
 )
