@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._progress import progress
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.inference.asymptotics import (
     Information,
     Local,
@@ -456,9 +456,9 @@ class BatchObjective:
         With thetas of shape (1, s, d) all data sets are compared with the same populations. NaN,
         as where a design has no point, becomes infinite.
         """
-        # In portions of a million weights.
+        # In portions whose weights stay in the cache.
         most = max(len(values) for values in self.values) * thetas.shape[1]
-        at_once = max(1, (1 << 20) // most)
+        at_once = max(1, IN_CACHE // most)
         if len(thetas) <= at_once:
             return self._values(thetas, rows)
         numbers = np.arange(self.n_sets)[rows]

@@ -107,16 +107,14 @@ class AreaDiscrepancy(Discrepancy):
         return ((heights * (upper - lower)).sum(axis=-1)[..., None],)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
-        """Return the ranks of the values among all finite values, the knots."""
+        """Return the ranks of the values among all finite values, the knots, and S_N there."""
         pooled = np.concatenate([simulated, self.observed])
         knots = np.unique(pooled[np.isfinite(pooled)])
         starts = knots[:-1]
         order, below = ranked(simulated, starts, kind="quicksort")
-        observed_order, observed_below = ranked(self.observed, starts, kind="quicksort")
-        lengths = np.diff(knots)
-        arrays = (order, below, observed_order, observed_below, lengths)
-        rows = tuple(array[None] for array in arrays)
-        return RankedBasis(rows, (self.weights,), (self.specimens,))
+        observed = summed_below(self.weights, *ranked(self.observed, starts, kind="quicksort"))
+        rows = tuple(array[None] for array in (order, below, observed, np.diff(knots)))
+        return RankedBasis(rows, (self.specimens,))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the area."""
@@ -140,9 +138,8 @@ class AreaSum(PartSum):
         bases = [target.basis(values) for target, values in projected(self.parts, simulated)]
         columns = zip(*[basis.arrays for basis in bases], strict=True)
         arrays = [_padded([row for (row,) in column]) for column in columns]
-        observed_weights = tuple(part.target.weights for part in self.parts)
         specimens = tuple(getattr(part.target, "specimens", 0) for part in self.parts)
-        return RankedBasis(tuple(arrays), observed_weights, specimens)
+        return RankedBasis(tuple(arrays), specimens)
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the areas times their shares."""
@@ -152,24 +149,24 @@ class AreaSum(PartSum):
 
 @dataclass(frozen=True, eq=False)
 class RankedBasis(Basis):
-    """The ranks of stored and observed values among the knots, for each of K projections.
+    """The ranks of stored values among the knots, for each of K projections.
 
-    The arrays, with a row for each projection, are for either side the order of the values and the
-    number of values up to each knot, then the lengths of the intervals between knots. Intervals
-    without length fill shorter rows: the graph of many projections is no larger than that of one.
+    The arrays, with a row for each projection, are the order of the values, the number of values up
+    to each knot, S_N at the knots, (K, m) or (K, ..., m) for several data sets, and the lengths of
+    the intervals between knots. Intervals without length fill shorter rows: the graph of many
+    projections is no larger than that of one.
     """
 
-    observed_weights: tuple[Floats, ...]
     specimens: tuple[int, ...]  # N of each projection's correction, or zero
 
     def features(self, weights: Any, xp: Any = np) -> Features:
         """Return the areas, (..., K)."""
-        if xp is np or len(self.observed_weights) == 1:  # one after another takes less memory
+        if xp is np or len(self.specimens) == 1:  # one after another takes less memory
             areas = []
-            for k, observed_weights in enumerate(self.observed_weights):
-                order, below, observed_order, observed_below, lengths = [a[k] for a in self.arrays]
-                table = correction_table(self.specimens[k])
-                if xp is np and observed_weights.ndim == 1 and lengths.size > 16 * order.size:
+            for k, n in enumerate(self.specimens):
+                order, below, observed, lengths = [a[k] for a in self.arrays]
+                table = correction_table(n)
+                if xp is np and observed.ndim == 1 and lengths.size > 16 * order.size:
                     areas.append(self._integrals[k].areas(weights, table))
                     continue
                 if xp is np and weights.size > 1 << 16:  # where a compiled loop repays its loading
@@ -179,27 +176,23 @@ class RankedBasis(Basis):
                     simulated = simulated.reshape(*weights.shape[:-1], -1)
                 else:
                     simulated = summed_below(weights, order, below, xp)
-                observed = summed_below(observed_weights, observed_order, observed_below, xp)
                 heights = _heights(simulated, observed, table, xp)
                 areas.append((heights * lengths).sum(axis=-1))
             return (xp.stack(areas, axis=-1),)
-        order, below, observed_order, observed_below, lengths = self.arrays
+        order, below, observed, lengths = self.arrays
         simulated = _rows_summed_below(xp.take(weights, order), below, xp)
-        rows = np.arange(len(self.observed_weights))[:, None]
-        sorted_weights = xp.as_tensor(_padded(self.observed_weights))[rows, observed_order]
-        observed = _rows_summed_below(sorted_weights, observed_below, xp)
         tables = np.stack([correction_table(n) for n in self.specimens])
         return ((_heights(simulated, observed, tables, xp) * lengths).sum(axis=-1),)
 
     @cached_property
     def _integrals(self) -> list[_Integral]:
         """The observed side of each projection."""
-        rows = zip(*self.arrays, self.observed_weights, strict=True)
-        return [_Integral.of(*row) for row in rows]
+        return [_Integral.of(*row) for row in zip(*self.arrays, strict=True)]
 
     def rows(self, index: Any) -> Self:
         """Return the ranks for some of several data sets."""
-        return replace(self, observed_weights=tuple(w[index] for w in self.observed_weights))
+        order, below, observed, lengths = self.arrays
+        return replace(self, arrays=(order, below, observed[:, index], lengths))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,13 +213,10 @@ class _Integral:
         cls,
         order: NDArray[np.intp],
         below: NDArray[np.intp],
-        observed_order: NDArray[np.intp],
-        observed_below: NDArray[np.intp],
+        observed: Floats,
         lengths: Floats,
-        observed_weights: Floats,
     ) -> _Integral:
-        """Add up S_N from its steps."""
-        observed = summed_below(observed_weights, observed_order, observed_below)
+        """Integrate S_N, known at the knots."""
         starts = np.searchsorted(below, np.arange(order.size) + 1)
         edges = np.concatenate([[0], starts, [lengths.size]])
         positions, integral = (
@@ -327,10 +317,11 @@ def _heights(simulated: Any, observed: Any, tables: Floats, xp: Any) -> Any:
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return arrays of one axis as rows of one array, with zeros behind those that are shorter."""
-    out = np.zeros((len(arrays), max(map(len, arrays))), dtype=arrays[0].dtype)
-    for row, array in zip(out, arrays, strict=True):
-        row[: array.size] = array
+    """Return arrays as rows of one array, with zeros behind those whose last axis is shorter."""
+    sizes = [array.shape[-1] for array in arrays]
+    out = np.zeros((len(arrays), *arrays[0].shape[:-1], max(sizes)), dtype=arrays[0].dtype)
+    for row, array, size in zip(out, arrays, sizes, strict=True):
+        row[..., :size] = array
     return out
 
 

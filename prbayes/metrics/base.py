@@ -349,7 +349,8 @@ class JoinedBasis(Basis):
 
     def rows(self, index: Any) -> Self:
         """Return the maps for some of several data sets."""
-        return replace(self, bases=tuple(basis.rows(index) for basis in self.bases))
+        bases = tuple(basis.rows(index) for basis in self.bases)
+        return replace(self, arrays=sum((basis.arrays for basis in bases), ()), bases=bases)
 
 
 def joined(bases: Sequence[Basis]) -> Basis:

@@ -348,7 +348,9 @@ class CellwiseDiscrepancy(DensityDiscrepancy):
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum over the cells."""
-        return self.terms(features[0], self.constants, xp).sum(axis=-1)
+        # Arrays, so that a graph has the same structure for other data.
+        constants = tuple(map(np.atleast_1d, self.constants))
+        return self.terms(features[0], constants, xp).sum(axis=-1)
 
 
 class DensitySum(PartSum):

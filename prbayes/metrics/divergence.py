@@ -102,8 +102,7 @@ class ResidualDiscrepancy(CellwiseDiscrepancy):
 
         The measure is the width in the integral form, one in the sum form.
         """
-        # np.float64, because PyTensor casts Python floats to float32.
-        root = np.sqrt(np.float64(self.scale_factor))
+        root = np.sqrt(self.scale_factor)
         return root, self.density, self.cells.widths if self.cells.smooth else 1.0
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:

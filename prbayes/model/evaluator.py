@@ -42,7 +42,7 @@ from prbayes.propagation.base import Bound, responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
-from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, with_shared_arrays
 from prbayes.response.inputs import Inputs, is_known, read_inputs
 
 # Points of a design from which on samplers start with an eighth of them.
@@ -214,6 +214,9 @@ class Evaluator:
                     for node, params in zip(self.nodes, _simulator_params(self), strict=True)
                 ]
                 graphs = model.replace_rvs_by_values(graphs)
+                for k, node in enumerate(self.nodes):
+                    if node.bound.stored:
+                        graphs[k] = with_shared_arrays(graphs[k])
                 scales = pt.dvector("scales")
                 scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
                 total = scaled - _log_other(model, _ordinary(model))

@@ -28,6 +28,7 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
+from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
@@ -37,7 +38,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import variables_at
+from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
@@ -425,9 +426,8 @@ def _findings(
                 "likelihood.md#identification",
             )
         )
-    for mode, weight in zip(modes[1:], weights[1:], strict=True):
-        if weight < 0.01:
-            continue
+    second_modes = [(m, w) for m, w in zip(modes[1:], weights[1:], strict=True) if w >= 0.01]
+    for mode, weight in second_modes:
         findings.append(
             Finding(
                 "second-mode",
@@ -437,7 +437,48 @@ def _findings(
                 "likelihood.md#several-modes",
             )
         )
+    is_too_small = _too_small_errors(evaluator.hyperparameters, objective, best)
+    too_small = [name for name in names[is_too_small] if name not in excluded]
+    if too_small and not second_modes:
+        findings.append(
+            Finding(
+                "flat-likelihood",
+                f"The likelihood of {', '.join(too_small)} is more than three times as wide as "
+                "the standard error: values four standard errors from the optimum are nearly as "
+                "likely. Report intervals of prb.sample.",
+                "likelihood.md#flat-likelihood",
+            )
+        )
     return findings
+
+
+def _too_small_errors(
+    hyperparameters: Hyperparameters, objective: _Objective, best: Mode
+) -> NDArray[np.bool_]:
+    """Return which standard errors, (d,), are less than a third as wide as the likelihood.
+
+    The root of the profile likelihood ratio four standard errors away is compared with four, or
+    with the distance in the user's units where that is shorter, as from a spread to zero. Where a
+    population is normal, the root is at least half as large, also with three specimens.
+    """
+    size = best.theta.size
+    is_too_small = np.zeros(size, dtype=bool)
+    for i in range(size):
+        variance = best.covariance[i, i]
+        if not 0 < variance < np.inf:
+            continue
+        # Other elements follow as they would under a normal likelihood.
+        step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
+        value = ends_of_prior(hyperparameters, best.theta)[0][i]
+        near = ends_of_prior(hyperparameters, best.theta + 0.01 * step)[0][i]
+        unit = np.abs(near - value) / 0.01
+        for shift in (-4.0, 4.0):
+            theta = best.theta + shift * step
+            far = ends_of_prior(hyperparameters, theta)[0][i]
+            distance = np.fmin(np.abs(far - value) / unit, 4.0)
+            if _signed_root(objective, best, theta, i) < distance / 3:
+                is_too_small[i] = True
+    return is_too_small
 
 
 def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> float:

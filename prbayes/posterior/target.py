@@ -20,10 +20,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
-from scipy.special import logsumexp, ndtri
+from scipy.special import ndtri
 
 from prbayes._finding import Finding
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._stats import log_sum_exp
+from prbayes._validate import IN_CACHE, Floats
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
@@ -216,13 +217,11 @@ class RefitLikelihood:
         sampling = self.centers[0]
         x = sampling.coordinates(self.continuation.coordinates(thetas))
         largest = max(count.shape[1] for count in self.counts)
-        rows = max(16, AT_ONCE // max(largest, len(self.estimates)))
+        rows = max(16, IN_CACHE // max(largest, len(self.estimates)))
         for first in range(0, len(x), rows):
             block = x[first : first + rows]
-            # Log weights of the data sets, which sum to one.
+            # Log weights of the data sets, up to a constant of each row.
             logs = _log_likelihoods(sampling, self.counts, block) - self.log_mixture
-            with np.errstate(invalid="ignore"):
-                logs -= logsumexp(logs, axis=1, keepdims=True)
             is_supported = np.isfinite(logs).any(axis=1)
             values = np.full(len(block), -np.inf)
             if is_supported.any():
@@ -248,6 +247,8 @@ def extended_log_density(
 ) -> Floats:
     """Return the log-density of an estimate of zero, (S,), given log weights (S, R) of estimates.
 
+    The weights are known up to a factor.
+
     The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
     distribution with their moments. A few data sets with one standard error join the moments, which
     matters if few of the synthetic ones have weights. ``shifts``, (S, r), are the populations
@@ -256,6 +257,7 @@ def extended_log_density(
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
     untilted = cumulants([log_weights], scores, np.zeros_like(shifts))
+    log_weights = log_weights - untilted.values[:, None]  # they sum to one
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
     part = effective / (effective + options.prior_sets * (r + 1))
     # Beyond all data sets the mean is as far away as the population.
@@ -356,7 +358,7 @@ def refit_likelihood(
             likelihood,
             counts=joined,
             estimates=np.concatenate(estimates),
-            log_mixture=logsumexp(logs, axis=0),
+            log_mixture=log_sum_exp(logs.T),
         )
     return likelihood
 

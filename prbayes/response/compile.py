@@ -14,14 +14,14 @@ import pytensor.tensor as pt
 from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.op import Op
-from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.replace import clone_replace, graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.variable import TensorVariable
+from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 
 def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
@@ -191,6 +191,20 @@ def _is_stateless(op: Op) -> bool:
         return False
     parts = [getattr(op, name, None) for name in getattr(op, "__props__", None) or ()]
     return all(map(_is_stateless, [part for part in parts if isinstance(part, Op)]))
+
+
+def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
+    """Replace constant arrays by shared variables: graphs for other data have one structure."""
+    arrays: dict[Any, Any] = {}
+    for variable in ancestors([graph]):
+        if not isinstance(variable, TensorConstant):
+            continue
+        values = variable.data
+        if values.dtype == np.float64 and values.ndim and values.size:
+            shape = [n if n == 1 else None for n in values.shape]
+            arrays[variable] = pytensor.shared(values, shape=shape, borrow=True)
+    (result,) = clone_replace([graph], arrays, rebuild_strict=False)
+    return result
 
 
 # -- batches ---------------------------------------------------------------------------------------
