@@ -471,7 +471,7 @@ def _too_small_errors(
         step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
         value = ends_of_prior(hyperparameters, best.theta)[0][i]
         near = ends_of_prior(hyperparameters, best.theta + 0.01 * step)[0][i]
-        unit = np.abs(near - value) / 0.01
+        unit = max(np.abs(near - value) / 0.01, 1e-300)  # a transform may saturate
         for shift in (-4.0, 4.0):
             theta = best.theta + shift * step
             far = ends_of_prior(hyperparameters, theta)[0][i]
