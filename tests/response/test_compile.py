@@ -214,7 +214,9 @@ def test_a_model_that_is_built_again_has_its_functions(compilations: list[Any]) 
 
 
 @pytest.mark.parametrize(
-    "metric", [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric()], ids=repr
+    "metric",
+    [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric()],
+    ids=["PR", "KLD", "area"],
 )
 def test_the_objective_of_other_data_is_not_compiled_again(
     metric: prb.Metric, compilations: list[Any]
