@@ -344,6 +344,19 @@ def test_conflict_of_prior_and_data(problem: Problem) -> None:
     assert str(checked.findings[0]).startswith("mu: got prior")
 
 
+def test_conflict_is_reported_with_censored_readings_too() -> None:
+    readings = np.minimum(np.random.default_rng(1).normal(4, 1, 20), 4.5)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0.0, 0.5), pm.HalfNormal("sigma", 1.0))
+        metric = prb.LogLikelihood(censored=(None, 4.5))
+        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, observed=readings)
+    posterior = prb.sample(model=model, progressbar=False)
+    diagnosis = prb.diagnose(posterior, model=model)
+    assert "prior-conflict" in [finding.code for finding in diagnosis.findings]
+    (untested,) = diagnosis.untested
+    assert untested.startswith("The family of the population was not tested: readings of y are c")
+
+
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:
     assert not influence(posterior)
     heavy = posterior.copy(deep=True)

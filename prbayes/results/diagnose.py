@@ -36,7 +36,7 @@ from prbayes.model.parameters import (
     table_elements,
 )
 from prbayes.optimize.design_refinement import rough_emulators
-from prbayes.optimize.maximum_likelihood import simulation_obstacle
+from prbayes.optimize.maximum_likelihood import specimen_refit_obstacle
 from prbayes.optimize.minimize import find_optimum
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import (
@@ -244,7 +244,11 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         checked += emulator_remarks(optimum.evaluator) + check_population(optimum)
     elif has_draws:
         checked += check_draws(evaluator, tree, thetas)
-        if evaluator is not None and thetas is not None and simulation_obstacle(evaluator) is None:
+        if (
+            evaluator is not None
+            and thetas is not None
+            and specimen_refit_obstacle(evaluator) is None
+        ):
             maximum = find_optimum(evaluator, Minimisation())
             checked += check_population(maximum) + check_conflict(maximum, thetas)
     else:

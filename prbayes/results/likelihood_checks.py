@@ -34,7 +34,11 @@ from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
+from prbayes.optimize.maximum_likelihood import (
+    simulation_obstacle,
+    specimen_refit_obstacle,
+    specimen_refits,
+)
 from prbayes.optimize.optimum import Optimum, require_minimiser
 from prbayes.response.compile import compile_batched
 from prbayes.response.condition import is_condition
@@ -316,7 +320,7 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
         return checked + Checked(untested=(f"{both}: that needs the model; pass model=.",))
     checked += Checked(failing_region_findings(evaluator, thetas.mean(axis=0)))
     checked += emulator_remarks(evaluator)
-    obstacle = simulation_obstacle(evaluator)
+    obstacle = specimen_refit_obstacle(evaluator)
     if obstacle is None:
         return checked
     return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
