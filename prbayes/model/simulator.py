@@ -702,7 +702,8 @@ def _prepared_metric(
         return target
     except (TypeError, ValueError) as error:
         values = np.asarray(observed, dtype=np.float64)
-        causes = outlier_findings(name, values, np.empty(0), ()) if values.ndim == 1 else ()
+        is_sample = values.ndim == 1 and values.size
+        causes = outlier_findings(name, values, np.empty(0), ()) if is_sample else ()
         cause = "".join(f" {finding.text}" for finding in causes)
         raise type(error)(f"{name}: {error}{cause and f'.{cause}'}") from None
 
