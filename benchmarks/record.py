@@ -32,7 +32,7 @@ def about(packages: Iterable[str] = PACKAGES) -> dict[str, Any]:
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     module = f"-m {spec.name}" if spec is not None else sys.argv[0]
     # What the benchmarks themselves write is no change of what they measure.
-    code = [".", ":!benchmarks/results", ":!docs/images"]
+    code = [".", ":!benchmarks/results", ":!docs"]
     status = _git("status", "--porcelain", "--untracked-files=no", "--", *code)
     changed = " with changes" if status else ""
     versions = {"python": platform.python_version()}
