@@ -301,31 +301,20 @@ def calibrated(n):
                       propagation=prb.Resimulated(n))
         return prb.minimize(start={"mu": 0.8, "sigma": 0.7})
 
-calibrated(1000)  # what is imported and compiled on the way
-begun = peak()
-optimum = calibrated(int(sys.argv[2]))
+optimum = calibrated(1_000_000)
 assert optimum.converged, optimum.message
 assert abs(optimum.point["mu"] - 1) < 4 * optimum.stderr["mu"], optimum
-print(begun, peak())
+print(peak())
 """
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
-@pytest.mark.parametrize(
-    ("metric", "n"),
-    [
-        # A tenth of a million says as much of what each response takes, in less time.
-        ("ProbabilityResidual", 100_000),
-        ("ProbabilityResidual", 1_000_000),
-        ("AreaMetric", 1_000_000),
-    ],
-)
+@pytest.mark.parametrize("metric", ["ProbabilityResidual", "AreaMetric"])
 @pytest.mark.slow
 def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a_gibibyte(
-    metric: str, n: int
+    metric: str,
 ) -> None:
-    command = [sys.executable, "-c", MILLION, metric, str(n)]
+    command = [sys.executable, "-c", MILLION, metric]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-    begun, peak = map(float, run.stdout.split())
-    assert begun + (peak - begun) * (1_000_000 / n) < 1.0
+    assert float(run.stdout) < 1.0
