@@ -209,10 +209,11 @@ def test_epsilon_is_restored_after_a_failure(monkeypatch: pytest.MonkeyPatch) ->
     def fail(*_: Any) -> None:
         raise RuntimeError("stop")
 
+    model, _ = area_run()
     monkeypatch.setattr(prb.posterior.BatchedKernel, "mutate", fail)
     with pytest.raises(RuntimeError, match="stop"):
-        sample(area_run()[0], 50, chains=1, epsilon=0.7)
-    assert epsilons(area_run()[0]) == [0.02]
+        sample(model, 50, chains=1, epsilon=0.7)
+    assert epsilons(model) == [0.02]
 
 
 @pytest.mark.long
