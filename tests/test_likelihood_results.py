@@ -355,6 +355,14 @@ def test_conflict_is_reported_with_censored_readings_too() -> None:
     assert "prior-conflict" in [finding.code for finding in diagnosis.findings]
     (untested,) = diagnosis.untested
     assert untested.startswith("The family of the population was not tested: readings of y are c")
+    # The power is that of complete readings.
+    with pm.Model() as agreeing:
+        x = pm.Normal.dist(pm.Normal("mu", 4.0, 0.5), pm.HalfNormal("sigma", 1.0))
+        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, observed=readings)
+    maximum = prb.minimize(agreeing, progressbar=False)
+    pulled = maximum.theta + np.sqrt(np.diag(maximum.covariance))
+    (remark,) = check_conflict(maximum, pulled[None]).remarks
+    assert str(remark).endswith("no hyperparameter is in conflict with its prior (p > .05).")
 
 
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:

@@ -411,14 +411,11 @@ def _rare_probability(
             f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
             "return +inf for specimens that fail"
         )
-    # Of the specimens that have a response, as from stored responses
+    # The probability is that of specimens with a response, as from stored responses.
     by_draw = np.minimum(event.by_draw / (1 - event.lost), 1.0)
     error = np.hypot(event.error / (1 - event.lost), _error_of_draws(populations, by_draw))
-    return _Estimate(
-        *(by_draw, float(error), responses.count, "importance points"),
-        points=points,
-        lost=event.lost,
-    )
+    count, lost = responses.count, event.lost
+    return _Estimate(by_draw, float(error), count, "importance points", points=points, lost=lost)
 
 
 def _error_of_draws(populations: Populations, by_draw: Floats) -> float:

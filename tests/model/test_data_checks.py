@@ -472,7 +472,7 @@ def test_an_impossible_repeated_reading_is_reported_by_the_optimum() -> None:
     y = np.repeat(rng.normal(1, 0.5, 8), 3) + rng.normal(0, 0.1, 24)
     y[4] *= 10
 
-    def found(y: Floats, **keywords: object) -> list[str]:
+    def codes(y: Floats, **keywords: object) -> list[str]:
         with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
             metric = prb.LogLikelihood(**{"error": 0.1} | keywords)  # type: ignore[arg-type]
@@ -480,6 +480,6 @@ def test_an_impossible_repeated_reading_is_reported_by_the_optimum() -> None:
             prb.Simulator("y", np.positive, x, metric=metric, observed=y, specimens=specimens)
         return [finding.code for finding in prb.minimize(model, progressbar=False).findings]
 
-    assert found(y) == ["readings-misfit"]
-    assert "readings-misfit" not in found(y, gross_errors=True)
-    assert found(np.delete(y, 4).take(np.r_[0:4, 4, 4:23])) == []
+    assert codes(y) == ["readings-misfit"]
+    assert "readings-misfit" not in codes(y, gross_errors=True)
+    assert codes(np.delete(y, 4).take(np.r_[0:4, 4, 4:23])) == []
