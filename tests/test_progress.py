@@ -2,7 +2,6 @@
 
 import io
 import sys
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,22 +17,45 @@ from prbayes._progress import _expected, progress, shown
 
 @pytest.fixture
 def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
-    """A terminal that all bars are drawn on, and patience of a hundredth of a second."""
+    """A terminal that all bars are drawn on."""
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
     monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
-    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.01)
     return text
+
+
+@pytest.fixture
+def impatient(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """A terminal on which bars are drawn at once, however quick the work is."""
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
+    return screen
+
+
+class Clock:
+    """A clock that is set by hand, in seconds."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(prbayes._progress, "time", clock)
+    return clock
 
 
 @pytest.mark.parametrize("total", [3, None])
 def test_a_bar_appears_when_the_work_turns_out_to_be_long(
-    screen: io.StringIO, total: int | None
+    screen: io.StringIO, clock: Clock, total: int | None
 ) -> None:
     with progress("walking", total) as report:
         assert screen.getvalue() == ""
         for _ in range(3):
-            time.sleep(0.02)
+            clock.now += 1.5
             report(1, "on foot")
     for text in ("walking", "on foot", "3/3" if total else "3"):
         assert text in screen.getvalue()
@@ -41,36 +63,37 @@ def test_a_bar_appears_when_the_work_turns_out_to_be_long(
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_short_work_shows_nothing(
-    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool
+    screen: io.StringIO, clock: Clock, monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
     monkeypatch.setattr(prbayes._progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
-    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 2.0)
     for total in (100, None):
         with progress("quick", total) as report:
             for _ in range(100):
+                clock.now += 0.0199
                 report(1, "")
     assert screen.getvalue() == ""
 
 
 @pytest.fixture
 def log(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
-    """No terminal: a line for each hundredth of a second."""
+    """No terminal."""
     monkeypatch.setattr(prbayes._progress, "CONSOLE", Console(file=screen, force_terminal=False))
-    monkeypatch.setattr(prbayes._progress, "_LINE_EVERY", 0.01)
     return screen
 
 
 def test_where_no_bar_can_move_there_is_a_line_each_minute(
-    log: io.StringIO, monkeypatch: pytest.MonkeyPatch
+    log: io.StringIO, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with progress("walking", 3) as report:
+        clock.now += 59.0
         report(1, "on foot")
         assert log.getvalue() == ""
-        time.sleep(0.02)
+        clock.now += 1.0
         report(1, "[on foot]")
+        clock.now += 59.0
         report(1, "on foot")
     with progress("looking") as report:
-        time.sleep(0.02)
+        clock.now += 60.0
         report(1, "")
     said = "walking 2/3 [on foot]\nlooking 1\n"
     assert log.getvalue() == said
@@ -78,7 +101,7 @@ def test_where_no_bar_can_move_there_is_a_line_each_minute(
     for on_page in (False, True):
         monkeypatch.setattr(prbayes._progress, "_in_kernel", lambda on_page=on_page: on_page)
         with shown(on_page), progress("walking", 2) as report:
-            time.sleep(0.02)
+            clock.now += 60.0
             report(1, "")
         assert log.getvalue() == said
 
@@ -100,9 +123,9 @@ def test_the_seconds_left_are_those_at_the_pace_so_far() -> None:
     assert _expected(3.0, 7, None) == 3.0
 
 
-def test_what_is_hidden_outside_stays_hidden_inside(screen: io.StringIO) -> None:
+def test_what_is_hidden_outside_stays_hidden_inside(screen: io.StringIO, clock: Clock) -> None:
     with shown(False) as outer, shown(True) as inner, progress("hidden", 2) as report:
-        time.sleep(0.02)
+        clock.now += 3.0
         report(1, "")
         assert not outer
         assert not inner
@@ -111,17 +134,17 @@ def test_what_is_hidden_outside_stays_hidden_inside(screen: io.StringIO) -> None
         assert visible
 
 
-def test_a_bar_is_taken_away_when_the_work_fails(screen: io.StringIO) -> None:
+def test_a_bar_is_taken_away_when_the_work_fails(screen: io.StringIO, clock: Clock) -> None:
     def fail() -> None:
         with progress("failing", 2) as report:
-            time.sleep(0.02)
+            clock.now += 3.0
             report(1, "")
             raise ValueError("lost")
 
     with pytest.raises(ValueError, match="lost"):
         fail()
     with progress("next", 2) as report:
-        time.sleep(0.02)
+        clock.now += 3.0
         report(1, "")
     assert "next" in screen.getvalue()
 
@@ -136,7 +159,7 @@ def build(**settings: Any) -> pm.Model:
 
 
 @pytest.mark.long
-def test_a_design_that_grows_shows_its_error(screen: io.StringIO) -> None:
+def test_a_design_that_grows_shows_its_error(impatient: io.StringIO) -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
         b = pm.Normal.dist(1, pm.HalfNormal("sigma", 0.5))
@@ -144,29 +167,27 @@ def test_a_design_that_grows_shows_its_error(screen: io.StringIO) -> None:
         propagation = prb.Reweighted(64, emulator=None)
         prb.Simulator("y", lambda a, b: a * b, a, b, **data, propagation=propagation)
     assert prb.minimize(model, starts=0).n_responses > 64
-    text = " ".join(screen.getvalue().split())
+    text = " ".join(impatient.getvalue().split())
     assert "0.1 are wanted" in text
 
 
 @pytest.mark.parametrize("visible", [True, False])
 def test_everything_inside_the_sampler_follows_its_keyword(
-    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, visible: bool
+    impatient: io.StringIO, visible: bool
 ) -> None:
-    # At once, however quick the search is.
-    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
     model = build(propagation=prb.Resimulated(16), epsilon=None)
     settings = {"model": model, "adjustment": None, "random_seed": 1}
     prb.sample_smc(20, chains=1, progressbar=visible, **settings)
     for text in ("SMC stages", "evaluations", "discrepancy"):
-        assert (text in screen.getvalue()) == visible
+        assert (text in impatient.getvalue()) == visible
     if not visible:
-        assert screen.getvalue() == ""
+        assert impatient.getvalue() == ""
 
 
-def test_a_calibration_of_the_sampler_shows_one_bar(screen: io.StringIO) -> None:
+def test_a_calibration_of_the_sampler_shows_one_bar(impatient: io.StringIO) -> None:
     prb.simulation_based_calibration(2, model=build(propagation=prb.Reweighted(32)), draws=50)
-    assert "data sets" in screen.getvalue()
-    assert not {"SMC", "refits", "evaluations"} & set(screen.getvalue().split())
+    assert "data sets" in impatient.getvalue()
+    assert not {"SMC", "refits", "evaluations"} & set(impatient.getvalue().split())
 
 
 def test_a_kernel_without_widgets_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

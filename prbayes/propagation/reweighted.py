@@ -112,7 +112,7 @@ class Reweighted(Propagation):
     timeout : float, optional
         Seconds after which a response has failed; with executors of processes only, Dask's among
         them, as nothing else ends a response that hangs. What hangs outside Python ends with its
-        worker, half as long again and a second later; Dask then tries it on other workers.
+        worker, half as long again and five seconds later; Dask then tries it on other workers.
 
     Raises
     ------

@@ -419,8 +419,8 @@ class Tally:
             self.named = chunk.named
         if set(self.named.labels) != set(chunk.named.labels):
             raise ResponseError(
-                f"the response returned a mapping with {list(chunk.named.names)}, expected "
-                f"{list(self.named.names)}, as for the first specimen"
+                f"the response returned a mapping with the keys {list(chunk.named.names)}, "
+                f"expected {list(self.named.names)}, as for the first specimen"
             )
         order = [chunk.named.labels.index(label) for label in self.named.labels]
         return chunk.values[..., order]

@@ -93,7 +93,8 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         return
     start = time.monotonic()
     message = f"no result within timeout = {seconds:g} s"
-    with _watchdog(1.5 * seconds + 1):  # late enough for the signal to come first
+    # Late enough for the signal to come first, also where a busy machine stands still for seconds.
+    with _watchdog(1.5 * seconds + 5):
         try:
             in_main = threading.current_thread() is threading.main_thread()
             if in_main and hasattr(signal, "setitimer"):
@@ -116,13 +117,16 @@ def _alarm(seconds: float) -> Iterator[None]:
     is_over = False
 
     def interrupt(*_: object) -> None:
+        nonlocal is_over
         if not is_over:
+            is_over = True  # nothing interrupts the clean-up after it
             raise _AlarmError
 
     previous = signal.signal(signal.SIGALRM, interrupt)
     try:
         try:
-            signal.setitimer(signal.ITIMER_REAL, seconds)
+            # Again each second: another thread may receive a signal, and the main thread sleeps on.
+            signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
             yield
         finally:
             is_over = True  # an alarm from here on must not break the clean-up

@@ -16,7 +16,7 @@ from um_server import Real
 import prbayes as prb
 from prbayes.response.call import CallSettings, Points, Tally, respond
 
-LIMIT = 0.4
+LIMIT = 2.0
 
 
 def by_command(folder: Path) -> Iterator[prb.scalar]:
@@ -66,6 +66,6 @@ def test_a_model_that_never_returns_costs_its_specimen_without_workers_in_proces
             (failure,) = tally.failed.values()
             assert failure.reason.startswith("it raised TimeoutError: ")
             assert f"within timeout = {LIMIT:g} s" in failure.reason
-            assert time.monotonic() - clock < 10
+            assert time.monotonic() - clock < 30
     finally:
         making.close()

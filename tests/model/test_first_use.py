@@ -137,7 +137,9 @@ def test_the_first_use_computes_the_runs_once(name: str, caplog: pytest.LogCaptu
     model = build(response, observed=2 * OBSERVED)
     with caplog.at_level(logging.INFO, "prbayes"):
         USES[name](model)
-    assert caplog.text.count("y: runs at first: 32, less than 1 s; for each value of") == 1
+    (message,) = [r.getMessage() for r in caplog.records if "runs at first" in r.getMessage()]
+    assert message.startswith("y: runs at first: 32, ")
+    assert "for each value of the hyperparameters: 0" in message
     assert "pass another number in propagation=Reweighted(n=32)" in caplog.text
     if name != "pickled":  # with a response of its own
         assert response.runs == 32 + AGAIN
@@ -210,7 +212,7 @@ def test_two_threads_compute_the_runs_once() -> None:
     ("propagation", "line"),
     [
         (prb.Reweighted(16), "y: runs at first: 16; for each value of the hyperparameters: 0;"),
-        (prb.Fresh(40), "y: runs at first: 16, less than 1 s; for each .*: 40, less than 1 s; .*="),
+        (prb.Fresh(40), "y: runs at first: 16, .* s; for each .*: 40, .* s; .*="),
     ],
 )
 def test_the_line_of_a_design_comes_before_its_only_call(

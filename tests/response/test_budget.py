@@ -100,7 +100,7 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path) -> None:
         assert str(tmp_path) in message
         assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.search.stopped
     # A budget that is large enough changes nothing.
-    optimum = found(tmp_path / "parts", max_seconds=1000, max_runs=at_once.n_responses)
+    optimum = found(tmp_path / "parts", max_seconds=1e6, max_runs=at_once.n_responses)
     assert not optimum.search.stopped
     assert np.array_equal(optimum.theta, at_once.theta)
     assert np.array_equal(optimum.covariance, at_once.covariance)
@@ -116,10 +116,11 @@ def test_before_anything_is_known_minimize_says_what_is_kept(tmp_path: Path) -> 
 
 def test_minimize_stops_in_time(tmp_path: Path) -> None:
     # A theta takes 0.16 s, a chunk a hundredth.
-    clock = time.perf_counter()
+    response = Counted(0.01)
     with pytest.raises(BudgetError, match=r"max_seconds = 0\.1 was reached"):
-        found(tmp_path, prb.scalar(Counted(0.01)), max_seconds=0.1)
-    assert time.perf_counter() - clock < 5
+        found(tmp_path, prb.scalar(response), max_seconds=0.1)
+    # Those of the first use come before.
+    assert response.calls <= 16 + 3 + 11
 
 
 def test_with_stored_responses_the_best_so_far_is_complete() -> None:

@@ -134,10 +134,10 @@ def nothing_is_left() -> bool:
 def test_what_is_in_time_is_left_alone(where: str) -> None:
     def quick() -> int:
         for _ in range(200):
-            with time_limit(0.02):
+            with time_limit(0.2):
                 pass
         # None of those that were set comes later.
-        spin(0.04)
+        spin(0.25)
         return 3
 
     assert run(where, quick) == 3
@@ -149,10 +149,10 @@ def test_an_alarm_while_the_clock_is_stopped_comes_too_late(
 ) -> None:
     stop = signal.setitimer
 
-    def stopped(which: int, seconds: float) -> None:
+    def stopped(which: int, seconds: float, interval: float = 0.0) -> None:
         if seconds == 0:
             signal.raise_signal(signal.SIGALRM)
-        stop(which, seconds)
+        stop(which, seconds, interval)
 
     monkeypatch.setattr(signal, "setitimer", stopped)
     with time_limit(5.0):
@@ -162,12 +162,12 @@ def test_an_alarm_while_the_clock_is_stopped_comes_too_late(
 
 def replacing_the_alarm() -> None:
     try:
-        spin(10.0)
+        spin(60.0)
     except BaseException as error:
         raise RuntimeError("Failed to instantiate model") from error
 
 
-@pytest.mark.parametrize("late", [lambda: spin(10.0), replacing_the_alarm])
+@pytest.mark.parametrize("late", [lambda: spin(60.0), replacing_the_alarm])
 def test_what_runs_in_python_is_ended(late: Callable[[], None]) -> None:
     def limited() -> None:
         with time_limit(0.05):
@@ -176,7 +176,28 @@ def test_what_runs_in_python_is_ended(late: Callable[[], None]) -> None:
     begun = time.perf_counter()
     with pytest.raises(TimeoutError, match=r"^no result within timeout = 0.05 s$"):
         limited()
-    assert time.perf_counter() - begun < 1.0
+    assert time.perf_counter() - begun < 30.0
+    assert nothing_is_left()
+
+
+@pytest.mark.long
+def test_an_alarm_comes_again_and_is_raised_once() -> None:
+    """Another thread may receive the first one, while the main thread sleeps."""
+    intervals, cleaned = [], []
+
+    def late() -> None:
+        with time_limit(0.05):
+            intervals.append(signal.getitimer(signal.ITIMER_REAL)[1])
+            try:
+                spin(60.0)
+            finally:
+                spin(1.2)
+                cleaned.append(True)
+
+    with pytest.raises(TimeoutError):
+        late()
+    assert intervals == [1.0]
+    assert cleaned == [True]
     assert nothing_is_left()
 
 
@@ -211,7 +232,7 @@ def test_two_threads_have_a_clock_each(monkeypatch: pytest.MonkeyPatch) -> None:
     second.set()
     thread.join()
     # The shorter one is first, and then the longer one again.
-    assert wound == [31.0, 4.0, 31.0]
+    assert wound == [35.0, 8.0, 35.0]
     assert nothing_is_left()
 
 

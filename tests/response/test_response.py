@@ -102,9 +102,9 @@ def test_failures_are_counted(tmp_path: Path) -> None:
 
 
 def test_a_wrong_shape_is_no_failure_to_replace() -> None:
-    responses = Responses("y", lambda x: x[:2], inputs(X), on_failure=Replace())
+    responses = Responses("y", lambda x: x[:1], inputs(X), on_failure=Replace())
     with pytest.raises(
-        ResponseError, match=r"y: .*returned shape \(2,\) .* \(4,\), expected \(4,\)"
+        ResponseError, match=r"y: .*returned shape \(1,\) .* \(2,\), expected \(2,\)"
     ):
         responses([np.zeros((2, 3))], [])
 
@@ -381,14 +381,19 @@ def test_a_change_between_the_simulator_and_its_first_runs_is_refused(kind: str)
 
 
 def test_a_use_costs_at_most_five_runs_once_and_none_with_a_version(tmp_path: Path) -> None:
-    response = Counted(lambda x: np.where(x > 2, np.inf, np.where(x < -1.5, np.nan, x)))
-    for version, runs in ((None, [5]), ("1", [])):
+    asked: list[float] = []
+
+    def response(x: Any) -> Any:
+        asked.extend(x)
+        return np.where(x > 2, np.inf, np.where(x < -1.5, np.nan, x))
+
+    for version, runs in ((None, 5), ("1", 0)):
         stored = Responses("y", response, inputs(X), store=tmp_path, version=version)
         values = stored([POINTS], [])
-        response.asked.clear()
+        asked.clear()
         for _ in range(2):
             stored.used_by("prb.predict").refuse_change([POINTS], values, stored)
-        assert response.asked == runs
+        assert len(asked) == runs
 
 
 @pytest.mark.parametrize(

@@ -149,23 +149,26 @@ def test_what_is_no_number_and_what_the_model_raises(real: Real) -> None:
 
 @pytest.mark.long
 def test_a_request_that_never_returns_is_given_up_and_its_answer_is_nobody_s(real: Real) -> None:
-    moody = prb.umbridge(real.url, "moody", timeout=0.3)
-    clock = time.monotonic()
-    with pytest.raises(TimeoutError, match=r"moody: no response within timeout = 0.3 s from http"):
-        moody(-0.8)
-    assert time.monotonic() - clock < 0.7
+    moody = prb.umbridge(real.url, "moody", timeout=1.0)
+    with pytest.raises(TimeoutError, match=r"moody: no response within timeout = 1 s from http"):
+        moody(-2.0)
     # The late answer arrives meanwhile.
-    for x in np.linspace(1, 2, 100):
+    for x in np.linspace(1, 2, 120):
         assert moody(x) == 2 * x
         time.sleep(0.01)
 
 
-def test_requests_are_at_work_at_the_same_time(real: Real) -> None:
-    moody = prb.umbridge(real.url, "moody")
-    clock = time.monotonic()
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(moody, [-0.4] * 4)) == [-0.8] * 4
-    assert time.monotonic() - clock < 1.2
+def test_requests_are_at_work_at_the_same_time() -> None:
+    barrier = threading.Barrier(4, timeout=60)
+
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        barrier.wait()  # broken after the time limit unless four are at work
+        give(handler, x, y)
+
+    with telling(evaluate) as server, ThreadPoolExecutor(4) as pool:
+        response = prb.umbridge(server.url)
+        found = [float(pair[0]) for pair in pool.map(response, range(4), [1.0] * 4)]
+    assert found == [-2, -1, 0, 1]
 
 
 @pytest.mark.slow
@@ -284,7 +287,7 @@ def test_a_thread_keeps_its_connection_and_opens_another_where_it_was_closed() -
 def test_an_answer_in_drops_is_given_up_in_time(start: str) -> None:
     def evaluate(handler: Told, *_: float) -> None:
         handler.wfile.write(start.encode())
-        for _ in range(30):
+        for _ in range(600):
             handler.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n" if not start else b"X")
             time.sleep(0.05)
 
@@ -292,7 +295,7 @@ def test_an_answer_in_drops_is_given_up_in_time(start: str) -> None:
         clock = time.monotonic()
         with pytest.raises(TimeoutError, match=r"within timeout = 0.2 s"):
             prb.umbridge(server.url, timeout=0.2)(1.0, 2.0)
-        assert time.monotonic() - clock < 0.7
+        assert time.monotonic() - clock < 15
 
 
 def test_a_specimen_that_ends_its_server_is_sent_three_times() -> None:
