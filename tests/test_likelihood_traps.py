@@ -231,6 +231,16 @@ def three_outputs(a: Any, b: Any) -> Any:
     return np.stack([a + b, a - b, a * b], axis=-1)
 
 
+def two_frequencies(a: Any, b: Any) -> Any:
+    first = np.exp((a - b) / 2)
+    return np.stack([first, 1.8 * first + 0.2 * np.exp(a)], axis=-1)
+
+
+def in_order(rng: np.random.Generator, outputs: slice) -> pm.Model:
+    y = two_frequencies(sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3))
+    return model_of(two_frequencies, two_inputs, y[:, outputs])
+
+
 def bell(x: Any) -> Any:
     return np.exp(-(np.asarray(x) ** 2))
 
@@ -290,6 +300,11 @@ TRAPS = {
         "outside the range of all runs",
         partial(of_data, response=bell, change=lambda y: y + 1.1),
         partial(of_data, response=fold, change=lambda y: y),
+    ),
+    "swapped outputs": Trap(
+        "check the order of the outputs|readings-misfit",
+        partial(in_order, outputs=slice(None, None, -1)),
+        partial(in_order, outputs=slice(None)),
     ),
     "units": Trap(
         "check the units",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -509,13 +510,36 @@ def unreached(outputs: Floats, readings: Readings) -> str:
     with np.errstate(invalid="ignore"):
         outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
     count = int(outside.any(axis=1).sum())
-    if 2 * count <= len(readings):
-        return ""
-    return (
-        f"the readings of {count} of {len(readings)} specimens are outside the range of all runs "
-        "over the priors: check the response, the priors and the units, or pass "
-        "prb.LogLikelihood(error=...)"
-    )
+    if 2 * count > len(readings):
+        return (
+            f"the readings of {count} of {len(readings)} specimens are outside the range of all "
+            "runs over the priors: check the response, the priors and the units, or pass "
+            "prb.LogLikelihood(error=...)"
+        )
+    for pair in combinations(range(finite.shape[1]), 2):
+        count = _n_beyond(finite[:, pair], readings.values[:, pair])
+        if 2 * count > len(readings):
+            return (
+                f"outputs {pair[0]} and {pair[1]} of {count} of {len(readings)} specimens are "
+                "outside the range of all runs over the priors together, although each is within "
+                "its own range: check the order of the outputs, the response and the priors"
+            )
+    return ""
+
+
+def _n_beyond(runs: Floats, readings: Floats) -> int:
+    """Return how many readings of two outputs, (N, 2), lie beyond all runs (n, 2) in a direction.
+
+    The direction is that of the linear discriminant between the runs and the readings.
+    """
+    scale = runs.std(axis=0)
+    readings = readings[np.isfinite(readings).all(axis=1)]
+    if not len(readings) or not (scale > 0).all():
+        return 0
+    runs, readings = runs / scale, readings / scale
+    away = np.median(readings, axis=0) - runs.mean(axis=0)
+    direction = np.linalg.pinv(np.cov(runs.T), rcond=1e-6) @ away
+    return int((readings @ direction > (runs @ direction).max()).sum())
 
 
 def refuse_undetermined(
@@ -615,7 +639,7 @@ def misfit_findings(
             f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
             "mean square, by output), expected less than the error of the readings; pass "
             "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
-            "single specimens, or look at the response and the priors.",
+            "single specimens, or look at the order of the outputs, the response and the priors.",
             "likelihood.md#readings-that-no-inputs-reproduce",
         )
     ]
