@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
@@ -278,8 +278,8 @@ class ExceedanceTable(Table):
         sentences.append(f"From {attrs['source']}; {attrs['responses']} responses computed.")
         heading = (
             f"Probability that {attrs['response']} is {sides} {attrs['limit']:g}: "
-            f"{' to '.join(values)}, {attrs['prob']:.0%} interval {float(self['lower']):.2g} to "
-            f"{float(self['upper']):.2g}"
+            f"{' to '.join(values)}, {percentage(attrs['prob'])} interval "
+            f"{float(self['lower']):.2g} to {float(self['upper']):.2g}"
         )
         return View(heading, rows=rows, sentences=sentences)
 

@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv, ndtr, ndtri
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import AT_ONCE, Floats, positive_integer, share
@@ -677,7 +677,7 @@ class QuantityTable(Table):
             ["responses computed", str(self.attrs["responses"])],
         ]
         heading = (
-            f"{self.attrs['quantity']}: {estimate:.4g}, {self.attrs['prob']:.0%} interval "
+            f"{self.attrs['quantity']}: {estimate:.4g}, {percentage(self.attrs['prob'])} interval "
             f"{lower:.4g} to {upper:.4g}"
         )
         sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
