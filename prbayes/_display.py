@@ -63,6 +63,17 @@ class View:
         return "\n  ".join([self.heading, *lines, *self.sentences])
 
 
+def percentage(share: float) -> str:
+    """Return a share of one with all its digits, such as '99.5%'."""
+    return f"{100 * share:g}%"
+
+
+def p_digits(p: float, alpha: float) -> int:
+    """Return the number of digits of a p-value, two or more, that keep it on its side of alpha."""
+    digits = (n for n in range(2, 17) if (float(f"{p:.{n}g}") <= alpha) == (p <= alpha))
+    return next(digits, 17)
+
+
 def html_of(shown: View) -> str:
     """Return the HTML of what a reader sees."""
     return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
@@ -73,7 +74,7 @@ def real_array(values: ArrayLike, name: str) -> Floats:
     is_convertible = array.dtype.kind == "O" and values is not None
     if is_convertible and not any(isinstance(x, bool | np.bool_ | str | bytes) for x in array.flat):
         with suppress(TypeError, ValueError, OverflowError):
-            return array.astype(np.float64)
+            return np.where(pd.isna(array), np.nan, array).astype(np.float64)  # pd.NA among them
     got = f"an array of dtype {array.dtype}" if array.ndim else called(values)
     text = first_text(array) if array.ndim else ""
     raise TypeError(f"{name}: got {got}, expected real numbers{text and '; '}{text}")
@@ -113,7 +114,7 @@ def observed_sample(
             f"{name}: got {n_invalid} NaN or infinite among {array.size} values, expected finite "
             f"ones; leave out missing specimens (NaN or masked){advice}"
         )
-    _refuse_huge(array, name)
+    refuse_huge(array, name)
     n_finite = array.size - n_failed
     if n_finite < minimum:
         got = {0: "no values", 1: "one value"}.get(n_finite, f"{n_finite} values")
@@ -141,7 +142,7 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
             f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
             "specimen that failed"
         )
-    _refuse_huge(array, name)
+    refuse_huge(array, name)
     missing = np.isnan(array)
     for empty, problem, line in (
         (missing.all(axis=1), "specimens without any output", "row"),
@@ -156,7 +157,7 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     return array
 
 
-def _refuse_huge(array: Floats, name: str) -> None:
+def refuse_huge(array: Floats, name: str) -> None:
     """Raise if the squares of values overflow: rather a mistake than a unit."""
     largest = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
     if largest > _LARGEST:

@@ -7,6 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -45,6 +46,14 @@ def test_every_kind_of_real_numbers_becomes_float64(values: Any) -> None:
         assert type(array) is np.ndarray
         assert array.dtype == np.float64
         np.testing.assert_array_equal(array, [1.0, 2.0])
+
+
+def test_missing_numbers_of_pandas_are_nan() -> None:
+    values = pd.Series([1.0, None]).convert_dtypes()
+    for given in (values, list(values), values.astype(object)):
+        np.testing.assert_array_equal(real_array(given, "load"), [1.0, NAN])
+    table = pd.DataFrame({"a": values, "b": values})
+    np.testing.assert_array_equal(real_array(table, "load"), [[1.0, 1.0], [NAN, NAN]])
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
@@ -106,9 +106,10 @@ def exceedance(
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     n_points : int, optional
         Number of responses to compute near the limit, for each point of the intervals; 0, or at
-        least 100. The inputs need inverse distribution functions, and no stored responses. By
-        default 0; but 1000 if the error of stored responses is above .3 of the distance between
-        ``requirement`` and interval, and the calibration has at least 1000 runs.
+        least 100. The inputs need inverse distribution functions and a support that does not depend
+        on hyperparameters, and no stored responses. By default 0; but 1000 if the error of stored
+        responses is above .3 of the distance between ``requirement`` and interval, and the
+        calibration has at least 1000 runs.
     steps : int
         Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional
@@ -277,8 +278,8 @@ class ExceedanceTable(Table):
         sentences.append(f"From {attrs['source']}; {attrs['responses']} responses computed.")
         heading = (
             f"Probability that {attrs['response']} is {sides} {attrs['limit']:g}: "
-            f"{' to '.join(values)}, {attrs['prob']:.0%} interval {float(self['lower']):.2g} to "
-            f"{float(self['upper']):.2g}"
+            f"{' to '.join(values)}, {percentage(attrs['prob'])} interval "
+            f"{float(self['lower']):.2g} to {float(self['upper']):.2g}"
         )
         return View(heading, rows=rows, sentences=sentences)
 
@@ -395,6 +396,13 @@ def _rare_probability(
     center = variables_at(evaluator.hyperparameters, populations.center[None])
     names = [str(rv.name) for rv in responses.inputs.parents]
     transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
+    parents = [values[name] for name in names]
+    if not transform.has_support_of(parents):
+        raise TypeError(
+            f"prb.exceedance: {responses.name}: got inputs whose support moves with their "
+            "hyperparameters, so that points of one population do not represent the others; "
+            "expected a support that stays; leave n_points= out, or count specimens of prb.predict"
+        )
     sign = -1.0 if quantity.below else 1.0
 
     def respond(z: Floats) -> Floats:
@@ -403,7 +411,6 @@ def _rare_probability(
         return sign * (outputs if column is None else outputs[:, column])
 
     rng = np.random.default_rng(seed)
-    parents = [values[name] for name in names]
     event = rare_event(transform, parents, respond, sign * quantity.limit, points, rng)
     if event.lost > MAX_LOST:
         raise DesignError(

@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
 from prbayes._validate import Floats, positive_integer, share
 from prbayes.decision.populations import (
@@ -187,13 +187,13 @@ class ProbabilityBox(Table):
         """Return what a reader sees."""
         y, rows = self["y"].values, []
         for p in (0.01, 0.05, 0.5, 0.95, 0.99):
-            row = [f"{p:.0%} quantile", f"{_place(self['mean'].values, y, p):.4g}"]
+            row = [f"{percentage(p)} quantile", f"{_place(self['mean'].values, y, p):.4g}"]
             for band in ("pointwise", "simultaneous"):
                 bounds = self.sel(band=band)
                 low, high = (_place(bounds[key].values, y, p) for key in ("upper", "lower"))
                 row.append(f"{low:.4g} to {high:.4g}")
             rows.append(row)
-        prob = f"{self.attrs['prob']:.0%}"
+        prob = percentage(self.attrs["prob"])
         heading = f"Distribution of {self.attrs['response']}, with {prob} bands"
         return View(heading, ["", "new specimen", "pointwise", "simultaneous"], rows)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, flag, positive_integer, share
@@ -252,8 +252,8 @@ class PopulationTable(Table):
         kind, prob = self.attrs.get("interval", ""), self.attrs.get("prob", np.nan)
         bounds = self.attrs.get("bounds", "")
         return (
-            f"Population, with {prob:.0%} intervals by the {kind}; A- and B-basis values are "
-            f"{bounds} bounds for 99% and 90% of the specimens with 95% confidence"
+            f"Population, with {percentage(prob)} intervals by the {kind}; A- and B-basis values "
+            f"are {bounds} bounds for 99% and 90% of the specimens with 95% confidence"
         )
 
     def __repr__(self) -> str:

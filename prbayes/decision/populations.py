@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv, ndtr, ndtri
 
-from prbayes._display import Table, View
+from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import AT_ONCE, Floats, positive_integer, share
@@ -194,14 +194,19 @@ class ResponseSample:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.
 
         The rest differ from it by its error: they lack a block of the runs each, or add the error
-        of left-out runs. Empty where responses are stored and not emulated.
+        of left-out runs, or that beyond the runs' range. Empty where responses are stored and not
+        emulated.
         """
         if self.emulator is None:
             assert self.design.has_runs
             return [self.select(v) for v in self.design.emulated(self.responses, list(points))]
-        values = self.emulator(values_of(points, self.design.inputs, self.responses.inputs))
+        inputs = values_of(points, self.design.inputs, self.responses.inputs)
+        values = self.emulator(inputs)
         error = self.emulator.error.reshape(self.emulator.event)
-        return [self.select(values), self.select(values + error)]
+        return [
+            self.select(outputs)
+            for outputs in (values, values + error, self.emulator.steepened(inputs))
+        ]
 
     @cached_property
     def _order(self) -> NDArray[np.intp]:
@@ -453,16 +458,29 @@ class InverseTransform:
 
     def __call__(self, z: Floats) -> list[Floats]:
         """Return the aleatory inputs, shapes (n, *event), of z (n, size)."""
+        return self._of_populations(self.parents, z)
+
+    def _of_populations(self, parents: Sequence[Floats], z: Floats) -> list[Floats]:
+        """Return the aleatory inputs of k populations at z (n, size), shapes (k n, *event)."""
         shapes = self.inputs.event_shapes
+        k = len(parents[0]) if parents else 1
         uniforms = [
-            inside(ndtr(z[:, columns])).reshape(1, len(z), *shape)
+            np.repeat(inside(ndtr(z[:, columns])).reshape(1, len(z), *shape), k, axis=0)
             for columns, shape in zip(self.columns, shapes, strict=True)
         ]
-        values = self._function(*self.parents, *uniforms)[: len(shapes)]
+        values = self._function(*parents, *uniforms)[: len(shapes)]
         return [
-            np.broadcast_to(v, (1, len(z), *shape))[0]
+            np.broadcast_to(v, (k, len(z), *shape)).reshape(-1, *shape)
             for v, shape in zip(values, shapes, strict=True)
         ]
+
+    def has_support_of(self, parents: Sequence[Floats]) -> bool:
+        """Return whether the population has a density wherever the k populations of parents do.
+
+        Looks at their ends, five standard deviations of z from the middle.
+        """
+        ends = self._of_populations(parents, np.array([[-5.0], [5.0]]) * np.ones(self.size))
+        return not np.isneginf(self.log_density(self.parents, ends)).any()
 
     def log_density(self, parents: Sequence[Floats], x: Sequence[Floats]) -> Floats:
         """Return log-densities of inputs in the populations of parents, (k, n)."""
@@ -628,7 +646,7 @@ class QuantityTable(Table):
             ["responses computed", str(self.attrs["responses"])],
         ]
         heading = (
-            f"{self.attrs['quantity']}: {estimate:.4g}, {self.attrs['prob']:.0%} interval "
+            f"{self.attrs['quantity']}: {estimate:.4g}, {percentage(self.attrs['prob'])} interval "
             f"{lower:.4g} to {upper:.4g}"
         )
         sentences = [str(finding) for finding in from_json(self.attrs["findings"])]

@@ -34,7 +34,7 @@ class Table:
 
 def read_table(caller: str, inputs: Any, responses: Any) -> Table:
     """Read runs; raise TypeError or ValueError at the first cell that is not as expected."""
-    named = _columns(f"{caller}: inputs", inputs)
+    named = _columns(f"{caller}: inputs", inputs, inputs)
     names = [name or f"x{i}" for i, (name, _) in enumerate(named, 1)]
     if len(set(names)) < len(names):
         raise ValueError(f"{caller}: inputs: got the names {names}, expected different ones")
@@ -58,9 +58,7 @@ def read_table(caller: str, inputs: Any, responses: Any) -> Table:
                 "input that varies between them; leave the column out"
             )
         ranges.append(Range(name, low, high))
-    if not isinstance(inputs, Mapping) and not isinstance(responses, Mapping):
-        responses = in_order_of(responses, inputs, caller)
-    outputs = _columns(f"{caller}: responses", responses)
+    outputs = _columns(f"{caller}: responses", responses, inputs)
     parts, labels = [], []
     for name, column in outputs:
         _refuse_length(f"{caller}: responses{name and f': {name}'}", column, n)
@@ -136,17 +134,21 @@ def _number(cell: str, decimal: str, label: str) -> float:
         ) from None
 
 
-def _columns(label: str, values: Any) -> list[tuple[str, Floats]]:
-    """Return columns (n, *event) with their names, empty without one."""
+def _columns(label: str, values: Any, inputs: Any) -> list[tuple[str, Floats]]:
+    """Return columns (n, *event) in the order of the inputs' index; names are empty without one."""
+
+    def column(part: Any, name: str) -> Floats:
+        return real_array(in_order_of(part, inputs, name, reference="the inputs"), name)
+
     if isinstance(values, Mapping):  # datasets of xarray among them
-        columns = [(str(key), real_array(x, f"{label}: {key}")) for key, x in values.items()]
+        columns = [(str(key), column(x, f"{label}: {key}")) for key, x in values.items()]
     elif hasattr(values, "columns"):
         columns = [
-            (str(key), real_array(values.iloc[:, i], f"{label}: {key}"))
+            (str(key), column(values.iloc[:, i], f"{label}: {key}"))
             for i, key in enumerate(values.columns)
         ]
     else:
-        array = real_array(values, label)
+        array = column(values, label)
         names = [str(getattr(values, "name", None) or "")]
         if array.ndim == 2:
             names = [""] * array.shape[1]

@@ -75,20 +75,47 @@ class EmulatedResponse:
         the nearest run has no finite response, the response is that of the run.
         """
         z = self.coordinates.of(inputs, 1)
-        inside = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
-        is_outside = (np.abs(z - inside) > 1e-9).any(axis=1)
-        z = inside
-        values = self.surface.values(z)[:, self.columns]
+        ends = self._in_range(z)
+        values = self._at(ends)
         if not self.is_continued:
-            values[is_outside] = np.nan
+            values[(np.abs(z - ends) > 1e-9).any(axis=1)] = np.nan
+        return values.reshape(len(z), *self.event)
+
+    def steepened(self, inputs: Sequence[Floats]) -> Floats:
+        """Return the same, but beyond the runs' range with twice the slope at its end.
+
+        The difference estimates the error of the constant response there.
+        """
+        values = self(inputs)
+        z = self.coordinates.of(inputs, 1)
+        ends = self._in_range(z)
+        beyond = z - ends
+        # Slopes are differences to points further inside, by 2 % of the range at most.
+        share = 0.02 / np.maximum((np.abs(beyond) / self._width).max(axis=1), 1e-12)
+        inner = self._in_range(ends - share[:, None] * beyond)
+        difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
+        change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
+        return np.where(np.isfinite(values + change), values + change, values)
+
+    @cached_property
+    def _width(self) -> Floats:
+        """The runs' range in each coordinate, (d,)."""
+        return np.maximum(np.ptp(self.z, axis=0), 1e-300)
+
+    def _in_range(self, z: Floats) -> Floats:
+        """Return the nearest coordinates within the runs' range."""
+        return np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+
+    def _at(self, z: Floats) -> Floats:
+        """Return the outputs at coordinates within the runs' range, (n, m)."""
+        values = self.surface.values(z)[:, self.columns]
         is_finite = np.isfinite(self.y).all(axis=1)
         if not is_finite.all():
             from scipy.spatial import cKDTree
 
-            width = np.maximum(np.ptp(self.z, axis=0), 1e-300)
-            _, nearest = cKDTree(self.z / width).query(z / width)
+            _, nearest = cKDTree(self.z / self._width).query(z / self._width)
             values = np.where(is_finite[nearest, None], values, self.y[nearest])
-        return values.reshape(len(z), *self.event)
+        return values
 
 
 def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:

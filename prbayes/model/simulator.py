@@ -24,6 +24,7 @@ from prbayes._validate import (
     observed_sample,
     plain_text,
     positive_number,
+    refuse_huge,
     refuse_single_precision,
     sample_labels,
     sample_weights,
@@ -224,7 +225,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         _refuse_by_specimen(name, arguments, epsilon, propagation)
         if rows is not None:
             metric = cast(LogLikelihood, metric).of_frequencies(rows, size)
-        values = checked_specimens(name, values)
+        values = checked_specimens(name, values, outputs)
     else:
         refuse_covariates(name, arguments.covariates)
         target = _prepared_metric(name, metric, values, weights)
@@ -570,7 +571,7 @@ def _refuse_by_specimen(
     refuse_without_density(name, inputs)
 
 
-def checked_specimens(name: str, observed: Floats) -> Floats:
+def checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
     """Return measured outputs, (N,) or (N, m), of at least two specimens."""
     values = np.asarray(observed, dtype=np.float64)
     if values.ndim not in (1, 2) or len(values) < 2:
@@ -585,11 +586,19 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
             f"{name}: observed: got no measured output of specimen {row}, expected at least one; "
             "leave the specimen out"
         )
+    empty = np.isnan(rows).all(axis=0)
+    if empty.any():
+        label = [*outputs.names, name][int(empty.argmax())]
+        raise ValueError(
+            f"{name}: observed: got no measured value of the output {label}, expected at least "
+            "one; leave the output out, here and in the response or its condition"
+        )
     if np.isinf(rows).any():
         raise ValueError(
             f"{name}: observed: got infinite values, expected finite ones for prb.LogLikelihood(); "
             "use metric=prb.AreaMetric(), which counts specimens that failed"
         )
+    refuse_huge(rows, f"{name}: observed")
     return values
 
 

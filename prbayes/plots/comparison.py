@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import percentage
 from prbayes._validate import flag
 from prbayes.plots.canvas import (
     BLUE,
@@ -123,7 +124,7 @@ def plot_comparison(
             if n > 1:  # a line through the first result, for comparison
                 text = f"estimate of {texts[0]}"
                 axis.axvline(estimate[0], color=GREY, linestyle=":", label=text, gid="first")
-            text = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
+            text = f"{percentage(comparison.attrs.get('interval', 0.89))} interval"
             has_ends = np.isfinite(lower) & np.isfinite(upper)
             ends = rows[has_ends], lower[has_ends], upper[has_ends]
             axis.hlines(*ends, color=BLUE, linewidth=3, label=text, gid="interval")

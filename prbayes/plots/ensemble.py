@@ -11,6 +11,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from prbayes._display import percentage
 from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
@@ -173,7 +174,7 @@ def draw_calibrated(
     if len(spread):
         sides = pointwise_band(spread, prob)
         top = max(top, float(sides[1].max()))
-        text = f"{prob:.0%} band of the {ensemble.spread}"
+        text = f"{percentage(prob)} band of the {ensemble.spread}"
         axis.fill_between(
             grid, *sides, color=BLUE, alpha=alpha, linewidth=0, label=text, gid="band"
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
 from prbayes.model.parameters import element_name
@@ -115,7 +116,7 @@ def plot_individuals(
             mean = values.mean(axis=0)
             order = np.argsort(mean, kind="stable")
             places = np.arange(len(order))
-            text = f"{prob:.0%} of the draws of a specimen"
+            text = f"{percentage(prob)} of the draws of a specimen"
             _draw_intervals(axis, places, values[:, order], prob, label=text, gid="interval")
             axis.scatter(
                 places, mean[order], 14, color=BLUE, label="their mean", gid="mean", zorder=3
@@ -125,7 +126,7 @@ def plot_individuals(
             y = readings[name]
             of_rows = {str(key): x.values for key, x in conditions.items() if x.size == y.size}
             x_name, x = next(iter(of_rows.items()), ("specimen", np.arange(y.size)))
-            text = f"{prob:.0%} of replicates"
+            text = f"{percentage(prob)} of replicates"
             _draw_intervals(axis, x, replicated[name], prob, label=text, gid="replicates")
             median = np.nanmedian(replicated[name], axis=0)
             look: dict[str, Any] = {"color": GREY, "zorder": 3}
@@ -145,7 +146,7 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
     tail = (1 - prob) / 2
     values = replicates.values.reshape(-1, x.size)
     low, median, high = np.nanquantile(values, [tail, 0.5, 1 - tail], axis=0)
-    text = f"{prob:.0%} of replicates"
+    text = f"{percentage(prob)} of replicates"
     axis.fill_between(
         x, low, high, color=GREY, alpha=0.25, linewidth=0, label=text, gid="replicates"
     )

@@ -10,6 +10,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
 
+from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
 from prbayes.model.evaluator import Evaluator
@@ -161,7 +162,7 @@ def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float
     weights = np.full(len(points), 1 / len(points))
     half, region = outlines(points, weights, (0.5, prob))
     for gid, p, line, style in (("half", 0.5, half, "--"), ("region", prob, region, "-")):
-        text = f"{p:.0%} of the calibrated population: {ensemble.label}"
+        text = f"{percentage(p)} of the calibrated population: {ensemble.label}"
         axis.plot(*line, style, color=BLUE, linewidth=1.5, label=text, gid=gid)
     correlations: Any = np.corrcoef(points.T)
     return float(correlations[0, 1])

@@ -10,6 +10,7 @@ import pymc as pm
 import xarray as xr
 from scipy.stats import norm
 
+from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
 from prbayes.model.description import labelled
@@ -284,7 +285,7 @@ def _draw(
     drawn.add_legend(
         "distribution",
         aes=["color", "linestyle"],
-        title=f"{prob:.0%} intervals, with the mean or the optimum",
+        title=f"{percentage(prob)} intervals, with the mean or the optimum",
         **(look if backend == "matplotlib" else {}),
     )
     collection: PlotCollection = drawn

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import percentage
 from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import share
 from prbayes.plots.canvas import BLUE, check_options, finish, ink, named, panels, refuse_labels
@@ -103,7 +104,7 @@ def plot_prediction(
         look: dict[str, Any] = {"color": BLUE, "linewidth": 2.2}
         if len(curves) > 1:
             sides = pointwise_band(curves, prob)
-            text = f"{prob:.0%} of the populations"
+            text = f"{percentage(prob)} of the populations"
             axis.fill_between(
                 grid, *sides, color=BLUE, alpha=0.25, linewidth=0, label=text, gid="band"
             )

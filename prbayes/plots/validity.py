@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from prbayes._display import p_digits, percentage
 from prbayes._validate import Floats
 from prbayes.plots.canvas import (
     BLUE,
@@ -101,8 +102,9 @@ def plot_validity(
             y = f"share of {values.size} values"
             statistic = "area"
         axis.plot([0, 1], [0, 1], "--", color=ink(), gid="identity")
-        level = f", level {test.alpha:.0%}"
-        first = f"{name}, p = {test.p_value:.2g}" if name else f"p = {test.p_value:.2g}{level}"
+        level = f", level {percentage(test.alpha)}"
+        p = f"p = {test.p_value:.{p_digits(test.p_value, test.alpha)}g}"
+        first = f"{name}, {p}" if name else f"{p}{level}"
         sign, verdict = (">", "rejected") if test.rejected else ("<", "not rejected")
         second = f"{statistic} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}"
         title = f"{first}\n{second}: {verdict}"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
 from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
@@ -31,7 +32,6 @@ from prbayes.reports.numbers import (
     enumerated,
     in_percent,
     number,
-    percentage,
     plus_minus,
     rows_table,
     sample_sd,
@@ -70,14 +70,16 @@ def verdict(m: Material) -> list[Section]:
     questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}
     requirements = {label: t for label, t in questions.items() if "requirement" in t.attrs}
     if m.is_usable:
-        text += [f"{q}: {_expected(t)}." for q, t in questions.items() if q not in requirements]
+        for question, table in questions.items():
+            if question not in requirements:
+                text.append(f"{question}: {_expected(table, m.prob)}.")
     sections = [_requirement(label, table, m) for label, table in requirements.items()]
     return [Section(title, text, verdict=mark), *sections]
 
 
 def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
     """Return a requirement with its answer; of a model that may not be used it has none."""
-    allowed = f"allowed: at most {in_percent(table.attrs['requirement'])}"
+    allowed = f"allowed: at most {percentage(table.attrs['requirement'])}"
     if not m.is_usable:
         reason = "the model is rejected" if m.rejected else "solve the problems first"
         return Section(
@@ -88,16 +90,21 @@ def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
         )
     answer = table.attrs["verdict"]
     mark = {"met": "good", "not met": "bad"}.get(answer, "open")
-    text = f"{label}: {_expected(table)}; {allowed}."
+    text = f"{label}: {_expected(table, m.prob)}; {allowed}."
     return Section(f"Requirement {answer}", text, verdict=mark, level=3)
 
 
-def _expected(table: xr.Dataset) -> str:
-    """Return a probability with its interval, as shares of specimens."""
+def _expected(table: xr.Dataset, prob: float) -> str:
+    """Return a probability with its interval, as shares of specimens.
+
+    The interval is called by its probability if that is another than ``prob``.
+    """
     floor = min(1e-5, table.attrs.get("requirement", 1.0) / 10)
     bounds = dict.fromkeys(in_percent(p, floor) for p in np.ravel(table["probability"].values))
     interval = f"{in_percent(float(table.lower), floor)} to {in_percent(float(table.upper), floor)}"
-    return f"{' to '.join(bounds)} of the specimens are expected (interval {interval})"
+    level = table.attrs.get("prob", prob)
+    name = "interval" if level == prob else f"{percentage(level)} interval"
+    return f"{' to '.join(bounds)} of the specimens are expected ({name} {interval})"
 
 
 def _tested(m: Material) -> str:
@@ -332,7 +339,7 @@ def answer(m: Material) -> list[Section]:
         if np.isinf(sd):  # the data do not identify it
             texts[1] = NOTHING
         row["standard deviation" if ends else "standard error"] = texts[1]
-        rows.append(row | dict(zip((f"{m.prob:.0%} from", "to"), texts[2:], strict=False)))
+        rows.append(row | dict(zip((f"{percentage(m.prob)} from", "to"), texts[2:], strict=False)))
     shown = rows if len(rows) <= 30 else []
     text = ["The estimates are in the appendix."]
     if shown:
@@ -418,7 +425,7 @@ def agreement(m: Material) -> list[Section]:
         sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
         median, lower, upper = alike(quantiles, sd)
         name = {"condition": named(pair.name, m.labels)}
-        interval = {f"{m.prob:.0%} from": lower, "to": upper}
+        interval = {f"{percentage(m.prob)} from": lower, "to": upper}
         rows.append(name | described(pair.measured) | {"predicted median": median} | interval)
     if not (m.tests or rows):
         return []
@@ -428,8 +435,8 @@ def agreement(m: Material) -> list[Section]:
         text.append(f"Together the tests reject a right model in up to {alpha} of cases.")
     if rows:
         text.append(
-            f"The table has the measured values, and the range with {m.prob:.0%} of the predicted "
-            "ones; ∞ is a failure."
+            f"The table has the measured values, and the range with {percentage(m.prob)} of the "
+            "predicted ones; ∞ is a failure."
         )
     return [Section("Test of the model", text, rows_table(with_zeros(rows)), level=3)]
 
@@ -441,11 +448,14 @@ def _in_words(label: str, test: ValidityTest, m: Material) -> str:
     if test.folded:
         aspect = "the scatter of the measured values"
         agreed = "differs too much from", "agrees with"
-    p = "less than 0.1%" if test.p_value < 0.001 else in_percent(test.p_value)
+    digits = p_digits(test.p_value, test.alpha)
+    p = "less than 0.1%"
+    if test.p_value >= 0.001:
+        p = percentage(float(f"{test.p_value:.{digits}g}"))
     aspect = aspect if name else aspect.capitalize()
     return (
         f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right model, {p} of such "
-        f"tests differ at least as much; below {percentage(test.alpha)} the model is rejected."
+        f"tests differ at least as much; at {percentage(test.alpha)} or less the model is rejected."
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import pymc as pm
 import xarray as xr
 
+from prbayes._display import percentage
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.material import date_of, gather, versions_of
@@ -153,7 +154,7 @@ class Report:
                 names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
                 packages = versions_of(material).items()
                 parts = [f"{names[name]} {version}" for name, version in packages if name in names]
-                note = ", ".join([*parts, f"intervals of {material.prob:.0%} probability"])
+                note = ", ".join([*parts, f"intervals of {percentage(material.prob)} probability"])
         for section in contents:
             if not isinstance(section, Section):
                 got = type(section).__name__

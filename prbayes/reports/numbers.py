@@ -78,17 +78,13 @@ def sample_sd(finite: Any) -> float:
     return float(finite.std(ddof=1)) if finite.size > 1 else math.nan
 
 
-def percentage(share: float) -> str:
-    """Return a share of one, such as '5%'."""
-    return f"{100 * share:g}%"
-
-
 def in_percent(p: float, floor: float = 1e-5) -> str:
-    """Return a probability with two digits, such as '0.47%'; below the floor as such."""
+    """Return a probability with two digits, such as '0.47%'; near zero or one as such."""
     if 0 < p < floor:
         return f"under {100 * floor:g}%"
     digits = 4 if p > 0.99 else 2
-    return f"{float(f'{100 * p:.{digits}g}'):g}%"
+    percent = float(f"{100 * p:.{digits}g}")
+    return "over 99.99%" if p < 1 and percent == 100 else f"{percent:g}%"
 
 
 def span(values: Any, form: str) -> str:
@@ -199,7 +195,8 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
     if not rows:
         return None
     pandas: Any = import_module("pandas")
-    columns = {key: [row[key] for row in rows] for key in rows[0]}
+    keys = dict.fromkeys(key for row in rows for key in row)
+    columns = {key: [row.get(key) for row in rows] for key in keys}
     return pandas.DataFrame(
         {
             key: column

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
 from prbayes.model.description import labelled
@@ -50,7 +51,6 @@ from prbayes.reports.numbers import (
     correlation_table,
     enumerated,
     number,
-    percentage,
     places,
     plus_minus,
     rows_table,
@@ -379,7 +379,7 @@ def _posterior_rows(
                 "variable": name,
                 "mean": mean,
                 "sd": sd,
-                f"{prob:.0%} from": lower,
+                f"{percentage(prob)} from": lower,
                 "to": upper,
                 "ESS, bulk": f"{bulk:.0f}" if math.isfinite(bulk) else NOTHING,
                 "ESS, tail": f"{tail:.0f}" if math.isfinite(tail) else NOTHING,
@@ -526,6 +526,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
     values = "|2u - 1|" if test.folded else "u"
     if directions and not test.folded:
         values = "u and |2u - 1|"
+    digits = p_digits(test.p_value, test.alpha)
     # The verdict first: the end of a wide table is off a phone's screen.
     return {
         "verdict": "rejected" if test.rejected else "not rejected",
@@ -535,7 +536,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
         "of": values,
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
-        "p-value": f"{test.p_value:.2g}" if test.p_value >= 0.001 else "< 0.001",
+        "p-value": f"{test.p_value:.{digits}g}" if test.p_value >= 0.001 else "< 0.001",
         "level": percentage(test.alpha),
     }
 

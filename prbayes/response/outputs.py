@@ -274,7 +274,7 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
     return Outputs(labels, dim, keys, units or _units_in(observed, labels))
 
 
-def in_order_of(values: Any, observed: Any, name: str) -> Any:
+def in_order_of(values: Any, observed: Any, name: str, *, reference: str = "observed") -> Any:
     """Return values of specimens in the order of the observed ones, where both have an index.
 
     An index 0, 1, ... is none, unless the other is another order of it. Raises a ValueError if the
@@ -289,13 +289,15 @@ def in_order_of(values: Any, observed: Any, name: str) -> Any:
     if np.array_equal(index, in_order) or np.array_equal(expected, in_order):
         return values
     raise ValueError(
-        f"{name}: got values with the index {list(index[:3])}, ..., expected that of observed, "
+        f"{name}: got values with the index {list(index[:3])}, ..., expected that of {reference}, "
         f"{list(expected[:3])}, ...; where the order is the same, pass values.to_numpy()"
     )
 
 
 def specimen_index(values: Any) -> Any:
-    """Return the index of the specimens of a Series, DataFrame or DataArray, None of others."""
+    """Return the index of the specimens of a labelled array or a mapping of them, or None."""
+    if isinstance(values, Mapping):  # of outputs, each in the order of the first
+        return specimen_index(next(iter(values.values()), None))
     if hasattr(values, "dims") and hasattr(values, "indexes"):
         return values.indexes.get(values.dims[0]) if values.dims else None
     return values.index if hasattr(values, "iloc") else None

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from decisions import doubled, normal, posterior, same
+import xarray as xr
+from decisions import doubled, jeffreys, normal, posterior, same
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
@@ -170,6 +171,36 @@ def test_a_population_without_stored_responses_takes_points() -> None:
         prb.exceedance(posterior(), same, 2.5, x, model=model)
     with pytest.raises(TypeError, match="got a model variable as an input"):
         prb.exceedance(posterior(), shifted, 2.5, x, model["mu"], model=model, n_points=100)
+
+
+def test_points_are_refused_where_the_support_moves() -> None:
+    observed = np.random.default_rng(1).uniform(0, 3, 40)
+    with pm.Model() as model:
+        x = pm.Uniform.dist(0.0, pm.HalfNormal("end", 5))
+        prb.Simulator("y", same, x, observed=observed)
+    ends = np.random.default_rng(2).normal(3.0, 0.1, (1, 500))
+    result = xr.DataTree.from_dict({"posterior": xr.Dataset({"end": (("chain", "draw"), ends)})})
+    # The central population ends at 3: its points have no response above 3, unlike the others.
+    with pytest.raises(TypeError, match=r"support moves .* leave n_points= out"):
+        prb.exceedance(result, same, 3.05, x, model=model, n_points=500)
+    table = prb.exceedance(result, same, 3.05, x, model=model)
+    expected = float(np.maximum(1 - 3.05 / ends, 0).mean())
+    assert abs(float(table.probability) - expected) < 3 * float(table.error)
+
+
+def test_a_limit_beyond_the_range_of_the_runs_is_not_decided() -> None:
+    observed = np.random.default_rng(3).normal(0.0, 1.0, 8)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, observed=observed)
+    result = jeffreys(observed, 1000)
+    draws = result["posterior"]
+    by_draw = ndtr((draws["mu"].values - 4.5) / draws["sigma"].values)
+    # The runs end at 3.9, where the prior does.
+    table = prb.exceedance(result, same, 4.5, x, model=model, requirement=0.003)
+    assert float(table.probability) == 0
+    assert by_draw.mean() < 4 * float(table.error)
+    assert (np.quantile(by_draw, 0.945) > 0.003, table.attrs["verdict"]) == (True, "not decided")
 
 
 def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) -> None:

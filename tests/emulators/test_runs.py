@@ -59,6 +59,25 @@ def test_all_kinds_of_tables_are_read_alike(tmp_path: Path, runs: prb.Runs) -> N
         np.testing.assert_allclose(table(0.5, 1.5) if table is not tables[3] else 0, 0, atol=9)
 
 
+def test_rows_are_matched_by_their_index_in_every_kind_of_table() -> None:
+    """Names of outputs remain, so that they can be matched to those of observed."""
+    names = [f"r{i}" for i in range(48)]
+    table = TABLE.set_axis(names).rename_axis("run")
+    values = pd.DataFrame({"sag": bent(*X.T), "span": X[:, 0]}, table.index)
+    backwards = values[::-1]
+    for inputs in (table, dict(table), {"x": table.x, "y": table.y[::-1]}, table.to_xarray()):
+        for responses in (backwards, dict(backwards), backwards.to_xarray()):
+            runs = prb.Runs(inputs, responses)
+            np.testing.assert_array_equal(runs.points, X)
+            np.testing.assert_array_equal(runs.responses, values)
+            assert runs.outputs == ("sag", "span")
+    assert prb.Runs(table, backwards["sag"]).outputs == ("sag",)
+    others = backwards.set_axis([f"s{i}" for i in range(48)])
+    for inputs, responses in ((table, others), (dict(table), dict(others))):
+        with pytest.raises(ValueError, match=r"sag: .*'s0'.* that of the inputs, \['r0'"):
+            prb.Runs(inputs, responses)
+
+
 def test_the_first_bad_cell_is_named(tmp_path: Path) -> None:
     path = tmp_path / "runs.csv"
     rows = [f"{k},{k * k}" for k in range(1, 12)]

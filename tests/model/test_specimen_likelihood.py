@@ -392,6 +392,11 @@ def test_data_of_another_shape_are_refused() -> None:
         ),
         ({"observed": np.append(Y, np.inf)}, r"infinite values, .*metric=prb\.AreaMetric\(\)"),
         ({"observed": np.append(Y, np.nan)}, "got no measured output of specimen 20.*leave"),
+        ({"observed": np.append(Y, 1e200)}, r"observed: got values of up to 1e\+200, .*check them"),
+        (
+            {"observed": {"a": Y, "b": np.full(N, np.nan)}},
+            "observed: got no measured value of the output b, .*leave the output out",
+        ),
         ({"observed": Y[:1]}, r"got shape \(1,\), expected \(N,\) or .* with at least 2 specimens"),
         ({"dims": "specimen"}, "dims: got 'specimen' of length 3, expected 20"),
         (

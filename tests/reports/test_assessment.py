@@ -73,7 +73,7 @@ def test_validity(calibrated: Any, page: Any, row: Any, section: Any) -> None:
     in_words = section(both, "Test of the model").text
     assert in_words[0].startswith("early: the measured values agree with the prediction. Of a r")
     assert in_words[1].startswith("late: the measured values differ too much from the prediction.")
-    assert "1% of such tests differ at least as much; below 5% the model is" in in_words[1]
+    assert "1% of such tests differ at least as much; at 5% or less the model is" in in_words[1]
     assert in_words[2] == "Together the tests reject a right model in up to 10% of cases."
     one = prb.Report("x", validity=test, pictures=False)
     assert not any("up to" in p for p in section(one, "Test of the model").text)

@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from prbayes._display import p_digits, percentage
 from prbayes._finding import counted
 from prbayes.reports.numbers import (
     alike,
     cells,
+    in_percent,
     number,
-    percentage,
     places,
     plus_minus,
     rows_table,
@@ -79,7 +80,10 @@ def test_words_around_numbers() -> None:
     assert [counted(n, "draw") for n in (1, 2, 0)] == ["1 draw", "2 draws", "0 draws"]
     assert span(np.array([3, 4, 3]), ".0f") == "3 to 4"
     assert span(np.array([3.01, 3.02]), ".1f") == "3.0"
-    assert (percentage(0.05), percentage(0.001)) == ("5%", "0.1%")
+    assert (percentage(0.05), percentage(0.001), percentage(0.995)) == ("5%", "0.1%", "99.5%")
+    assert [in_percent(p) for p in (0.99996, 1.0, 1e-6)] == ["over 99.99%", "100%", "under 0.001%"]
+    digits = [p_digits(p, 0.05) for p in (0.0496, 0.05, 0.0504, 0.05001, 0.3, 1e-9)]
+    assert digits == [2, 2, 3, 4, 2, 2], "one that rounds to alpha and is larger shows it"
 
 
 def test_decimal_points_stand_in_line() -> None:
@@ -111,6 +115,8 @@ def test_tables_of_xarray() -> None:
 def test_columns_in_which_no_row_has_anything_are_left_out() -> None:
     rows = [{"a": 1, "b": None, "c": "", "d": np.nan}, {"a": None, "b": None, "c": "", "d": np.nan}]
     assert list(rows_table(rows).columns) == ["a", "d"]
+    (_, row) = cells(rows_table([{"a": "1", "89%": "2"}, {"a": "3", "99%": "4"}])).rows
+    assert row == ("3", "\u2013", "4"), "rows of several kinds"
     assert list(rows_table([{"zero": 0, "empty": ""}]).columns) == ["zero"]
     assert cells(rows_table([{"n": 3, "s": None}, {"n": None, "s": "x"}])).rows[1][1] == "x"
 

@@ -436,6 +436,27 @@ def test_requirements_look_different(answer: str, mark: str) -> None:
     assert (box.title, box.verdict) == (f"Requirement {answer}", mark)
 
 
+def test_intervals_of_other_probabilities_are_called_so() -> None:
+    model, x = normal()
+    few = prb.exceedance(optimum(), same, 4.0, x, model=model, prob=0.995, requirement=0.00125)
+    more = prb.plan(
+        optimum(),
+        {"a": prb.decision.Condition(same, x)},
+        k=[5],
+        quantity=prb.decision.Mean(same, x),
+    )
+    parts = decided(decision=questions() | {"few": few, "more": more}).sections
+    (box,) = [section for section in parts if section.text and section.text[0].startswith("few: ")]
+    assert "(99.5% interval " in box.text[0]
+    assert box.text[0].endswith("; allowed: at most 0.125%.")
+    tables = {section.title: section.table for section in parts}
+    assert {"89% interval", "99.5% interval"} <= set(tables["Probability beyond a limit"])
+    assert len(tables["What more data would change"]) == 5
+    note = prb.Report("x", optimum=optimum(), decision=few, pictures=False).note
+    assert note.endswith("intervals of 99.5% probability")
+    assert "99.5% interval" in few.to_view().heading
+
+
 def refuted() -> prb.validation.ValidityTest:
     """A test that rejects the model."""
     model, x = normal()

@@ -93,8 +93,13 @@ def test_values_of_specimens_are_matched_by_their_index():
     assert in_order_of(pd.Series([0.0, 1.0, 2.0]), moved, "w").tolist() == [1.0, 2.0, 0.0]
     with pytest.raises(ValueError, match=r"w: got .* \['x', .*expected .* \['a', .*to_numpy\(\)"):
         in_order_of(pd.Series([1.0, 2.0, 3.0], index=["x", "b", "c"]), observed, "w")
-    values, _ = read_observed("y", {"p": observed, "q": other})
-    assert values.tolist() == [[10.0, 1.0], [20.0, 2.0], [30.0, 3.0]]
+    mapping = {"p": observed, "q": other}
+    assert in_order_of(other, mapping, "w").tolist() == [1.0, 2.0, 3.0]
+    for outputs in (mapping, xr.Dataset({k: x.rename_axis("i") for k, x in mapping.items()})):
+        assert in_order_of(other, outputs, "w").tolist() == [1.0, 2.0, 3.0]
+        values, labels = read_observed("y", outputs)
+        assert values.tolist() == [[10.0, 1.0], [20.0, 2.0], [30.0, 3.0]]
+        assert labels.names == ("p", "q")
 
 
 @pytest.mark.parametrize(
