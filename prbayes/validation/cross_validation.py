@@ -266,9 +266,10 @@ def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tup
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
         counts += np.bincount(numbers[k], weights * weights.size, total)
+        # With a condition each specimen has a population of responses of its own.
         inputs = simulator.inputs
-        if inputs.covariates or any(map(is_condition, inputs.aleatory)):
-            # Each specimen has a population of responses of its own.
+        has_conditions = any(map(is_condition, inputs.aleatory))
+        if inputs.covariates or has_conditions:
             scores[numbers[k]] = np.nan
             continue
         try:

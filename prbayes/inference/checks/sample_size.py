@@ -26,23 +26,29 @@ def elements_above(evaluator: Evaluator) -> NDArray[np.bool_]:
     enters = np.zeros((len(evaluator.simulators), hyperparameters.size), dtype=bool)
     for k, row in enumerate(enters):
         parents = evaluator.parents(thetas, k)
-        values = [parent.reshape(len(thetas), -1) for parent in parents]
-        if any(v.shape[1] > 1 for v in values):  # a population may depend on an element alone
+        flat = [parent.reshape(len(thetas), -1) for parent in parents]
+        values = np.concatenate(flat, axis=1)
+        if values.shape[1] > len(parents):
+            # Of a vector a population may depend on one element alone.
+            inputs = evaluator.simulators[k].inputs
             with contextlib.suppress(TypeError):  # not all inputs can be drawn
-                values = _specimens(evaluator.simulators[k].inputs, parents)
-        row |= np.any([(v[1:] != v[0]).any(axis=1) for v in values], axis=0)
+                values = _specimens(inputs, parents)
+        row |= (values[1:] != values[0]).any(axis=1)
     return enters
 
 
-def _specimens(inputs: Inputs, parents: Sequence[Floats], n: int = 64) -> list[Floats]:
-    """Draw specimens of each population from the same random numbers, by input, (P, ...)."""
+def _specimens(inputs: Inputs, parents: Sequence[Floats]) -> Floats:
+    """Draw specimens of each population from the same random numbers, (P, k)."""
     sampler = PopulationSampler(inputs)
     draws = []
     for k in range(len(parents[0])):
         rng = np.random.default_rng(0)
-        aleatory, epistemic = sampler([parent[k : k + 1] for parent in parents], n, rng)
-        draws.append([*aleatory, *epistemic])
-    return [np.stack(values).reshape(len(draws), -1) for values in zip(*draws, strict=True)]
+        population = [parent[k : k + 1] for parent in parents]
+        aleatory, epistemic = sampler(population, 64, rng)
+        values = [np.ravel(x) for x in aleatory]
+        values += [np.ravel(x) for x in epistemic]
+        draws.append(np.concatenate(values))
+    return np.stack(draws)
 
 
 def interval_ratios(n: float) -> tuple[float, float]:
