@@ -312,24 +312,68 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
 def _hessian(objective: _Objective, theta: Floats) -> Floats | None:
     """Return central differences of the gradient, or None where the objective is not finite.
 
-    The steps are a hundredth of a standard error.
+    The steps are a hundredth of a standard error. They are wider where the objective has kinks, as
+    that of a Laplace population.
     """
     step = 1e-3 * objective.unit
-    hessian = None
-    for _ in range(3):
-        rows = []
-        for j, shift in enumerate(np.diag(step)):
-            (ahead, up), (behind, down) = objective(theta + shift), objective(theta - shift)
-            if not (np.isfinite(ahead) and np.isfinite(behind)):
-                return None
-            rows.append((up - down) / (2 * step[j]))
-        hessian = (np.array(rows) + np.array(rows).T) / 2
+    hessian = _differences(objective, theta, step)
+    for _ in range(2):
+        if hessian is None:
+            return None
         curvature = np.maximum(np.diag(hessian), 1e-4 / objective.unit**2)
         better_step = 0.01 / np.sqrt(curvature)
         if np.all((better_step / step < 10) & (step / better_step < 10)):
             break
         step = better_step
-    return hessian
+        hessian = _differences(objective, theta, step)
+    if hessian is None:
+        return None
+    wide_step = _widened(objective, theta, step, hessian)
+    if np.array_equal(wide_step, step):
+        return hessian
+    return _differences(objective, theta, wide_step)
+
+
+def _differences(objective: _Objective, theta: Floats, step: Floats) -> Floats | None:
+    """Return the symmetric differences of the gradient, or None where it is not finite."""
+    rows = []
+    for j, shift in enumerate(np.diag(step)):
+        ahead, up = objective(theta + shift)
+        behind, down = objective(theta - shift)
+        if not (np.isfinite(ahead) and np.isfinite(behind)):
+            return None
+        rows.append((up - down) / (2 * step[j]))
+    hessian = np.array(rows)
+    return np.asarray((hessian + hessian.T) / 2)
+
+
+def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats) -> Floats:
+    """Return steps over which an objective with kinks rises by half a nat on both sides.
+
+    At kinks differences over small steps are too large, and between them zero: one standard error
+    away the objective has not risen.
+    """
+    result = step.copy()
+    for j, unit in enumerate(np.diag(objective.unit)):
+        curvature = unit @ hessian @ unit
+        if curvature > 1.0 / 25:
+            rises = _rises(objective, theta, unit / np.sqrt(curvature))
+            if not rises.mean() < 0.3:
+                continue
+        for width in 2.0 ** np.arange(-12, 1):
+            rises = _rises(objective, theta, width * unit)
+            if np.isfinite(rises).all() and rises.min() >= 0.5:
+                result[j] = width * unit[j]
+                break
+    return result
+
+
+def _rises(objective: _Objective, theta: Floats, shift: Floats) -> Floats:
+    """Return by how much an objective rises from theta on both sides, (2,)."""
+    value, _ = objective(theta)
+    ahead, _ = objective(theta + shift)
+    behind, _ = objective(theta - shift)
+    return np.array([ahead, behind]) - value
 
 
 def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:

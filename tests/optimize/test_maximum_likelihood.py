@@ -394,3 +394,19 @@ def test_the_signed_root_is_that_of_the_normal_likelihood_ratio() -> None:
         root = np.sqrt(N * (np.log(ratio) - 1 + 1 / ratio))
         assert _signed_root(objective, mode, theta, j) == pytest.approx(root, rel=1e-3)
     assert _signed_root(objective, mode, optimum.theta, i) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 8])
+def test_a_likelihood_with_kinks_has_standard_errors(seed: int) -> None:
+    """That of a Laplace population is linear between the specimens."""
+    observed = np.random.default_rng(seed).laplace(1.5, 0.8, 60)
+    with pm.Model() as model:
+        x = pm.Laplace.dist(pm.Normal("a", 1, 2), pm.HalfNormal("b", 2))
+        prb.Simulator("y", lambda x: x, x, observed=observed)
+    optimum = prb.minimize(model, progressbar=False)
+    assert not optimum.findings
+    scale = np.abs(observed - np.median(observed)).mean()
+    assert optimum.point["b"] == pytest.approx(scale, rel=1e-3)
+    # The asymptotic one is that of many specimens.
+    assert 0.6 < optimum.stderr["a"] / (scale / np.sqrt(60)) < 1.6
+    assert optimum.stderr["b"] == pytest.approx(scale / np.sqrt(60), rel=0.02)
