@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 from four_metrics import same
@@ -61,6 +62,24 @@ def test_specimens_count_where_simulators_share_hyperparameters() -> None:
 
     assert not warned(model(True))
     assert warned(model(False)).startswith("y0: got 4 specimens")
+
+
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood()])
+def test_groups_count_together_where_they_share_hyperparameters(metric: prb.Metric) -> None:
+    def model(sizes: list[int], is_shared: bool) -> pm.Model:
+        labels = np.repeat(["a", "b"], sizes)
+        observed = pd.DataFrame({"y": INPUTS[-len(labels) :], "rig": labels})
+        with pm.Model(coords={"rig": ["a", "b"]}) as result:
+            rig = prb.response.group("rig")
+            mu = pm.Normal("mu", pm.Normal("m", 0, 2), 1, dims="rig")
+            spread = pm.HalfNormal("sd", 1, dims=None if is_shared else "rig")
+            x = pm.Normal.dist(mu[rig], spread if is_shared else spread[rig])
+            prb.Simulator("y", same, x, metric=metric, observed=observed)
+        return result
+
+    assert warned(model([20, 3], False)).startswith("y[b]: got 3 specimens")
+    assert not warned(model([20, 3], True))
+    assert not warned(model([6, 2], True))  # 1 / sum(w**2) of each are 8 but for rounding
 
 
 def test_readings_of_one_specimen_and_weights_do_not_count_as_specimens() -> None:
