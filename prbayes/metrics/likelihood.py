@@ -18,7 +18,6 @@ from prbayes.metrics.density import (
     likelihood_bandwidth,
 )
 from prbayes.metrics.readings import Readings
-from prbayes.response.outputs import specimen_index
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -102,7 +101,7 @@ class LogLikelihood(Metric):
         flag(self.relative, "LogLikelihood: relative")
         limits: Any = self.censored
         parts = [self.error, self.rounded, *(limits if isinstance(limits, tuple | list) else ())]
-        labelled = tuple(x for x in parts if specimen_index(x) is not None)
+        labelled = tuple(x for x in parts if hasattr(x, "iloc") or hasattr(x, "indexes"))
         object.__setattr__(self, "_labelled", labelled)
         gross = self.gross_errors
         if isinstance(gross, int | float) and not isinstance(gross, bool) and not 0 < gross < 1:

@@ -13,7 +13,6 @@ import pytensor.tensor as pt
 from numpy.typing import ArrayLike, NDArray
 from pytensor import config
 from pytensor.graph.basic import Variable
-from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, counted, report
@@ -76,12 +75,7 @@ from prbayes.response.inputs import (
     read_inputs,
     set_units,
 )
-from prbayes.response.outputs import (
-    Outputs,
-    in_order_of,
-    read_observed,
-    refuse_other_order,
-)
+from prbayes.response.outputs import Outputs, in_order_of, read_observed
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
@@ -217,11 +211,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     if isinstance(observed, Summary):
         unused = [metric, epsilon, weights, specimens, dims, arguments.groups]
         metric, observed = _read_summary(name, observed, unused, propagation)
-    given, labelled = observed, getattr(metric, "_labelled", ())
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
-    _refuse_other_order(name, inputs, given, labelled, outputs if given is observed else Outputs())
     outputs = _with_units(name, units, arguments, response, outputs)
     n = np.shape(values)[0] if np.ndim(values) else 1
     refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, n)
@@ -347,18 +339,6 @@ def _read_specimens(
         values = values[rows]
         groups = None if groups is None else groups[rows]
     return values, outputs, groups, rows
-
-
-def _refuse_other_order(
-    name: str, inputs: Sequence[Any], observed: Any, labelled: Sequence[Any], outputs: Outputs
-) -> None:
-    """Raise if conditions, errors or limits with an index are in another order than observed."""
-    for values in labelled:
-        refuse_other_order(values, observed, f"{name}: LogLikelihood", outputs)
-    for variable in ancestors([x for x in inputs if isinstance(x, Variable)]):
-        values = getattr(variable.tag, "labelled", None)
-        if values is not None:
-            refuse_other_order(values, observed, f"{name}: {variable.name}", Outputs())
 
 
 def _with_units(
