@@ -231,6 +231,8 @@ def test_a_condition_may_be_an_input_and_a_covariate(is_last: bool) -> None:
 def test_a_population_for_each_specimen_has_no_common_score(model: pm.Model) -> None:
     table = prb.cross_validate(prb.minimize(model, progressbar=False), folds=2, progressbar=False)
     assert np.isfinite(table["discrepancy"]).all()
+    assert "specimens without a score" in str(table)
+    assert "nan" not in str(table)
     with pytest.raises(ValueError, match="depend on a condition of each specimen"):
         prb.rank({"first": table, "second": table})
 

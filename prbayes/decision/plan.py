@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
+from pytensor.graph.basic import Variable
+from scipy.special import ndtri
+from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, from_json
+from prbayes._finding import Finding, as_json, counted, from_json
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample
@@ -21,9 +24,11 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
+from prbayes.metrics.readings import Readings
 from prbayes.model.description import labelled
+from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.locking import locked
-from prbayes.model.parameters import split_elements, table_elements
+from prbayes.model.parameters import split_elements, table_elements, variables_at
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
@@ -40,7 +45,8 @@ class Condition:
     *inputs
         As for `predict`.
     metric : Metric, optional
-        Of its data; that of the model's simulator by default.
+        Of its data; that of the model's simulator by default. Under the log-likelihood by specimen
+        it is a `LogLikelihood` with the error of the readings.
 
     Raises
     ------
@@ -141,8 +147,9 @@ def plan(
     Notes
     -----
     This is an expectation at the centre of the result: an actual posterior after k specimens has
-    another centre and width. Specimens are new, each measured under one condition. Numbers below
-    ten are less reliable, as information adds up in large samples.
+    another centre and width. Specimens are new, each measured once under one condition. Numbers
+    below ten are less reliable, as information adds up in large samples. Gross errors of readings
+    are not counted.
 
     References
     ----------
@@ -341,19 +348,13 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
 
     The Godambe information :math:`H J^{-1} H` of an ideal sample of the central population, divided
     by its size, and at most the Fisher information of the response. For a simulator with the
-    log-likelihood by specimen, the Fisher information itself.
+    log-likelihood by specimen, the Fisher information of its readings.
     """
     evaluator = sample.populations.evaluator
     center = sample.populations.center
     design = sample.design
     if not design.has_runs:
-        if metric is not None:
-            raise ValueError(
-                f"prb.plan: {sample.responses.name}: metric: got {metric!r} of a simulator with "
-                "the log-likelihood by specimen, whose posterior uses the whole information of "
-                "the response; leave metric= out"
-            )
-        return fisher_information(sample)
+        return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
     # At least 50 specimens: smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)
@@ -371,17 +372,93 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     return _at_most(information / n, fisher_information(sample))
 
 
-def fisher_information(sample: ResponseSample) -> Floats:
+@dataclass(frozen=True, eq=False)
+class ReadingErrors:
+    """Errors, rounding and limits of the readings of a response."""
+
+    readings: Readings  # their errors and steps, which repeat
+    unknown: Variable[Any, Any] | None  # model variable that is the error
+    limits: tuple[Any, Any]  # lower and upper ones, infinite without a limit
+
+    @classmethod
+    def of(cls, sample: ResponseSample, metric: Metric | None) -> ReadingErrors | None:
+        """Return those of a metric, or of the simulator; None of exact readings."""
+        simulator = sample.populations.evaluator.simulators[sample.k]
+        assert isinstance(simulator, EmulatedSimulator)
+        measurement = simulator.measurement
+        label = f"prb.plan: {sample.responses.name}"
+        event = sample.outputs.shape[1:]
+        likelihood: Any = measurement.metric if metric is None else metric
+        if not likelihood.by_specimen:
+            raise ValueError(
+                f"{label}: metric: got {metric!r} of a simulator with the log-likelihood by "
+                "specimen, whose posterior uses the whole information of the readings; leave "
+                "metric= out, or pass prb.LogLikelihood(error=...)"
+            )
+        unknown = likelihood.error if isinstance(likelihood.error, Variable) else None
+        readings = measurement.readings
+        if metric is not None:
+            error = None if unknown is None else 0.0
+            readings = likelihood.readings(np.zeros((1, sample.outputs[0].size)), error, event)
+        elif unknown is not None:
+            unknown = measurement.extras["error"]
+        has_error = unknown is not None or readings.error.any()
+        if not (has_error or readings.step.any() or likelihood.censored):
+            return None
+        size = sample.outputs[0].size
+        size_of_model = readings.values.shape[1]
+        if size != size_of_model:
+            raise ValueError(
+                f"{label}: got {counted(size, 'output')}, expected {size_of_model}, as "
+                f"{simulator.name} has, whose readings have errors; pass "
+                "metric=prb.LogLikelihood(error=...) to prb.decision.Condition"
+            )
+        low, high = likelihood.censored or (None, None)
+        low = -np.inf if low is None else low
+        high = np.inf if high is None else high
+        return cls(readings, unknown, (low, high))
+
+    def draw(
+        self, outputs: Floats, scores: Floats, values: Mapping[str, Floats], step: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return readings of outputs, (n, m), and scores, (n, d), of inputs and errors.
+
+        ``values`` are the variables at a cross of thetas with steps (d,), ``scores`` those of
+        inputs.
+        """
+        shape = outputs.shape
+        normal = np.random.default_rng(0).standard_normal(shape)
+        sd = np.resize(self.readings.error, shape)
+        if self.unknown is not None:
+            logs = np.log(values[str(self.unknown.name)]).reshape(1 + 2 * step.size, -1)
+            sd = np.exp(logs[0])
+            by_output = np.broadcast_to(slopes(logs, step), (shape[1], step.size))
+            scores = scores + (normal**2 - 1) @ by_output
+        is_relative = np.resize(self.readings.is_relative, shape)
+        unit = np.where(is_relative, np.abs(outputs), 1.0)
+        result = outputs + sd * unit * normal
+        width = np.resize(self.readings.step, shape)
+        is_rounded = width > 0
+        width = np.where(is_rounded, width, 1.0)
+        steps = np.round(result / width)
+        result = np.where(is_rounded, steps * width, result)
+        lowest, highest = (np.resize(limit, shape) for limit in self.limits)
+        return np.clip(result, lowest, highest), scores
+
+
+def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = None) -> Floats:
     r"""Return the Fisher information of one specimen, (d, d), in units of the prior's spread.
 
     The covariance of the score of a response, :math:`E[s(x) | y]`: the mean over bins of the
     response of the score of the inputs, which is the derivative of their log weights. For several
-    outputs the covariance of the inputs' score, an upper bound.
+    outputs the covariance of the inputs' score, an upper bound; if they are readings with errors,
+    of its projection on quadratic functions of the readings.
     """
     evaluator = sample.populations.evaluator
     unit = evaluator.hyperparameters.prior_sd
     step = 1e-3 * unit
-    parents = evaluator.parents(cross(sample.populations.center, step), sample.k)
+    thetas = cross(sample.populations.center, step)
+    parents = evaluator.parents(thetas, sample.k)
     _, weights = sample.design.populations(parents)
     outputs = sample.outputs
     if sample.emulator is None:
@@ -391,19 +468,45 @@ def fisher_information(sample: ResponseSample) -> Floats:
     is_used = (weights[0] > 0) & is_observable
     weights = weights[:, is_used]
     with np.errstate(divide="ignore", invalid="ignore"):
-        scores = slopes(np.log(weights), step) * unit
+        scores = slopes(np.log(weights), step)
     mass = weights[0] / weights[0].sum()
-    scores = scores - mass @ scores
-    if outputs.ndim > 1:
-        return np.asarray((scores.T * mass) @ scores)
-    values = outputs[is_used]
+    values = outputs[is_used].reshape(len(mass), -1)
     # Bins of half the root of the number of points; equal values are in one bin.
-    rank = np.searchsorted(np.sort(values), values)
-    bins = rank // max(1, int(np.sqrt(len(mass)) / 2))
+    size = max(1, int(np.sqrt(len(mass)) / 2))
+    if errors is not None:
+        copies = 16  # of each specimen, with other errors
+        values = np.tile(values, (copies, 1))
+        scores = np.tile(scores, (copies, 1))
+        mass = np.tile(mass, copies) / copies
+        variables = variables_at(evaluator.hyperparameters, thetas)
+        values, scores = errors.draw(values, scores, variables, step)
+        size = max(1, len(mass) // 128)
+    scores = (scores - mass @ scores) * unit
+    if outputs.ndim > 1:
+        if errors is not None:
+            scores = _projected(scores, values, mass)
+        return np.asarray((scores.T * mass) @ scores)
+    rank = np.searchsorted(np.sort(values[:, 0]), values[:, 0])
+    bins = rank // size
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
     means = sums / np.where(share > 0, share, 1.0)
     return np.asarray((means * share) @ means.T)
+
+
+def _projected(scores: Floats, values: Floats, mass: Floats) -> Floats:
+    """Return scores, (n, d), as quadratic functions of the normal scores of values, (n, m)."""
+    z = ndtri((rankdata(values, axis=0) - 0.5) / len(values))
+    # Eight components of many outputs, such as those of a curve.
+    _, axes = np.linalg.eigh(z.T @ z)
+    z = z @ axes[:, -8:]
+    first, second = np.triu_indices(z.shape[1])
+    products = z[:, first] * z[:, second]
+    basis = np.column_stack([z, products])
+    basis -= mass @ basis
+    root = np.sqrt(mass)[:, None]
+    coefficients = np.linalg.lstsq(root * basis, root * scores)[0]
+    return np.asarray(basis @ coefficients)
 
 
 def _at_most(information: Floats, bound: Floats) -> Floats:

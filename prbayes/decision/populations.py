@@ -304,9 +304,10 @@ class ResponseSample:
             )
 
     def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
-        """Return findings of a tail of few points, and the error of the quantity at the centre.
+        """Return findings, and the error of the quantity at the centre.
 
-        Raises ValueError if no response is in the tail, or specimens failed.
+        Findings are of a tail of few points, and of populations beyond the runs. Raises ValueError
+        if no response is in the tail, or specimens failed.
         """
         caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
@@ -319,7 +320,7 @@ class ResponseSample:
         at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
         if not np.isin(is_beyond, (0.0, 1.0)).all():
-            return (), self._jackknife_error(quantity)
+            return _beyond_runs(self, quantity), self._jackknife_error(quantity)
         share = float(self.mean_weights() @ is_beyond)
         is_upper = share <= 0.5
         if not is_upper:  # the rarer side decides how well the quantity is known
@@ -341,6 +342,7 @@ class ResponseSample:
             findings = report(Finding("rough-probability", text))
         if not isinstance(quantity, Quantile):
             return findings, error
+        findings += _beyond_runs(self, quantity)
         (weights,) = self.weights(center)
         is_beyond = quantity.of_specimen(self.values, at)
         on_line = self.design.has_runs and self.design.design.on_line
@@ -350,7 +352,10 @@ class ResponseSample:
         tails = probability_bounds(share, error, float(ndtr(-1)))
         tails *= min(quantity.probability, 1 - quantity.probability) / share
         ends = weighted_quantiles(self.values, weights, tails, is_upper)
-        return findings, float(np.abs(ends - value).max())
+        error = float(np.abs(ends - value).max())
+        if self.emulator is not None:
+            error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
+        return findings, error
 
     def _jackknife_error(self, quantity: Quantity) -> float:
         """Return the error of a quantity at the centre, by points and emulator."""
@@ -363,16 +368,42 @@ class ResponseSample:
         if outputs:
             parents = self.populations.evaluator.parents(center, self.k)
             mass = self.design.populations(parents)[1]
-            quantities = np.array([_of_unsorted(quantity, values, mass) for values in outputs])
+            quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
             variance += ((quantities[1:] - quantities[0]) ** 2).sum()
         return float(np.sqrt(variance))
 
 
-def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> float:
-    """Return a quantity of responses in any order, (n,); NaN are left out."""
+def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
+    """Return a finding if the constant response beyond the runs limits a quantity."""
+    if sample.emulator is None:
+        return ()
+    thetas = sample.populations.thinned()
+    change = np.nanstd(_range_effect(sample, quantity, thetas)) / 2
+    if not change > 0.1 * np.nanstd(sample.evaluate(quantity, thetas)):
+        return ()
+    text = (
+        f"{quantity!r}: some populations extend beyond the range of the runs, where the response "
+        "is taken as constant. With the slope at the end of the range the quantity of a "
+        f"population would be different by about {change:.1g}, and its interval too; compute it "
+        "from prb.predict with stored=False, which calls the response there."
+    )
+    return report(Finding("beyond-runs", text, "decision.md#the-population-in-units"))
+
+
+def _range_effect(sample: ResponseSample, quantity: Quantity, thetas: Floats) -> Floats:
+    """Return by how much a steeper response beyond the runs changes a quantity, (k,)."""
+    populations = sample.populations
+    mass = sample.design.populations(populations.evaluator.parents(thetas, sample.k))[1]
+    constant, *_, steeper = sample.emulated(sample.points)
+    return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
+
+
+def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
+    """Return a quantity of responses in any order, (n,), by population; NaN are left out."""
     order = np.argsort(values)[: np.isfinite(values).sum()]
     weights = weights[:, order]
-    return float(quantity.of(values[order], weights / weights.sum())[0])
+    with np.errstate(invalid="ignore"):
+        return quantity.of(values[order], weights / weights.sum(axis=1, keepdims=True))
 
 
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:

@@ -18,7 +18,7 @@ from prbayes.emulators.surrogate import Surrogate
 from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import Outputs
+from prbayes.response.outputs import Outputs, is_missing
 
 
 class Runs(Shown):
@@ -77,6 +77,8 @@ class Runs(Shown):
         table = read_table("Runs", inputs, responses)
         self.surrogate = replace(Surrogate.of_table("Runs", table), _warned=[True])
         self.outputs = table.outputs
+        if is_missing(table.responses).any():
+            self.remedy = f"leave out runs that failed by chance, {self.remedy}"
 
     @classmethod
     def read_csv(

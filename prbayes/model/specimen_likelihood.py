@@ -124,22 +124,24 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     It is that of the difference between two independent halves of the points of each specimen. A
     population that is narrower than the distances between points has a large one. Specimens that
     have a gross error have next to none. A specimen without a point in one of the halves is left
-    out; zero if the error of the readings is unknown.
+    out.
     """
     shared, shared_log_a = arrays(likelihood)
     log_a = shared_log_a.get_value(borrow=True)
     x = [variable.get_value(borrow=True) for variable in shared]
     size, half = len(next(iter(values.values()))), log_a.shape[1] // 2
     variance = np.zeros(size)
-    if not likelihood.error_is_known:
-        return variance
+    errors = _errors(likelihood, values)
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(values, group, rows)
         logs = []
         for part in (slice(half), slice(half, None)):
             of_half = [v[rows, part] for v in x]
             points = WeightedPoints.of(likelihood.inputs, of_half, log_a[rows, part])
-            of_points = likelihood.density.log_likelihoods(parents, points)
+            if likelihood.error_is_known:
+                of_points = likelihood.density.log_likelihoods(parents, points)
+            else:
+                of_points = _with_unknown_error(likelihood, errors, parents, points, rows, part)
             logs.append(_with_gross_errors(likelihood, values, of_points, rows))
         with np.errstate(invalid="ignore"):
             difference = logs[0] - logs[1]
@@ -174,11 +176,15 @@ def _with_unknown_error(
     parents: Sequence[Floats],
     points: WeightedPoints,
     rows: NDArray[np.intp],
+    columns: slice = slice(None),
 ) -> Floats:
-    """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M)."""
+    """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M).
+
+    The points are ``columns`` of all points.
+    """
     result = np.empty((len(errors), len(rows)))
     for k, error in enumerate(errors):
-        log_a = points.log_a + _readings_log_density(likelihood, error, np)[rows]
+        log_a = points.log_a + _readings_log_density(likelihood, error, np)[rows, columns]
         population = [parent[k : k + 1] for parent in parents]
         at_error = replace(points, log_a=log_a)
         (result[k],) = likelihood.density.log_likelihoods(population, at_error)

@@ -670,11 +670,12 @@ def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str
         store_text = f"; {len(settings.store)} responses are kept in {settings.store.folder}"
     remedy = "pass on_failure=prb.response.Replace() or prb.response.Retry()"
     receiver = " to the propagation or surrogate"
-    if not settings.takes_policy:
+    is_wrong = is_wrong_result(reason)
+    if not settings.takes_policy or (is_wrong and isinstance(settings.on_failure.final, Replace)):
         remedy, receiver = "return NaN (no response) or inf (the specimen failed) there", ""
     advice = f"repair it, keep priors and inputs where it has a response, or {remedy}{receiver}"
     advice += array_advice(reason)
-    if is_wrong_result(reason):
+    if is_wrong:
         advice = f"repair it; if this is what a run that failed returns, {remedy}"
     return ResponseError(
         f"{settings.name}: the response failed at {counted(len(raised), 'point')}{place}: {reason}"

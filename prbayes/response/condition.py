@@ -19,6 +19,7 @@ from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 from prbayes._validate import Floats, plain_text, real_array
+from prbayes.response.outputs import specimen_index
 
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
@@ -110,7 +111,7 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     plain_text(name, f"{caller}: name")
     array = real_array(values, f"{caller}: values").astype(float)
     if array.ndim == 2 and len(array) > 1:
-        return _vector(name, array, caller)
+        return _labelled(_vector(name, array, caller), values)
     if array.ndim != 1 or len(array) < 2 or not np.isfinite(array).all():
         raise ValueError(
             f"{caller}: values: got shape {array.shape}, {int((~np.isfinite(array)).sum())} of "
@@ -126,6 +127,13 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     rng = pt.random.shared_rng(seed=None)
     _, variable = op(*op.range, rng=rng, return_next_rng=True)
     variable.name = name
+    return _labelled(variable, values)
+
+
+def _labelled(variable: TensorVariable, values: ArrayLike) -> TensorVariable:
+    """Return a condition that keeps values with an index, to be compared with that of observed."""
+    if specimen_index(values) is not None:
+        variable.tag.labelled = values
     return variable
 
 

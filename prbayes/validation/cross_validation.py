@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from prbayes._display import Table, View
+from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
@@ -27,6 +28,7 @@ from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
+from prbayes.response.condition import is_condition
 
 
 @locked
@@ -69,7 +71,7 @@ def cross_validate(
         which a tenth is spread widely over the data; and ``weight``, the number of observations
         that the specimen counts for. The scores of several simulators add up; of several outputs a
         score is the mean over directions, as in `Joint`. Scores are NaN if the data have no
-        density.
+        density, or if responses or populations depend on `prbayes.response.condition`.
 
     Raises
     ------
@@ -148,8 +150,14 @@ class CrossValidationTable(Table):
             [str(name), *(f"{float(means[key].sel(simulator=name)):.4g}" for key in means)]
             for name in self["simulator"].values
         ]
-        score = float(self["score"].mean())
+        score = float(self["score"].mean(skipna=False))
         sentences = [f"Mean log density of a held-out specimen: {score:.4g}."]
+        if np.isnan(score):
+            n_missing = int(self["score"].isnull().sum())
+            sentences = [
+                f"{counted(n_missing, 'specimen')} without a score: the observed values have no "
+                "density, or depend on a condition of each specimen; compare the discrepancies."
+            ]
         n_failed = int((~self["converged"]).sum())
         if n_failed:
             sentences.append(f"The minimisations of {n_failed} folds did not converge.")
@@ -258,7 +266,10 @@ def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tup
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
         counts += np.bincount(numbers[k], weights * weights.size, total)
-        if simulator.inputs.covariates:  # each specimen has a population of its own
+        # With a condition each specimen has a population of responses of its own.
+        inputs = simulator.inputs
+        has_conditions = any(map(is_condition, inputs.aleatory))
+        if inputs.covariates or has_conditions:
             scores[numbers[k]] = np.nan
             continue
         try:

@@ -188,19 +188,38 @@ def test_points_are_refused_where_the_support_moves() -> None:
     assert abs(float(table.probability) - expected) < 3 * float(table.error)
 
 
-def test_a_limit_beyond_the_range_of_the_runs_is_not_decided() -> None:
+def narrow_prior() -> tuple[pm.Model, Any, Any]:
+    """Return a model of eight specimens whose runs end at 3.9, as its prior does, and draws."""
     observed = np.random.default_rng(3).normal(0.0, 1.0, 8)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", same, x, observed=observed)
-    result = jeffreys(observed, 1000)
+    return model, x, jeffreys(observed, 1000)
+
+
+def test_a_limit_beyond_the_range_of_the_runs_is_not_decided() -> None:
+    model, x, result = narrow_prior()
     draws = result["posterior"]
     by_draw = ndtr((draws["mu"].values - 4.5) / draws["sigma"].values)
-    # The runs end at 3.9, where the prior does.
     table = prb.exceedance(result, same, 4.5, x, model=model, requirement=0.003)
     assert float(table.probability) == 0
     assert by_draw.mean() < 4 * float(table.error)
     assert (np.quantile(by_draw, 0.945) > 0.003, table.attrs["verdict"]) == (True, "not decided")
+
+
+def test_quantiles_beyond_the_range_of_the_runs_are_reported() -> None:
+    model, x, result = narrow_prior()
+    draws = result["posterior"]
+    for probability, codes in ((0.9, []), (0.9999, ["beyond-runs"])):
+        quantity = prb.decision.Quantile(same, x, probability=probability)
+        table = prb.decision.evaluate(result, quantity, model=model)
+        expected = (draws["mu"] + ndtri(probability) * draws["sigma"]).mean()
+        assert abs(float(table.estimate - expected)) < 2 * float(table.error)
+        assert [finding.code for finding in from_json(table.attrs["findings"])] == codes
+    condition = prb.decision.Condition(same, x)
+    bounds = prb.population(result, condition, model=model, upper=True)
+    (finding,) = from_json(bounds.attrs["findings"])
+    assert finding.code == "beyond-runs"
 
 
 def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) -> None:

@@ -3,7 +3,9 @@
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
+import xarray as xr
 from decisions import N, doubled, normal, optimum, posterior, same
 
 import prbayes as prb
@@ -131,3 +133,48 @@ def test_precisions_add_up() -> None:
     draws = Draws.of(populations.thetas, populations.evaluator.hyperparameters.prior_sd)
     sd = np.sqrt(np.diag(draws.covariance)) * draws.unit
     np.testing.assert_allclose(sd, populations.thetas.std(axis=0), rtol=0.03)
+
+
+def test_errors_of_readings_are_part_of_the_information() -> None:
+    """A normal population with standard deviation .3, and normal errors."""
+    rng = np.random.default_rng(0)
+    observed = rng.normal(1.0, 0.3, 30)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        error = pm.HalfNormal("error", 0.5)
+        metric = prb.LogLikelihood(error=error)
+        prb.Simulator("y", same, x, observed=observed + rng.normal(0, 0.5, 30), metric=metric)
+    draws = {"mu": rng.normal(1.0, 0.05, 500)}
+    draws |= {k: v * np.exp(rng.normal(0, 0.1, 500)) for k, v in (("sigma", 0.3), ("error", 0.5))}
+    group = xr.Dataset({name: (("chain", "draw"), v[None]) for name, v in draws.items()})
+    result = xr.DataTree.from_dict({"posterior": group})
+    populations = Populations.of(result, model, 500, "prb.plan")
+    sigma, e = np.exp(populations.center[1:])
+    unit = populations.evaluator.hyperparameters.prior_sd
+
+    def information(response: Any, metric: Any = None) -> Any:
+        sample = populations.sample_of_all_outputs(response, (x,))
+        return specimen_information(sample, metric) / np.outer(unit, unit)
+
+    def normal(covariance: Any, errors: Any) -> Any:
+        """Return the information of normal readings about the mean, log sigma and log error."""
+        inverse = np.linalg.inv(covariance)
+        slopes = [2 * (covariance - errors) @ inverse, 2 * errors @ inverse]
+        spreads = [[0.5 * np.trace(a @ b) for a in slopes] for b in slopes]
+        return np.pad(spreads, (1, 0)) + np.diag([inverse.sum(), 0, 0])
+
+    variance = np.full((2, 2), sigma**2)
+    expected = normal(variance[:1, :1] + e**2, np.array([[e**2]]))
+    np.testing.assert_allclose(information(same), expected, rtol=0.06, atol=0.06)
+    # Of two outputs with an error that the candidate's metric states, and the model does not have.
+    errors = np.diag([0.3, 1.0]) ** 2
+    expected = normal(variance + errors, errors)
+    expected[2] = expected[:, 2] = 0
+    stated = prb.LogLikelihood(error=[0.3, 1.0])
+    found = information(lambda x: np.stack([x, x], axis=-1), stated)
+    np.testing.assert_allclose(found, expected, rtol=0.06, atol=0.06)
+    with pytest.raises(ValueError, match=r"got 2 outputs, expected 1, .*LogLikelihood\(error="):
+        information(lambda x: np.stack([x, x], axis=-1))
+    # Censored at the mean: half of the readings are equal.
+    censored = information(same, prb.LogLikelihood(censored=(None, populations.center[0])))
+    assert censored[0, 0] == pytest.approx((0.5 + 1 / np.pi) / sigma**2, rel=0.05)

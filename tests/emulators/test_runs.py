@@ -116,6 +116,8 @@ def test_outputs_keep_their_labels_and_failed_runs_are_nan_nearby() -> None:
     table = prb.Runs(TABLE, values)
     near = table([0.3, 0.9], 1.5)
     np.testing.assert_allclose(near.sel(output="a"), [1.5, np.nan], atol=1e-4)
+    assert table.remedy.startswith("leave out runs that failed by chance, add the runs")
+    assert prb.Runs(TABLE, values["b"]).remedy.startswith("add the runs")
     assert table.responses.shape == (48, 2)
 
 

@@ -15,6 +15,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import Hyperparameters
 from prbayes.model.specimen_likelihood import monte_carlo_error
 from prbayes.optimize.maximum_likelihood import (
@@ -325,6 +326,31 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     assert wide < 0.2
     values["s1"] = np.array([1e-80, 0.2])  # the square of the difference overflows: no warning
     assert monte_carlo_error(likelihood, values).tolist() == [np.inf, pytest.approx(wide)]
+
+
+def test_a_population_between_the_points_is_no_optimum_with_an_unknown_error() -> None:
+    times = np.linspace(0, 1, 8)
+    rng = np.random.default_rng(0)
+
+    def lines(a: Any, b: Any) -> Any:
+        return np.asarray(a)[..., None] + np.asarray(b)[..., None] * times
+
+    observed = lines(rng.normal(1, 0.5, 8), np.full(8, 0.7)) + rng.normal(0, 0.3, (8, 8))
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("m1", 1, 0.5), pm.HalfNormal("s1", 0.5))
+        b = pm.Normal.dist(pm.Normal("m2", 0.7, 1), pm.HalfNormal("s2", 0.5))
+        metric = prb.LogLikelihood(error=pm.HalfNormal("e", 0.5))
+        prb.Simulator("y", lines, a, b, metric=metric, observed=observed)
+    (likelihood,) = Evaluator.of(model).likelihoods
+    points = {"m1": 1.0, "s1": 0.5, "m2": 0.7, "s2": [0.001, 0.3], "e": 0.3}
+    values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
+    narrow, wide = monte_carlo_error(likelihood, values)
+    assert narrow > 2
+    assert wide < 0.2
+    # Maxima at spreads of b near zero are several nats high.
+    optimum = fit(model, start={"m1": 1, "s1": 0.5, "m2": 0.7, "s2": 0.01, "e": 0.3})
+    assert not optimum.converged
+    assert "narrow-population" in {finding.code for finding in optimum.findings}
 
 
 def test_a_likelihood_that_overflows_is_no_warning() -> None:

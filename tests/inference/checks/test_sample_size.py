@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 from four_metrics import same
@@ -61,6 +62,48 @@ def test_specimens_count_where_simulators_share_hyperparameters() -> None:
 
     assert not warned(model(True))
     assert warned(model(False)).startswith("y0: got 4 specimens")
+
+
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood()])
+def test_groups_count_together_where_they_share_hyperparameters(metric: prb.Metric) -> None:
+    def model(sizes: list[int], is_shared: bool) -> pm.Model:
+        labels = np.repeat(["a", "b"], sizes)
+        observed = pd.DataFrame({"y": INPUTS[-len(labels) :], "rig": labels})
+        with pm.Model(coords={"rig": ["a", "b"]}) as result:
+            rig = prb.response.group("rig")
+            mu = pm.Normal("mu", pm.Normal("m", 0, 2), 1, dims="rig")
+            spread = pm.HalfNormal("sd", 1, dims=None if is_shared else "rig")
+            x = pm.Normal.dist(mu[rig], spread if is_shared else spread[rig])
+            prb.Simulator("y", same, x, metric=metric, observed=observed)
+        return result
+
+    assert warned(model([20, 3], False)).startswith("y[b]: got 3 specimens")
+    assert not warned(model([20, 3], True))
+    # The sum of 1 / sum(w**2) is 8 but for rounding.
+    assert "at least 8" not in warned(model([6, 2], True))
+
+
+def test_a_spread_in_common_of_pairs_is_underestimated() -> None:
+    """The maximum of the likelihood is the root of half the variance (Neyman and Scott 1948)."""
+    rigs = [f"rig {k}" for k in range(10)]
+
+    def optimum(n: int) -> prb.Optimum:
+        labels = np.repeat(rigs, n)
+        values = np.random.default_rng(n).normal(0, 1, len(labels))
+        observed = pd.DataFrame({"y": values, "rig": labels})
+        with pm.Model(coords={"rig": rigs}):
+            mu = pm.Normal("mu", 0, 1, dims="rig")
+            x = pm.Normal.dist(mu[prb.response.group("rig")], pm.HalfNormal("sd", 1))
+            prb.Simulator("y", same, x, observed=observed)
+            return prb.minimize(progressbar=False)
+
+    pairs = optimum(2)
+    (finding,) = pairs.findings
+    assert finding.code == "few-specimens"
+    assert "20 specimens of 10 populations" in finding.text
+    assert "by about 29%" in finding.text
+    assert pairs.point["sd"] < 1 - 1.5 * pairs.stderr["sd"]
+    assert not optimum(21).findings
 
 
 def test_readings_of_one_specimen_and_weights_do_not_count_as_specimens() -> None:
