@@ -93,17 +93,22 @@ class LogLikelihood(Metric):
     counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
     distance: ClassVar[bool] = False
+    # Arrays with an index, to be compared with that of observed.
+    _labelled: ClassVar[tuple[Any, ...]] = ()
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
+        limits: Any = self.censored
+        parts = [self.error, self.rounded, *(limits if isinstance(limits, tuple | list) else ())]
+        labelled = tuple(x for x in parts if hasattr(x, "iloc") or hasattr(x, "indexes"))
+        object.__setattr__(self, "_labelled", labelled)
         gross = self.gross_errors
         if isinstance(gross, int | float) and not isinstance(gross, bool) and not 0 < gross < 1:
             raise ValueError(
                 f"LogLikelihood: gross_errors: got {gross!r}, expected True, a share in (0, 1) or "
                 "a variable of the model"
             )
-        limits: Any = self.censored
         if limits is not None:
             is_pair = isinstance(limits, tuple | list) and len(limits) == 2
             if not is_pair or all(x is None for x in limits):

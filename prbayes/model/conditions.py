@@ -9,12 +9,14 @@ from typing import Any, cast
 import numpy as np
 import xarray as xr
 from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats, called, real_array
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.response.condition import ReadingsCondition, is_condition
 from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import refuse_other_order
 
 
 def stacked_values(values: Mapping[str, Floats]) -> Floats | None:
@@ -49,6 +51,7 @@ def observed_at_conditions(
             "specimen, expected prb.LogLikelihood(): a metric of distributions compares specimens "
             "under the same conditions; leave metric= out, or write a simulator for each condition"
         )
+    _refuse_other_order(name, observed, metric, inputs)
     if not vectors:
         return observed, metric
     condition = vectors[0]
@@ -87,6 +90,18 @@ def observed_at_conditions(
         ]
         changed[role] = tuple(parts) if role == "censored" else parts[0]
     return scattered, replace(cast(LogLikelihood, metric), **changed) if changed else metric
+
+
+def _refuse_other_order(
+    name: str, observed: Any, metric: Metric | None, inputs: Sequence[Any]
+) -> None:
+    """Raise if conditions, errors or limits with labels are in another order than observed."""
+    for values in getattr(metric, "_labelled", ()):
+        refuse_other_order(values, observed, f"{name}: LogLikelihood")
+    for variable in ancestors([x for x in inputs if isinstance(x, Variable)]):
+        values = getattr(variable.tag, "labelled", None)
+        if values is not None:
+            refuse_other_order(values, observed, f"{name}: {variable.name}")
 
 
 def _at_columns(array: Any, condition: ReadingsCondition, missing: float = np.nan) -> Floats:

@@ -19,6 +19,7 @@ from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 from prbayes._validate import Floats, plain_text, real_array
+from prbayes.response.outputs import specimen_index
 
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
@@ -110,7 +111,7 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     plain_text(name, f"{caller}: name")
     array = real_array(values, f"{caller}: values").astype(float)
     if array.ndim == 2 and len(array) > 1:
-        return _vector(name, array, caller)
+        return _labelled(_vector(name, array, caller), values)
     if array.ndim != 1 or len(array) < 2 or not np.isfinite(array).all():
         raise ValueError(
             f"{caller}: values: got shape {array.shape}, {int((~np.isfinite(array)).sum())} of "
@@ -126,6 +127,13 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     rng = pt.random.shared_rng(seed=None)
     _, variable = op(*op.range, rng=rng, return_next_rng=True)
     variable.name = name
+    return _labelled(variable, values)
+
+
+def _labelled(variable: TensorVariable, values: ArrayLike) -> TensorVariable:
+    """Return a condition that keeps values with an index, to be compared with that of observed."""
+    if specimen_index(values) is not None:
+        variable.tag.labelled = values
     return variable
 
 
@@ -196,12 +204,23 @@ def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
 def refuse_vectors_of_specimens(
     name: str, aleatory: Sequence[Any], parents: Sequence[Variable], size: int
 ) -> None:
-    """Raise where an input is a vector with an element for each specimen, as in PyMC."""
+    """Raise where an input is a vector with an element for each specimen, as in PyMC.
+
+    Or where it depends on a condition of which each specimen has several values.
+    """
     for x in aleatory:
         batch = x.type.ndim - getattr(x.owner.op, "ndim_supp", 0)
-        if is_condition(x) or batch != 1:
+        if is_condition(x):
             continue
-        for v in ancestors(x.owner.inputs, blockers=parents):
+        above = list(ancestors(x.owner.inputs, blockers=parents))
+        for v in above:
+            if isinstance(v, ReadingsCondition):
+                raise TypeError(
+                    f"{name}: inputs: got {x.name or 'a .dist()'} with parameters from {v.name}, "
+                    f"whose values have the shape {v.columns.shape}, expected one value for each "
+                    "specimen; pass values of shape (N,) to prb.response.condition"
+                )
+        for v in above if batch == 1 else ():
             data: Any = v.get_value() if hasattr(v, "get_value") else getattr(v, "data", None)
             if np.shape(data) == (size,) and np.ptp(data) > 0:
                 label = v.name or "hardness"

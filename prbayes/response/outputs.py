@@ -294,6 +294,29 @@ def in_order_of(values: Any, observed: Any, name: str, *, reference: str = "obse
     )
 
 
+def refuse_other_order(values: Any, observed: Any, name: str) -> None:
+    """Raise a ValueError if a labelled array has specimens or outputs in another order."""
+    is_table = np.ndim(values) > 1
+    labels = labels_along(values, 1 if is_table else 0)
+    outputs: tuple[Any, ...] = ()
+    if isinstance(observed, Mapping) or hasattr(observed, "columns"):
+        outputs = tuple(observed)
+    elif np.ndim(observed) > 1 and hasattr(observed, "coords"):
+        outputs = labels_along(observed, 1)
+    are_outputs = set(labels) == set(outputs)
+    if are_outputs and labels != outputs:
+        raise ValueError(
+            f"{name}: got the outputs {list(labels)}, expected {list(outputs)}, the order of "
+            "observed"
+        )
+    is_by_specimen = is_table or not are_outputs
+    if is_by_specimen and in_order_of(values, observed, name) is not values:
+        raise ValueError(
+            f"{name}: got values in another order than observed, by their index, expected the "
+            "same order; pass values.loc[observed.index]"
+        )
+
+
 def specimen_index(values: Any) -> Any:
     """Return the index of the specimens of a labelled array or a mapping of them, or None."""
     if isinstance(values, Mapping):  # of outputs, each in the order of the first

@@ -10,6 +10,7 @@ from typing import Any
 import arviz as az
 import cloudpickle
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
@@ -545,3 +546,47 @@ def test_the_response_itself_serves_in_place_of_an_emulator() -> None:
             prb.Simulator("y", np.square, x, observed=observed, propagation=propagation)
         logs.append(values(model, {"mu": 0.9}).sum())
     assert logs[0] == pytest.approx(logs[1], abs=0.05)
+
+
+def test_labelled_arrays_in_another_order_than_observed_are_refused() -> None:
+    """Errors, limits and conditions have no names to match by: they would belong to others."""
+    y = pd.Series(Y, index=[f"s{i}" for i in range(N)])
+    table = pd.DataFrame({"a": y, "b": 2 * y})
+    step = 0 * y + np.linspace(0.1, 0.2, N)
+    rows, columns = "in another order than observed", r"outputs \['b', 'a'\], expected \['a', 'b'\]"
+    frame = table.abs() + 1
+
+    def of_both(x: Any) -> Any:
+        return {"a": 1 + 2 * x, "b": 2 + 4 * x}
+
+    def metric(**given: Any) -> dict[str, Any]:
+        return {"metric": prb.LogLikelihood(**given)}
+
+    def input_at(condition: Any) -> dict[str, Any]:
+        def inputs() -> list[Any]:
+            mu, sigma = priors()
+            return [pm.Normal.dist(mu + prb.response.condition("c", condition), sigma)]
+
+        return {"inputs": inputs}
+
+    for given, message in (
+        (metric(error=step[::-1]), rows),
+        (metric(rounded=step[::-1]), rows),
+        (metric(censored=(None, (step + 3)[::-1])), rows),
+        (metric(error=step.set_axis(step.index + "x")), "got values with the index"),
+        (input_at(step[::-1]), rows),
+    ):
+        with pytest.raises(ValueError, match=message):
+            build(observed=y, **given)
+    for error, message in (
+        (pd.Series({"b": 0.1, "a": 0.2}), columns),
+        (frame[["b", "a"]], columns),
+        (frame[::-1], rows),
+    ):
+        with pytest.raises(ValueError, match=message):
+            build(of_both, table, **metric(error=error))
+    build(observed=y, **metric(error=step, censored=(None, step + 3)))
+    build(observed=y, **input_at(step.to_numpy()[::-1]))
+    for same in (pd.Series({"a": 0.2, "b": 0.1}), frame, frame.reset_index(drop=True)):
+        build(of_both, table, **metric(error=same))
+        build(of_both, dict(table), **metric(error=same))
