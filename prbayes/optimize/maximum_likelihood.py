@@ -348,7 +348,7 @@ def _differences(objective: _Objective, theta: Floats, step: Floats) -> Floats |
 
 
 def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats) -> Floats:
-    """Return steps over which an objective with kinks rises by half a nat on both sides.
+    """Return steps over which an objective with kinks rises by two nats on both sides.
 
     At kinks differences over small steps are too large, and between them zero: one standard error
     away the objective has not risen.
@@ -358,11 +358,11 @@ def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats
         curvature = unit @ hessian @ unit
         if curvature > 1.0 / 25:
             rises = _rises(objective, theta, unit / np.sqrt(curvature))
-            if not rises.mean() < 0.3:
+            if not rises.mean() < 0.25:  # half of what curvature gives
                 continue
         for width in 2.0 ** np.arange(-12, 1):
             rises = _rises(objective, theta, width * unit)
-            if np.isfinite(rises).all() and rises.min() >= 0.5:
+            if np.isfinite(rises).all() and rises.min() >= 2.0:
                 result[j] = width * unit[j]
                 break
     return result
