@@ -262,6 +262,10 @@ class _Drawing:
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
             axis.set_xticks(places, list(outputs.names))
+            # An inch takes twelve characters of the default font
+            inches = axis.bbox.width / axis.figure.dpi
+            if max(map(len, outputs.names)) + 1 > 12 * inches / places.size:
+                axis.tick_params(axis="x", labelrotation=90)
             y += ", standard deviations from the mean"
         x = places[order]
         measured = ((observed - center) / unit)[:, order]

@@ -169,7 +169,8 @@ def area_test(
         of u and ``|2u - 1|``: a wrong correlation is a wrong spread in some directions.
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
-        NaN are left out.
+        NaN are left out. The values have to be like the observed ones: rounded, capped at the limit
+        of the instrument, or with an error, as these are.
     alpha : float
         Probability of rejecting a right model.
     null : Null, optional

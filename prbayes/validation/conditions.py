@@ -91,6 +91,16 @@ class Case:
         """Whether a specimen was measured several times."""
         return self.n_specimens < self.size
 
+    @property
+    def has_ties(self) -> bool:
+        """Whether u-values are middles of steps: measured values equal several predicted ones."""
+        for condition in self.conditions:
+            lower, upper = Predictive(condition.predicted).steps(condition.observed)
+            # The step of a single predicted value is one over their number.
+            if not self.randomize and ((upper - lower) * condition.predicted.size > 1.5).any():
+                return True
+        return False
+
     def statistic(self, u: Floats) -> Floats:
         """Return the statistic of u-values, (..., n) -> (...).
 
@@ -226,7 +236,8 @@ def projections(pool: Floats) -> list[Projection]:
     """Return projections of predicted outputs of all draws, shape (D, S, m).
 
     Their directions are well spread where the predicted outputs are white. Measured values have no
-    influence, so replicates have the same projections.
+    influence, so replicates have the same projections. Raises ValueError if predicted outputs
+    depend on each other linearly, as many outputs of few inputs do without a measurement error.
     """
     m = pool.shape[-1]
     rows = pool.reshape(-1, m)
@@ -235,7 +246,14 @@ def projections(pool: Floats) -> list[Projection]:
     # 4096 specimens determine correlations to .02; any directions give a test of the right size.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
-    center, axes = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    try:
+        center, axes = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    except ValueError as error:
+        got = str(error).removeprefix("observed: ")
+        raise ValueError(
+            f"predicted: {got}. If the readings have an error, add it to the prediction, such as "
+            "by prb.predict(posterior, reading, x, pm.Normal.dist(0, sd, shape=m))"
+        ) from None
     caps, number = failure_caps(rows), max(1, sufficient_directions(m))
     return [Projection(outputs, caps, center, axes @ u) for u in directions(m, number, 0)]
 

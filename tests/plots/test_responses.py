@@ -288,4 +288,5 @@ def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) 
     np.testing.assert_allclose(y[np.isfinite(y)], expected.ravel())
     axis = read.panel(pc, "strain")
     assert [tick.get_text() for tick in axis.get_xticklabels()] == names
+    assert {tick.get_rotation() for tick in axis.get_xticklabels()} == {90.0}, "side by side"
     assert not read.panels(pc, "before")

@@ -103,6 +103,13 @@ def test_outputs_are_white_in_every_direction(m: int) -> None:
         assert np.isfinite(numbers[1:]).all()
 
 
+def test_many_outputs_of_few_inputs_need_the_error_of_the_readings() -> None:
+    x = np.random.default_rng(1).standard_normal((50, 1))
+    predicted = x * [1.0, 2.0, 3.0]
+    with pytest.raises(ValueError, match=r"^predicted: got outputs 0, 1, 2 .* error, add it"):
+        prb.area_test(predicted[:5], predicted)
+
+
 def test_pairs_of_measured_and_predicted_outputs() -> None:
     values = np.arange(24.0).reshape(1, 2, 4, 3)
     measured = np.array([[1.0, np.nan, 3.0], [4.0, 5.0, np.inf]])

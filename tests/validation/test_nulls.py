@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -42,6 +42,20 @@ def test_critical_values_of_an_exact_and_an_uncertain_population(posterior: Post
     # Discrete responses: with random u-values of ties the size stays nominal.
     ties = critical(np.zeros(5), np.round(GRID), randomize=True)
     assert ties == pytest.approx(EXACT.critical_value(5), abs=0.01)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_a_known_population_with_ties_has_their_critical_value(folded: bool) -> None:
+    # Half of the specimens are at the limit of the instrument: their u is 3/4, and not uniform.
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=(20_000, 40))
+    u = np.where(z < 0, ndtr(z), 0.75)
+    areas = area(np.abs(2 * u - 1) if folded else u)
+    got = critical(np.minimum(z[0], 0), np.minimum(GRID, 0), EXACT, folded=folded)
+    assert got == pytest.approx(np.quantile(areas, 0.95), abs=0.004)
+    assert got > EXACT.critical_value(40) + 0.02
+    # A value that a population happens to have once is no tie.
+    assert critical(GRID[::50], GRID, EXACT) == EXACT.critical_value(20)
 
 
 def test_p_values_of_replicates_count_the_observed_data_in() -> None:

@@ -79,7 +79,31 @@ def test_groups_count_together_where_they_share_hyperparameters(metric: prb.Metr
 
     assert warned(model([20, 3], False)).startswith("y[b]: got 3 specimens")
     assert not warned(model([20, 3], True))
-    assert not warned(model([6, 2], True))  # 1 / sum(w**2) of each are 8 but for rounding
+    # The sum of 1 / sum(w**2) is 8 but for rounding.
+    assert "at least 8" not in warned(model([6, 2], True))
+
+
+def test_a_spread_in_common_of_pairs_is_underestimated() -> None:
+    """The maximum of the likelihood is the root of half the variance (Neyman and Scott 1948)."""
+    rigs = [f"rig {k}" for k in range(10)]
+
+    def optimum(n: int) -> prb.Optimum:
+        labels = np.repeat(rigs, n)
+        values = np.random.default_rng(n).normal(0, 1, len(labels))
+        observed = pd.DataFrame({"y": values, "rig": labels})
+        with pm.Model(coords={"rig": rigs}):
+            mu = pm.Normal("mu", 0, 1, dims="rig")
+            x = pm.Normal.dist(mu[prb.response.group("rig")], pm.HalfNormal("sd", 1))
+            prb.Simulator("y", same, x, observed=observed)
+            return prb.minimize(progressbar=False)
+
+    pairs = optimum(2)
+    (finding,) = pairs.findings
+    assert finding.code == "few-specimens"
+    assert "20 specimens of 10 populations" in finding.text
+    assert "by about 29%" in finding.text
+    assert pairs.point["sd"] < 1 - 1.5 * pairs.stderr["sd"]
+    assert not optimum(21).findings
 
 
 def test_readings_of_one_specimen_and_weights_do_not_count_as_specimens() -> None:
