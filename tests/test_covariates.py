@@ -228,6 +228,17 @@ def test_a_condition_may_be_an_input_and_a_covariate(is_last: bool) -> None:
         prb.predict(optimum, response, hardness, x, model=model, at={"hardness": 250.0})
 
 
+@pytest.mark.parametrize("part", [slice(None), 0])
+def test_a_covariate_has_one_value_for_each_specimen(part: Any) -> None:
+    """A column, such as a DataFrame of one, is no vector: it has rows of one value."""
+    with pm.Model():
+        hardness = prb.response.condition("hardness", np.reshape(HARDNESS, (-1, 1)))
+        x = pm.Normal.dist(pm.Normal("a", 1, 1) + hardness[part], 1.0, name="x")
+        shape = rf"got x .* from hardness, whose values have the shape \({len(HARDNESS)}, 1\)"
+        with pytest.raises(TypeError, match=shape):
+            prb.Simulator("y", np.positive, x, observed=HARDNESS)
+
+
 def test_a_population_for_each_specimen_has_no_common_score(model: pm.Model) -> None:
     table = prb.cross_validate(prb.minimize(model, progressbar=False), folds=2, progressbar=False)
     assert np.isfinite(table["discrepancy"]).all()

@@ -204,12 +204,23 @@ def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
 def refuse_vectors_of_specimens(
     name: str, aleatory: Sequence[Any], parents: Sequence[Variable], size: int
 ) -> None:
-    """Raise where an input is a vector with an element for each specimen, as in PyMC."""
+    """Raise where an input is a vector with an element for each specimen, as in PyMC.
+
+    Or where it depends on a condition of which each specimen has several values.
+    """
     for x in aleatory:
         batch = x.type.ndim - getattr(x.owner.op, "ndim_supp", 0)
-        if is_condition(x) or batch != 1:
+        if is_condition(x):
             continue
-        for v in ancestors(x.owner.inputs, blockers=parents):
+        above = list(ancestors(x.owner.inputs, blockers=parents))
+        for v in above:
+            if isinstance(v, ReadingsCondition):
+                raise TypeError(
+                    f"{name}: inputs: got {x.name or 'a .dist()'} with parameters from {v.name}, "
+                    f"whose values have the shape {v.columns.shape}, expected one value for each "
+                    "specimen; pass values of shape (N,) to prb.response.condition"
+                )
+        for v in above if batch == 1 else ():
             data: Any = v.get_value() if hasattr(v, "get_value") else getattr(v, "data", None)
             if np.shape(data) == (size,) and np.ptp(data) > 0:
                 label = v.name or "hardness"
