@@ -507,6 +507,8 @@ def sampling_obstacle(evaluator: Evaluator) -> str | None:
 def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
     obstacle = sampling_obstacle(evaluator) or summary_obstacle(evaluator)
+    if obstacle is None and evaluator.emulated:
+        return "the model has a log-likelihood by specimen"
     if obstacle is None and evaluator.other_terms:
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle

@@ -188,9 +188,20 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 
 def _is_partial(likelihood: SpecimenLikelihood) -> bool:
-    """Return whether a specimen has fewer readings, censored ones included, than inputs."""
-    present = likelihood.readings.is_measured | likelihood.readings.is_censored
-    return bool((present.sum(axis=1) < likelihood.coordinates.size).any())
+    """Return whether the readings of a specimen leave inputs along a fibre.
+
+    They are fewer than the inputs, or some are measured, known conditions among them, and the
+    others censored: points around roots would miss the measured ones. Without a known error such
+    points are kept, or refused where their halves differ.
+    """
+    n_measured = likelihood.readings.is_measured.sum(axis=1)
+    n_present = n_measured + likelihood.readings.is_censored.sum(axis=1)
+    size = likelihood.coordinates.size
+    is_partial = n_present < size
+    has_gross_errors = any(m.gross_errors is not False for m in likelihood.measurements)
+    if likelihood.error_is_known and not has_gross_errors and not likelihood.calls_response:
+        is_partial |= (n_measured > 0) & (n_measured < size)
+    return bool(is_partial.any())
 
 
 def _problem(runs: Runs) -> EmulationProblem:

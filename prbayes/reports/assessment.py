@@ -67,6 +67,8 @@ def verdict(m: Material) -> list[Section]:
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
     elif m.description is None:
         return []
+    if m.results and mark != "bad" and None in m.diagnoses.values():
+        text.append("Not all results were diagnosed: that needs the model.")
     questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}
     requirements = {label: t for label, t in questions.items() if "requirement" in t.attrs}
     if m.is_usable:
@@ -433,6 +435,11 @@ def agreement(m: Material) -> list[Section]:
     if len(text) > 1:
         alpha = in_percent(min(sum(test.alpha for test in m.tests.values()), 1.0))
         text.append(f"Together the tests reject a right model in up to {alpha} of cases.")
+    text += [
+        f"{row['condition']}: specimens failed, and no predicted one does: the model excludes them."
+        for row, (_, pair) in zip(rows, validation_pairs(m), strict=True)
+        if row["failed"] and not np.isposinf(pair.predicted).any()
+    ]
     if rows:
         text.append(
             f"The table has the measured values, and the range with {percentage(m.prob)} of the "

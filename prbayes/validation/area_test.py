@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._display import Shown, View, without_constructor
-from prbayes._finding import counted
+from prbayes._finding import Finding, counted, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
 from prbayes.model.description import versions
@@ -238,6 +238,7 @@ def area_test(
         _refuse_calibration_specimens(case)
     if case.shares_specimens:
         _require_same_samples(case)
+    report(*_excluded_failures(case))
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
@@ -276,6 +277,21 @@ def _refuse_calibration_specimens(case: Case) -> None:
             "hardly ever rejected on those it was fitted to; test others, or pass "
             "prb.predict(optimum, ...) and null=prb.validation.JointNull(optimum)"
         )
+
+
+def _excluded_failures(case: Case) -> list[Finding]:
+    """Report measured failures under conditions in which no predicted specimen fails."""
+    findings = []
+    for condition in case.conditions:
+        n_failed = int(np.isposinf(condition.observed).sum())
+        if n_failed and condition.projection is None and not np.isposinf(condition.predicted).any():
+            text = (
+                f"{condition.name}: {n_failed} of {condition.observed.size} measured values are "
+                "+inf, and no predicted one: the model excludes them, whatever the test says. Let "
+                "the response return +inf where specimens fail."
+            )
+            findings.append(Finding("population-misfit", text, "choosing_metric.md#a-wrong-family"))
+    return findings
 
 
 def _require_same_samples(case: Case) -> None:

@@ -207,6 +207,15 @@ def _area_quantiles(n: int) -> tuple[Floats, Floats]:
     return logs, np.array(at_n)
 
 
+def _slope(logs: Floats, quantiles: Floats) -> float:
+    """Return how minus the log of a tail probability grows with the square of a far quantile.
+
+    It is linear in the square (Brownian bridge: exp(-6 x^2)). From n = 20 on, any of the last
+    twelve quantiles gives a slope within 5%.
+    """
+    return float((logs[-1] - logs[-8]) / (quantiles[-1] ** 2 - quantiles[-8] ** 2))
+
+
 def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
     """Return the envelope of n sorted uniform numbers, (n,) each.
 
@@ -253,8 +262,11 @@ class ExactModel(Null):
         """Return the area that is exceeded with probability ``alpha`` by n uniform numbers."""
         n = positive_integer(n, "n")
         alpha = share(alpha, "alpha")
-        scaled = np.interp(-np.log(alpha), *_area_quantiles(n))
-        return float(scaled / np.sqrt(n))
+        log, (logs, quantiles) = -np.log(alpha), _area_quantiles(n)
+        scaled = np.interp(log, logs, quantiles)
+        if log > logs[-1]:
+            scaled = np.sqrt(quantiles[-1] ** 2 + (log - logs[-1]) / _slope(logs, quantiles))
+        return float(min(scaled / np.sqrt(n), 0.5))
 
     def p_value(self, statistic: float, n: int) -> float:
         """Return the probability that n uniform numbers have a larger area."""
@@ -265,11 +277,8 @@ class ExactModel(Null):
         logs, quantiles = _area_quantiles(n)
         if scaled <= quantiles[-1]:
             return float(np.exp(-np.interp(scaled, quantiles, logs)))
-        # Farther out the logarithm falls like the square (Brownian bridge: exp(-6 x^2)). From
-        # n = 20 on, any of the last twelve quantiles gives a slope within 5%.
-        last_squared = quantiles[-1] ** 2
-        slope = (logs[-1] - logs[-8]) / (last_squared - quantiles[-8] ** 2)
-        return float(np.exp(-(logs[-1] + slope * (scaled**2 - last_squared))))
+        farther = scaled**2 - quantiles[-1] ** 2
+        return float(np.exp(-(logs[-1] + _slope(logs, quantiles) * farther)))
 
     def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Look up p-value and critical value, and simulate the envelope; simulate all with ties."""
@@ -339,8 +348,9 @@ class JointNull(Null):
     TypeError
         If ``optimum`` is no Optimum, or a response cannot be called.
     ValueError
-        If a metric or propagation does not allow refits (`Fresh`, or a `FunctionMetric` without
-        `Reweighted`); if the prior was part of the optimum, or its model has changed since.
+        If a metric or propagation does not allow refits (the log-likelihood by specimen, `Fresh`,
+        or a `FunctionMetric` without `Reweighted`); if the prior was part of the optimum, or its
+        model has changed since.
 
     Examples
     --------
@@ -375,7 +385,10 @@ class JointNull(Null):
 
     def __post_init__(self) -> None:
         call_settings(self.executor, self.store, self.version)
-        advice = "; the model cannot be recalibrated: use prb.validation.PosteriorNull()"
+        advice = (
+            "; the model cannot be recalibrated: test other specimens with "
+            "prb.validation.PosteriorNull(), or hold these out by prb.cross_validate"
+        )
         require_refits(self.optimum, "JointNull", advice)
         if self.responses is not None:
             tested: list[Any] = [self.responses]

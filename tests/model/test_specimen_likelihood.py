@@ -590,3 +590,43 @@ def test_labelled_arrays_in_another_order_than_observed_are_refused() -> None:
     for same in (pd.Series({"a": 0.2, "b": 0.1}), frame, frame.reset_index(drop=True)):
         build(of_both, table, **metric(error=same))
         build(of_both, dict(table), **metric(error=same))
+
+
+def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
+    """Another output, or a condition, is exact; the log-likelihood has an error of some tenths."""
+    rng = np.random.default_rng(0)
+    x, c = rng.normal(10, 1, N), rng.uniform(1, 3, N)
+
+    def log_density(mu: float, sigma: float, limit: float) -> float:
+        of_c = stats.norm.logpdf(x * c, mu * c, sigma * c)
+        tail = stats.norm.logsf(limit, mu * c, sigma * c)
+        return float(np.where(x * c >= limit, tail, of_c).sum())
+
+    def log_density_of_both(mu: float, sigma: float, limit: float) -> float:
+        of_c = stats.norm.logpdf(x * c, 2 * x, 0.5 * x)
+        tail = stats.norm.logsf(limit, 2 * x, 0.5 * x)
+        of_x = stats.norm.logpdf(x, mu, sigma)
+        return float((of_x + np.where(x * c >= limit, tail, of_c)).sum())
+
+    def product(x: Any, c: Any) -> Any:
+        return x * c
+
+    def both(x: Any, c: Any) -> Any:
+        return {"x": x, "y": x * c}
+
+    cases: list[tuple[Any, ...]] = [
+        (product, lambda: prb.response.condition("c", c), x * c, log_density),
+        (both, lambda: pm.Normal.dist(2, 0.5), {"x": x, "y": x * c}, log_density_of_both),
+    ]
+    for response, second, observed, expected in cases:
+        limit = 22.0
+        highest = limit if response is product else np.array([np.inf, limit])
+        metric = prb.LogLikelihood(censored=(None, highest))
+        with pm.Model() as model:
+            mu, sigma = pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3)
+            inputs = pm.Normal.dist(mu, sigma), second()
+            prb.Simulator("y", response, *inputs, metric=metric, observed=observed)
+        log_likelihood = model.compile_logp(vars=model.observed_RVs)
+        for place in ((10.0, 1.0), (11.0, 0.8), (9.5, 2.0)):
+            got = float(log_likelihood({"mu": place[0], "sigma_log__": np.log(place[1])}))
+            assert got == pytest.approx(expected(*place, limit), abs=0.4)

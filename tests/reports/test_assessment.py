@@ -308,3 +308,17 @@ def test_a_bootstrap_is_reported_without_the_model(calibrated: Any, section: Any
     report = prb.Report("x", posterior={"bootstrap": boot}, pictures=False)
     assert "not diagnosed, because that needs the model" in section(report, "Diagnostics").text[0]
     assert cells(section(report, "Posterior").table).rows[0][0] == "mu"
+    passed = prb.Report("x", posterior=boot, validity=calibrated.test, pictures=False).sections[0]
+    assert passed.title == "Passed"
+    assert passed.text[-1] == "Not all results were diagnosed: that needs the model."
+
+
+def test_failures_that_the_prediction_excludes_are_named(later: xr.DataArray, section: Any) -> None:
+    fresh = np.append(np.random.default_rng(4).normal(2.0, 0.6, 11), np.inf)
+    words = "a: specimens failed, and no predicted one does: the model excludes them."
+    report = prb.Report("x", validation={"a": (fresh, later)}, pictures=False)
+    assert words in section(report, "Test of the model").text
+    some = later.copy()
+    some[..., 0] = np.inf
+    report = prb.Report("x", validation={"a": (fresh, some)}, pictures=False)
+    assert words not in section(report, "Test of the model").text

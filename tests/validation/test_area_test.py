@@ -244,3 +244,12 @@ def test_as_many_replicates_are_inside_the_envelope_as_asked_for() -> None:
         assert 1 - level <= inside < 1 - level + 0.05
     # Of one value it is an interval between two replicates.
     assert envelope((np.arange(99) + 1.0)[:, None] / 100, 0.1) == (0.05, 0.95)
+
+
+def test_failures_that_no_population_has_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    predicted = np.linspace(0, 1, 401)
+    prb.area_test([0.2, 0.4, 0.8, np.inf], predicted, progressbar=False)
+    assert "1 of 4 measured values are +inf, and no predicted one" in caplog.text
+    caplog.clear()
+    prb.area_test([0.2, 0.4, 0.8, np.inf], np.append(predicted, np.inf), progressbar=False)
+    assert not caplog.text

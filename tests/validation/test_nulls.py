@@ -74,6 +74,19 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         judge_by_replicates([u], case, 0.5, 0.01)
 
 
+@pytest.mark.parametrize("n", [40, 2000])
+def test_critical_values_go_on_beyond_the_table(n: int) -> None:
+    assert EXACT.p_value(EXACT.critical_value(n, 1e-8), n) == pytest.approx(1e-8, rel=1e-6)
+
+
+def test_a_likelihood_by_specimen_has_no_joint_null() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator("y", lambda x: 2 * x, x, observed=GRID[::50])
+    with pytest.raises(ValueError, match=r"log-likelihood by specimen; .* prb\.cross_validate"):
+        prb.validation.JointNull(prb.minimize(model))
+
+
 def test_nan_is_left_out_of_populations(posterior: Posterior) -> None:
     predicted = posterior()
     holes = np.where(np.random.default_rng(8).random(predicted.shape) < 0.2, np.nan, predicted)
