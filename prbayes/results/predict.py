@@ -162,7 +162,8 @@ def predict(
     against repeated measurements. Where two simulators of the model have designs of their own, pass
     ``stored=False``.
 
-    Quantiles of the result are no better known than the few samples beyond them. Probabilities of
+    Quantiles of the result are no better known than the few samples beyond them, and the response
+    is constant beyond the range of a likelihood's runs, unless ``stored=False``. Probabilities of
     far tails, with their errors, are those of `exceedance` with ``n_points=1000``.
 
     Examples
