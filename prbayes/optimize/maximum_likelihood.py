@@ -354,26 +354,24 @@ def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats
     away the objective has not risen.
     """
     result = step.copy()
+    value, _ = objective(theta)
     for j, unit in enumerate(np.diag(objective.unit)):
         curvature = unit @ hessian @ unit
         if curvature > 1.0 / 25:
-            rises = _rises(objective, theta, unit / np.sqrt(curvature))
+            rises = _values_beside(objective, theta, unit / np.sqrt(curvature)) - value
             if not rises.mean() < 0.25:  # half of what curvature gives
                 continue
         for width in 2.0 ** np.arange(-12, 1):
-            rises = _rises(objective, theta, width * unit)
+            rises = _values_beside(objective, theta, width * unit) - value
             if np.isfinite(rises).all() and rises.min() >= 2.0:
                 result[j] = width * unit[j]
                 break
     return result
 
 
-def _rises(objective: _Objective, theta: Floats, shift: Floats) -> Floats:
-    """Return by how much an objective rises from theta on both sides, (2,)."""
-    value, _ = objective(theta)
-    ahead, _ = objective(theta + shift)
-    behind, _ = objective(theta - shift)
-    return np.array([ahead, behind]) - value
+def _values_beside(objective: _Objective, theta: Floats, shift: Floats) -> Floats:
+    """Return the objective on both sides of theta, (2,)."""
+    return np.array([objective(theta + shift)[0], objective(theta - shift)[0]])
 
 
 def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:
