@@ -48,7 +48,7 @@ class Sampler(_BASE):  # type: ignore[misc]
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
     ...     y = prb.Simulator("y", lambda x: 2 * x, x, observed=[0.0, 2.0, 4.0])
-    >>> sampler = prb.posterior.Sampler(prb.sample, max_seconds=60)
+    >>> sampler = prb.posterior.Sampler(prb.sample, max_seconds=600)
     >>> idata = sampler.sample_from_init(model=model, draws=200, random_seed=1, progressbar=False)
     >>> idata.posterior["mu"].shape
     (4, 200)
