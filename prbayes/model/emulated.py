@@ -82,9 +82,9 @@ class EmulatedResponse:
         return values.reshape(len(z), *self.event)
 
     def steepened(self, inputs: Sequence[Floats]) -> Floats:
-        """Return the same, but beyond the runs' range with twice the slope at its end.
+        """Return responses that have twice the end slope of the runs' range beyond it.
 
-        The difference estimates the error of the constant response there.
+        Their difference from the constant response there estimates its error.
         """
         values = self(inputs)
         z = self.coordinates.of(inputs, 1)

@@ -167,8 +167,8 @@ def test_requests_are_at_work_at_the_same_time() -> None:
 
     with telling(evaluate) as server, ThreadPoolExecutor(4) as pool:
         response = prb.umbridge(server.url)
-        found = [float(pair[0]) for pair in pool.map(response, range(4), [1.0] * 4)]
-    assert found == [-2, -1, 0, 1]
+        first_outputs = [float(pair[0]) for pair in pool.map(response, range(4), [1.0] * 4)]
+    assert first_outputs == [-2, -1, 0, 1]
 
 
 @pytest.mark.slow
