@@ -24,7 +24,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.roots import Response, Roots
+from prbayes.specimens.proposals import Modes, Proposals
 
 # Data beside the first responses, for all metrics.
 
@@ -543,18 +543,19 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
 
 
 def refuse_undetermined(
-    name: str, emulation: Any, roots: Roots, inputs: Sequence[str], smallest: float = 3.0
+    name: str, proposals: Proposals, inputs: Sequence[str], smallest: float = 3.0
 ) -> None:
     """Raise if readings leave a direction of the inputs open, although there are enough outputs.
 
     Along such a direction the outputs change over half the prior's range by less than a few errors
-    of the emulator, at the median root. Responses without such a direction have 97 errors and more,
+    of the emulator, at the median mode. Responses without such a direction have 97 errors and more,
     those with one less than .01.
     """
-    if len(inputs) < 2 or not len(roots.z):
+    residuals, modes = proposals.residuals, proposals.modes
+    if len(inputs) < 2 or not len(modes.a):
         return
-    response: Response = emulation
-    _, jacobian = response(roots.z)
+    emulation = residuals.response
+    _, jacobian = emulation(residuals.coordinates(modes.specimen, modes.a))
     scaled = jacobian / emulation.error[:, None]
     values, directions = _singular(scaled)
     if len(values) and np.median(values[:, -1]) < smallest:
@@ -609,7 +610,7 @@ def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) 
 def misfit_findings(
     name: str,
     readings: Readings,
-    roots: Roots,
+    modes: Modes,
     error: Floats,
     largest: float = 50.0,
     *,
@@ -621,16 +622,16 @@ def misfit_findings(
     With gross errors in the likelihood half of the specimens may have such readings.
     """
     # The first root of each specimen with the smallest misfit.
-    order = np.lexsort((roots.misfit, roots.specimen))
-    specimens, first = np.unique(roots.specimen[order], return_index=True)
+    order = np.lexsort((modes.misfit, modes.specimen))
+    specimens, first = np.unique(modes.specimen[order], return_index=True)
     best = order[first]
-    has_root = np.isfinite(roots.misfit[best])
-    is_poor = has_root & (roots.misfit[best] > largest)
+    has_root = np.isfinite(modes.misfit[best])
+    is_poor = has_root & (modes.misfit[best] > largest)
     poor, rows = specimens[is_poor], best[is_poor]
     if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
-    off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
+    off = np.sqrt(np.mean((modes.errors[rows] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)
     return [
         Finding(

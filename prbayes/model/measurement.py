@@ -22,11 +22,13 @@ from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Emulation
+from prbayes.specimens.points import SpecimenOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +237,7 @@ class SpecimenLikelihood:
     measurements: tuple[Measurement, ...]  # of simulators with the same inputs
     model: Any = None  # weak reference to a pymc.Model
     shared_emulation: Emulation | None = None  # of the same responses, for other data
-    options: PointOptions = field(default_factory=PointOptions)
+    options: SpecimenOptions = field(default_factory=SpecimenOptions)
     # Values that are computed at their first use, such as the points of the specimens.
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 

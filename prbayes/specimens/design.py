@@ -1,0 +1,300 @@
+"""Runs of a response where the measured specimens are.
+
+A few runs over the prior predictive population, then batches: a sample of the specimens' likely
+inputs, whose misfit measures the error of the emulator before they join it, points far from all
+runs, and points of the prior where a specimen could lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._validate import Floats
+from prbayes.numerics.points import farthest_rows, sobol
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import (
+    fit_normal,
+    normal_log_density,
+    normalised_weights,
+)
+from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
+from prbayes.specimens.points import (
+    Draws,
+    SpecimenData,
+    SpecimenPoints,
+    draw_points,
+    fit_proposals,
+    normal_of,
+    reliable_draws,
+    specimen_points,
+)
+from prbayes.specimens.proposals import Normal, Proposals
+
+
+def first_runs(dimensions: int) -> int:
+    """Return the number of runs that an emulator of so many inputs starts from."""
+    return 6 * dimensions + 4
+
+
+def most_runs(dimensions: int) -> int:
+    """Return the largest number of runs before a response is refused."""
+    return 256 if dimensions <= 2 else 512 if dimensions <= 4 else 1920
+
+
+# Coordinates (n, d) -> outputs (n, m), NaN where there is no response.
+type Run = Callable[[Floats], Floats]
+
+
+def first_emulation(run: Run, data: SpecimenData) -> Emulation:
+    """Return the emulation through first runs, half as wide again as the prior's population."""
+    d = data.known.shape[1]
+    n = data.options.n_first or first_runs(d)
+    u = sobol(n, d, data.seed)
+    population = normal_of(data.inner[:, data.free])
+    z = np.empty((n, d))
+    z[:, data.free] = population.mean + 1.5 * ndtri(u[:, : len(data.free)]) @ population.root.T
+    low, high = data.prior.min(axis=0), data.prior.max(axis=0)
+    z = np.clip(z, low, high)
+    known = np.flatnonzero(~np.isnan(data.known[0]))
+    for place, column in enumerate(known):  # conditions: those of the specimens
+        values = np.quantile(data.known[:, column], u[:, len(data.free) + place])
+        z[:, column] = values
+    y = run(z)
+    while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
+        more = data.inner[np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)]
+        z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
+    surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
+    rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
+    error = np.maximum(2 * rms, data.options.floor * data.readings.spread())
+    return Emulation(z, y, surface, error, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Likely:
+    """Likely inputs of the specimens: weighted points, and the population that weights them."""
+
+    proposals: Proposals
+    points: SpecimenPoints
+    population: Normal
+    weights: Floats  # (N, K)
+
+    @classmethod
+    def of(cls, data: SpecimenData, emulation: Emulation, population: Normal, seed: int) -> Likely:
+        """Return likely inputs under the population that fits them."""
+        # Twice as wide: the population of the last round may have been too narrow.
+        wide = Normal(population.mean, 2.0 * population.root)
+        proposals = fit_proposals(data, emulation, wide)
+        if proposals.is_open:
+            draws, points, proposals = reliable_draws(data, proposals, 64, seed)
+            population = normal_of(draws.specimens()[:, data.free])
+        else:
+            points = draw_points(data, proposals, 8, seed)
+            has_point = np.isfinite(points.log_a).any(axis=1)
+            z = points.z[has_point][..., data.free]
+            population = Normal(*fit_normal(z, points.log_a[has_point]))
+        return cls.weighted(proposals, points, population, points.z[..., data.free])
+
+    @classmethod
+    def weighted(
+        cls, proposals: Proposals, points: SpecimenPoints, population: Normal, z: Floats
+    ) -> Likely:
+        """Return points with their weights under a population."""
+        logs = points.log_a + normal_log_density(z, population.mean, population.root)
+        logs[~np.isfinite(logs).any(axis=1)] = 0.0
+        return cls(proposals, points, population, normalised_weights(logs))
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:
+        """Return likely inputs, (count, d), and their specimens; different specimens first."""
+        n = len(self.weights)
+        specimens = np.concatenate([rng.permutation(n) for _ in range(-(-count // n))])[:count]
+        totals = np.cumsum(self.weights[specimens], axis=1)
+        places = (totals < rng.random((count, 1)) * totals[:, -1:]).sum(axis=1)
+        return self.points.z[specimens, places], specimens
+
+
+def emulate(
+    run: Run, data: SpecimenData, previous: Emulation | None = None
+) -> tuple[Emulation, SpecimenPoints, Proposals, Draws]:
+    """Fit the emulator: runs over the prior, then where the specimens are until the bias is small.
+
+    ``previous`` is the emulation of the same response for other data. Raise DesignError if the
+    response cannot be emulated well enough.
+    """
+    emulation = first_emulation(run, data) if previous is None else previous
+    population = normal_of(data.inner[:, data.free])
+    most = data.options.max_runs or most_runs(data.known.shape[1])
+    rng = np.random.default_rng([data.seed, 1])
+    batches = 0
+    while True:
+        likely = Likely.of(data, emulation, population, batches)
+        population = likely.population
+        if emulation.bias <= data.options.bias and batches >= 2:
+            points, proposals, draws = specimen_points(data, emulation, wider(population))
+            emulation, passed = audited(run, data, emulation, proposals, points, draws, rng)
+            if passed:
+                return emulation, points, proposals, draws
+            likely = Likely.of(data, emulation, population, batches)
+        if len(emulation.z) >= most:
+            require_accurate(data, emulation)
+        emulation = extended(run, data, emulation, likely, rng)
+        batches += 1
+
+
+def wider(population: Normal) -> Normal:
+    """Return a population that is twice as wide."""
+    return Normal(population.mean, 2.0 * population.root)
+
+
+def extended(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    rng: np.random.Generator,
+) -> Emulation:
+    """Return the emulation with a batch of runs, at most half of those so far."""
+    count = max(data.options.sampled + 2, len(emulation.z) // 2)
+    n_explored = max(2, count // 8)
+    n_sampled = max(data.options.sampled, (count - n_explored) // 2)
+    sampled, specimens = likely.sample(n_sampled, rng)
+    around, _ = likely.sample(8 * count, rng)
+    sd = np.sqrt((likely.population.root**2).sum(axis=1))
+    around[:, data.free] += 0.4 * sd * rng.standard_normal((len(around), len(sd)))
+    far = _farthest(data, np.concatenate([emulation.z, sampled]), around, count - n_sampled - n_explored, sd)
+    explored = _explored(data, emulation, np.concatenate([emulation.z, sampled, far]), n_explored, rng)
+    return joined(run, data, emulation, likely, sampled, specimens, np.concatenate([far, explored]))
+
+
+def joined(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    sampled: Floats,
+    specimens: NDArray[np.intp],
+    others: Floats,
+) -> Emulation:
+    """Return the emulation with runs at fresh points; the sampled ones give its error and bias."""
+    fresh = np.concatenate([sampled, others])
+    outputs = run(fresh)
+    misfit = outputs[: len(sampled)] - emulation.surface.values(sampled)
+    error, bias = error_and_bias(data, emulation, likely, sampled, specimens, misfit)
+    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
+    surface, _, _ = fit_surface(z, y, data.readings, data.name)
+    return Emulation(z, y, surface, error, bias)
+
+
+def error_and_bias(
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    z: Floats,
+    specimens: NDArray[np.intp],
+    misfit: Floats,
+) -> tuple[Floats, float]:
+    """Return the error of the emulator, (m,), and the bias that it causes, from misfits (n, m)."""
+    good = np.isfinite(misfit).all(axis=1)
+    if good.sum() < 4:
+        return emulation.error, np.inf
+    z, specimens, misfit = z[good], specimens[good], misfit[good]
+    error = np.maximum(
+        2 * np.sqrt((misfit**2).mean(axis=0)), data.options.floor * data.readings.spread()
+    )
+    measured = replace(emulation, error=error)
+    residuals = data.residuals(measured, likely.population)
+    a = residuals.whitened(z)
+    _, slopes = residuals.errors(specimens, a)
+    sd = residuals.sd[specimens]
+    # Shift of the inputs of a specimen that the error of the emulator causes.
+    hessian = np.einsum("kmd,kme->kde", slopes, slopes) + np.eye(a.shape[1])
+    gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
+    shift = -np.einsum("kdm,km->kd", gain, misfit / sd)
+    bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
+    # m readings identify m of d directions; the posterior is wider than the formula assumes.
+    of_each = np.isfinite(data.comparison_sd(error)).sum(axis=1).mean()
+    bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
+    # The comparison allows the error at each specimen; what the runs have overestimated of it is
+    # missing in the population's variance.
+    by_error = gain * np.where(np.isinf(sd), 0.0, error / sd)[:, None]
+    narrowing = np.sqrt(len(data.readings) / 2) * (by_error**2).sum(axis=2).mean(axis=0).max()
+    return error, float(max(bias, narrowing))
+
+
+def _farthest(
+    data: SpecimenData, runs: Floats, candidates: Floats, count: int, sd: Floats
+) -> Floats:
+    """Return candidates, (count, d), each far from all runs and from those before."""
+    if count <= 0:
+        return np.empty((0, runs.shape[1]))
+    scale = np.ones(runs.shape[1])
+    scale[data.free] = sd
+    known = ~np.isnan(data.known[0])
+    scale[known] = np.maximum(np.ptp(data.known[:, known], axis=0), 1e-9)
+    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
+    return candidates[farthest_rows(candidates / scale, count, squares)]
+
+
+def _explored(
+    data: SpecimenData, emulation: Emulation, runs: Floats, count: int, rng: np.random.Generator
+) -> Floats:
+    """Return points of the prior, far from all runs, at which a specimen could lie."""
+    z = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
+    known = ~np.isnan(data.known[0])
+    z[:, known] = data.known[rng.integers(0, len(data.known), len(z))][:, known]
+    readings, spread = data.readings, data.readings.spread()
+    low = np.nanmin(readings.values, axis=0) - 2 * spread
+    high = np.nanmax(readings.values, axis=0) + 2 * spread
+    values = emulation.values(z)
+    is_possible = ((values >= low) & (values <= high)).all(axis=1)
+    if is_possible.sum() >= count:
+        z = z[is_possible]
+    sd = data.inner[:, data.free].std(axis=0)
+    return _farthest(data, runs, z, count, sd)
+
+
+def audited(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    proposals: Proposals,
+    points: SpecimenPoints,
+    draws: Draws,
+    rng: np.random.Generator,
+) -> tuple[Emulation, bool]:
+    """Return whether runs at points that matter to the posterior confirm the emulator.
+
+    Otherwise the emulation has these runs.
+    """
+    population = normal_of(draws.specimens()[:, data.free], 1.2)
+    likely = Likely.weighted(proposals, points, population, points.z[..., data.free])
+    sampled, specimens = likely.sample(data.options.sampled // 2, rng)
+    candidates, owners = likely.sample(64 * data.options.sampled, rng)
+    sd = np.sqrt((population.root**2).sum(axis=1))
+    scale = np.ones(emulation.z.shape[1])
+    scale[data.free] = sd
+    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in np.concatenate([emulation.z, sampled])], axis=0)
+    rows = farthest_rows(candidates / scale, data.options.sampled // 2, squares)
+    z, specimens = np.concatenate([sampled, candidates[rows]]), np.concatenate([specimens, owners[rows]])
+    y = run(z)
+    misfit = y - emulation.surface.values(z)
+    error, bias = error_and_bias(data, emulation, likely, z, specimens, misfit)
+    all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, y])
+    if bias <= 1.5 * data.options.bias:
+        return replace(emulation, z=all_z, y=all_y, bias=max(bias, emulation.bias)), True
+    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name)
+    return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias), False
+
+
+def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
+    """Raise: the emulator's error shifts populations."""
+    raise DesignError(
+        f"{data.name}: got an emulator whose error would shift a mean or standard deviation of an "
+        f"input by {emulation.bias:.2g} posterior standard deviations after "
+        f"{len(emulation.z)} runs, expected at most {data.options.bias}; narrow the priors, or use "
+        "metric=prb.ProbabilityResidual()"
+    )

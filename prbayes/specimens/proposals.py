@@ -1,0 +1,432 @@
+r"""Importance points of measured specimens by randomize-then-optimize.
+
+The density of the readings of a specimen is an integral over its inputs,
+
+.. math:: p(y \mid \theta) = \int p(x \mid \theta) \, p(y \mid f(x)) \, dx
+          \approx \sum_k p(x_k \mid \theta) \exp(A_k), \qquad (1)
+
+with points and numbers A that do not contain theta. Inputs x = mean + L a are whitened by a normal
+reference population, and e(a) = (y - f(x)) / s are standardised errors of the readings. The residual
+r(a) = (a, e(a)) has the Jacobian (I, -G). At a mode of exp(-|r|^2 / 2), G = U S V', and
+
+.. math:: \xi(a) = D (V' a - S U' e(a)), \qquad D = (1 + S^2)^{-1/2}, \qquad (2)
+
+is standard normal given the readings if f is linear [1]_. Points solve xi(a) = xi_k for standard
+normal xi_k; their density is
+
+.. math:: q(a) = N(\xi(a); 0, I) \, |\det D (V' + S U' G(a))|. \qquad (3)
+
+Directions that the readings determine are solved for, and the others have the reference population:
+accurate and inaccurate readings, more or fewer than inputs, are one case. A mode has a proposal; a
+point counts with the density of all proposals of its specimen that reach it [2]_.
+
+References
+----------
+.. [1] Bardsley, J. M., Solonen, A., Haario, H. and Laine, M. (2014), Randomize-then-optimize,
+   SIAM J. Sci. Comput. 36, doi:10.1137/140964023.
+.. [2] Veach, E. and Guibas, L. J. (1995), Optimally combining sampling techniques for Monte Carlo
+   rendering, doi:10.1145/218380.218498.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._stats import log_sum_exp
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.numerics.points import sobol
+from prbayes.numerics.threads import one_thread
+
+Indices = NDArray[np.intp]
+
+# Coordinates (k, d) -> values (k, m), Jacobian (k, m, d). NaN where there is no response.
+Response = Callable[[Floats], tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal population, in which inputs are whitened: z = mean + root a."""
+
+    mean: Floats  # (d,)
+    root: Floats  # (d, d): lower Cholesky factor of the covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of specimens: whitened inputs, and standardised errors of the readings."""
+
+    response: Response
+    target: Floats  # (N, m): readings, any number where there is none
+    sd: Floats  # (N, m): standard deviation of the comparison; infinite where there is no reading
+    population: Normal  # of the reference, in coordinates z
+    known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
+
+    @property
+    def free(self) -> Indices:
+        """Columns of the coordinates that are not known."""
+        return np.flatnonzero(np.isnan(self.known[0]))
+
+    def coordinates(self, specimen: Indices, a: Floats) -> Floats:
+        """Return coordinates z, (k, d), of whitened inputs, (k, free)."""
+        z = self.known[specimen]
+        z[:, self.free] = self.population.mean + a @ self.population.root.T
+        return z
+
+    def whitened(self, z: Floats) -> Floats:
+        """Return whitened inputs, (..., free), of coordinates (..., d)."""
+        centred = z[..., self.free] - self.population.mean
+        return np.asarray(centred @ np.linalg.inv(self.population.root).T)
+
+    @np.errstate(all="ignore")
+    def errors(self, specimen: Indices, a: Floats) -> tuple[Floats, Floats]:
+        """Return standardised errors e, (k, m), and G = -de/da, (k, m, free).
+
+        NaN without a response.
+        """
+        count, m = len(a), self.target.shape[1]
+        e, slopes = np.empty((count, m)), np.empty((count, m, a.shape[1]))
+        for block in _blocks(count, m * self.known.shape[1]):
+            i = specimen[block]
+            values, jacobian = self.response(self.coordinates(i, a[block]))
+            sd = self.sd[i]
+            e[block] = np.where(np.isinf(sd), 0.0, (self.target[i] - values) / sd)
+            slope = (jacobian[:, :, self.free] @ self.population.root) / sd[:, :, None]
+            slopes[block] = np.where(np.isinf(sd)[:, :, None], 0.0, slope)
+        return e, slopes
+
+
+def _blocks(count: int, width: int) -> Iterator[slice]:
+    """Return slices of so many rows that their arrays stay in the cache."""
+    size = max(256, IN_CACHE // max(1, width))
+    for start in range(0, count, size):
+        yield slice(start, start + size)
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of the readings' density times a wide normal population, one row each."""
+
+    specimen: Indices  # (R,): row of the specimen; sorted
+    a: Floats  # (R, free): whitened inputs
+    misfit: Floats  # (R,): half the squared standardised errors, in nats
+    errors: Floats  # (R, m)
+    slopes: Floats  # (R, m, free): G
+    scale: Floats  # (R,): factor of the standard deviations of the comparison
+
+    @classmethod
+    def joined(cls, parts: Sequence[Modes]) -> Modes:
+        """Return modes as one record, sorted by specimen."""
+        arrays = [np.concatenate(values) for values in zip(*(p.arrays for p in parts), strict=True)]
+        return cls(*arrays).rows(np.argsort(arrays[0], kind="stable"))
+
+    def rows(self, index: Indices) -> Modes:
+        """Return selected modes."""
+        return Modes(*(values[index] for values in self.arrays))
+
+    @property
+    def arrays(self) -> list[NDArray[Any]]:
+        """The arrays of all fields."""
+        return [getattr(self, f.name) for f in fields(self)]
+
+    @cached_property
+    def table(self) -> Indices:
+        """The modes of each specimen, (N, most), filled up with -1."""
+        return rows_by_specimen(self.specimen)
+
+
+def find_modes(
+    residuals: Residuals,
+    starts: Floats,
+    *,
+    scale: float = 1.0,
+    precision: float = 0.1,
+    gap: float = 20.0,
+) -> Modes:
+    """Find the modes of each specimen by Levenberg-Marquardt [1]_ from starts, (N, S, free).
+
+    The population is wide: it has this precision, relative to the reference. A mode within ``gap``
+    nats of the specimen's best is kept. ``scale`` is a factor of the standard deviations.
+
+    References
+    ----------
+    .. [1] Moré, J. J. (1978), The Levenberg-Marquardt algorithm, doi:10.1007/BFb0067700.
+    """
+    n, count, d = starts.shape
+    specimen = np.repeat(np.arange(n), count)
+    exact = replace(residuals, sd=scale * residuals.sd)
+    # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
+    # the valley's lowest point with a larger error, then the readings themselves.
+    soft = replace(exact, sd=np.maximum(exact.sd, 0.03 * _typical_change(residuals, starts)))
+    a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40)[0]
+    a, value, e, slopes = _minimised(exact, specimen, a, precision, 20)
+    rows = _distinct(specimen, a, value, slopes, precision, gap)
+    rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
+    misfit = (e[rows] ** 2).sum(axis=1) / 2
+    scales = np.full(len(rows), scale)
+    return Modes(specimen[rows], a[rows], misfit, e[rows], slopes[rows], scales)
+
+
+def _typical_change(residuals: Residuals, starts: Floats) -> Floats:
+    """Return the standard deviation of each output in the reference population, (m,)."""
+    a = ndtri(sobol(64, starts.shape[2], 0))
+    values, _ = residuals.response(residuals.coordinates(np.resize(np.arange(len(starts)), 64), a))
+    values = values[np.isfinite(values).all(axis=1)]
+    low, high = np.quantile(values, [0.16, 0.84], axis=0) if len(values) > 1 else (0.0, 0.0)
+    return np.asarray(high - low) / 2 * np.ones(residuals.target.shape[1])
+
+
+def _minimised(
+    residuals: Residuals, specimen: Indices, a: Floats, precision: float, iterations: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return local minima of half the squared residuals, their values, errors and slopes."""
+    a, d = a.copy(), a.shape[1]
+    e, slopes = residuals.errors(specimen, a)
+
+    def objective(a: Floats, e: Floats) -> Floats:
+        value = (e**2).sum(axis=1) / 2 + precision * (a**2).sum(axis=1) / 2
+        return np.where(np.isnan(value), np.inf, value)
+
+    value = objective(a, e)
+    damping = np.full(len(a), 1e-3)
+    active = np.flatnonzero(np.isfinite(value))
+    for _ in range(iterations):
+        if not active.size:
+            break
+        g = slopes[active]
+        hessian = np.einsum("kmd,kme->kde", g, g) + precision * np.eye(d)
+        gradient = precision * a[active] - np.einsum("kmd,km->kd", g, e[active])
+        diagonal = np.einsum("kdd->kd", hessian)
+        damped = hessian + (damping[active, None] * diagonal)[:, :, None] * np.eye(d)
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        length = np.sqrt((step**2).sum(axis=1))
+        step /= np.maximum(length, 1.0)[:, None]
+        trial = a[active] + step
+        new_e, new_slopes = residuals.errors(specimen[active], trial)
+        new_value = objective(trial, new_e)
+        better = new_value < value[active]
+        gain = np.where(better, value[active] - new_value, np.inf)
+        rows = active[better]
+        a[rows], e[rows], slopes[rows] = trial[better], new_e[better], new_slopes[better]
+        value[rows] = new_value[better]
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
+        # A gain of a thousandth nat is none; a rejected step that is this short is rounding.
+        unfinished = (gain > 1e-3) & (length > 1e-11) & (damping[active] < 1e11)
+        active = active[unfinished]
+    return a, value, e, slopes
+
+
+def _distinct(
+    specimen: Indices, a: Floats, value: Floats, slopes: Floats, precision: float, gap: float
+) -> Indices:
+    """Return the rows of different modes within the gap of the specimen's best."""
+    least = np.full(specimen.max() + 1, np.inf)
+    np.minimum.at(least, specimen, value)
+    candidates = np.flatnonzero(np.isfinite(value) & (value <= least[specimen] + gap))
+    candidates = candidates[np.lexsort((value[candidates], specimen[candidates]))]
+    if not len(candidates):
+        return candidates
+    slots = rows_by_specimen(specimen[candidates])
+    table = np.where(slots >= 0, candidates[slots], -1)
+    is_mode = table >= 0
+    for k in range(1, table.shape[1]):
+        # Each specimen's k-th candidate, beside the better ones.
+        better = table[:, :k]
+        difference = a[table[:, k], None] - a[better]
+        along = np.einsum("nkmd,nkd->nkm", slopes[better], difference)
+        square = (along**2).sum(axis=2) + precision * (difference**2).sum(axis=2)
+        is_near = np.abs(difference).max(axis=2) < 1e-5
+        is_same = is_near | (square < 1.0)
+        is_mode[:, k] &= ~(is_same & is_mode[:, :k]).any(axis=1)
+    return np.asarray(table[is_mode])
+
+
+def rows_by_specimen(specimen: Indices) -> Indices:
+    """Return the rows of each specimen, (N, most), filled up with -1; specimens are ascending."""
+    count = np.bincount(specimen)
+    slot = np.arange(len(specimen)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(count), count.max()), -1)
+    table[specimen, slot] = np.arange(len(specimen))
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
+
+    residuals: Residuals
+    modes: Modes
+    inputs: Floats  # (R, free, free): D V'
+    readings: Floats  # (R, free, m): D S U'
+    orientation: Floats  # (R,): sign of the map's determinant at the mode
+
+    @classmethod
+    @one_thread()
+    def at_modes(cls, residuals: Residuals, modes: Modes) -> Proposals:
+        """Return the proposals at modes."""
+        count, m, d = modes.slopes.shape
+        u, s, vt = np.linalg.svd(modes.slopes, full_matrices=True)
+        scale = np.zeros((count, d))
+        rank = min(m, d)
+        scale[:, :rank] = s
+        inverse = 1 / np.sqrt(1 + scale**2)
+        readings = np.zeros((count, d, m))
+        of_left = u[:, :, :rank].swapaxes(1, 2)
+        readings[:, :rank] = (scale * inverse)[:, :rank, None] * of_left
+        orientation = np.sign(np.linalg.det(vt))
+        return cls(residuals, modes, inverse[:, :, None] * vt, readings, orientation)
+
+    def rows(self, index: Indices) -> Proposals:
+        """Return the proposals of selected modes."""
+        arrays = self.inputs[index], self.readings[index], self.orientation[index]
+        return Proposals(self.residuals, self.modes.rows(index), *arrays)
+
+    def without_covered(self) -> Proposals:
+        """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
+        modes = self.modes
+        order = np.lexsort((modes.misfit, modes.specimen))
+        sorted_ = self.rows(order)
+        table = sorted_.modes.table
+        kept = np.ones(len(order), dtype=bool)
+        _, own = sorted_.mapped(np.arange(len(order)), sorted_.modes.a)
+        own_log_det = np.linalg.slogdet(own)[1]
+        for k in range(1, table.shape[1]):
+            for better in range(k):
+                pairs = table[:, k] >= 0
+                at, rows = table[pairs, better], table[pairs, k]
+                pairs = kept[at] & kept[rows] & (sorted_.modes.scale[at] == sorted_.modes.scale[rows])
+                at, rows = at[pairs], rows[pairs]
+                if not rows.size:
+                    continue
+                value, jacobian = sorted_.mapped(at, sorted_.modes.a[rows])
+                sign, log_det = np.linalg.slogdet(jacobian)
+                is_in_bulk = (value**2).mean(axis=1) < 2.0
+                is_in_bulk &= (sign == sorted_.orientation[at]) & (log_det > own_log_det[at] - 1.0)
+                at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
+                end, _, _, converged = sorted_.solved(at, value)
+                is_reached = np.abs(end - sorted_.modes.a[rows]).max(axis=1, initial=0) < 1e-2
+                kept[rows[converged & is_reached]] = False
+        return sorted_.rows(np.flatnonzero(kept))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether readings leave inputs of a tenth of the specimens open.
+
+        Along an open direction their precision is less than a hundred times the population's.
+        """
+        _, m, d = self.modes.slopes.shape
+        if m < d:
+            return True
+        slopes = self.modes.slopes / self.modes.scale[:, None, None]
+        least = np.linalg.svd(slopes, compute_uv=False)[:, -1] ** 2
+        return bool(np.quantile(least, 0.1) < 100.0)
+
+    def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
+        """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
+        e, slopes = self.residuals.errors(self.modes.specimen[mode], a)
+        scale = self.modes.scale[mode]
+        e, slopes = e / scale[:, None], slopes / scale[:, None, None]
+        inputs, readings = self.inputs[mode], self.readings[mode]
+        xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
+        return xi, inputs + readings @ slopes
+
+    @np.errstate(all="ignore")
+    def solved(
+        self, mode: Indices, xi: Floats
+    ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+        """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
+
+        Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
+        converged. The determinant keeps its sign on the way: beyond a fold another proposal finds
+        the points.
+        """
+        a = self.modes.a[mode].copy()
+        value, jacobian = self.mapped(mode, a)
+        fraction = np.ones(len(a))
+        converged = np.zeros(len(a), dtype=bool)
+        active = np.arange(len(a))
+        for _ in range(25):
+            step = _solutions(jacobian[active], xi[active] - value[active])
+            length = np.sqrt((step**2).sum(axis=1))
+            usable = np.isfinite(length) & (fraction[active] > 1e-2)
+            active, step, length = active[usable], step[usable], length[usable]
+            if not active.size:
+                break
+            step *= (fraction[active] / np.maximum(length, 1.0))[:, None]
+            trial = a[active] + step
+            new_value, new_jacobian = self.mapped(mode[active], trial)
+            accepted = np.linalg.slogdet(new_jacobian)[0] == self.orientation[mode[active]]
+            to = active[accepted]
+            a[to], value[to] = trial[accepted], new_value[accepted]
+            jacobian[to] = new_jacobian[accepted]
+            fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
+            converged[active] = np.abs(xi[active] - value[active]).max(axis=1) < 0.01
+            active = active[~converged[active]]
+        log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
+        return a, value, log_det, converged
+
+    @one_thread()
+    def draw(self, count: int, seed: int, after: int = 0) -> tuple[Floats, Floats]:
+        """Draw points of each mode: coordinates (N, K, d), and logs of K times their density, (N, K).
+
+        The first ``after`` points of the seed are left out. The log is infinite where there is no
+        point.
+        """
+        modes, residuals = self.modes, self.residuals
+        size, d = modes.a.shape
+        n, slots = modes.table.shape
+        u = sobol(after + count, d, seed)[after:]
+        shifts = np.random.default_rng([seed, 1]).random((size, 1, d))
+        xi = ndtri(np.clip((u + shifts) % 1.0, 1e-12, 1 - 1e-12)).reshape(-1, d)
+        mode = np.repeat(np.arange(size), count)
+        a, value, log_det, converged = self.solved(mode, xi)
+        rows = np.flatnonzero(converged)
+        log_q = np.full(len(a), np.inf)
+        own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
+        log_q[rows] = self._log_mixture(mode[rows], a[rows], own)
+        log_q[rows] += np.log(count) - d / 2 * np.log(2 * np.pi)
+        log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
+        a[~converged] = 0.0
+        z = residuals.coordinates(modes.specimen[mode], a)
+        filled = np.maximum(modes.table, 0)
+        log_q = log_q.reshape(size, count)[filled]
+        log_q[modes.table < 0] = np.inf
+        return z.reshape(size, count, -1)[filled].reshape(n, slots * count, -1), log_q.reshape(n, -1)
+
+    def _log_mixture(self, mode: Indices, a: Floats, own: Floats) -> Floats:
+        """Return the log of the sum of the densities of all modes that reach the points."""
+        modes = self.modes
+        table = modes.table[modes.specimen[mode]]
+        terms = [own]
+        for slot in range(table.shape[1]):
+            rows = np.flatnonzero((table[:, slot] >= 0) & (table[:, slot] != mode))
+            term = np.full(len(a), -np.inf)
+            if rows.size:
+                at = table[rows, slot]
+                value, jacobian = self.mapped(at, a[rows])
+                sign, log_det = np.linalg.slogdet(jacobian)
+                density = log_det - (value**2).sum(axis=1) / 2
+                matters = (sign == self.orientation[at]) & (density > own[rows] - 10)
+                rows, at, density = rows[matters], at[matters], density[matters]
+                end, _, _, converged = self.solved(at, value[matters])
+                is_reached = converged & (np.abs(end - a[rows]).max(axis=1, initial=0) < 1e-3)
+                term[rows[is_reached]] = density[is_reached]
+            terms.append(term)
+        return log_sum_exp(np.stack(terms, axis=1))
+
+
+@np.errstate(all="ignore")
+def _solutions(matrices: Floats, right: Floats) -> Floats:
+    """Return the solutions (n, m) of n linear systems, NaN where a matrix is singular."""
+    if matrices.shape[-1] == 1:
+        return right / matrices[..., 0]
+    singular = ~(np.abs(np.linalg.det(matrices)) > 0)
+    safe = np.where(singular[:, None, None], np.eye(matrices.shape[-1]), matrices)
+    solution = np.linalg.solve(safe, right[..., None])[..., 0]
+    return np.where(singular[:, None], np.nan, solution)
