@@ -409,7 +409,7 @@ class Populations:
             away = thetas - mean
             covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
             root = np.linalg.cholesky(1.2 * covariance)
-            u = sobol(1024, d + 1, seed + 1 + attempt)
+            u = sobol(512, d + 1, seed + 1 + attempt)
             radius = np.sqrt(5 / chdtri(5, u[:, d]))
             standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T

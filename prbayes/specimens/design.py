@@ -17,11 +17,7 @@ from scipy.special import ndtri
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import (
-    fit_normal,
-    normal_log_density,
-    normalised_weights,
-)
+from prbayes.propagation.population_density import fit_normal
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
 from prbayes.specimens.points import (
     Draws,
@@ -29,6 +25,7 @@ from prbayes.specimens.points import (
     SpecimenPoints,
     draw_points,
     fit_proposals,
+    likely_weights,
     normal_of,
     reliable_draws,
     specimen_points,
@@ -90,23 +87,15 @@ class Likely:
         wide = Normal(population.mean, 2.0 * population.root)
         proposals = fit_proposals(data, emulation, wide)
         if proposals.is_open:
-            draws, points, proposals = reliable_draws(data, proposals, 64, seed)
+            draws, points, proposals = reliable_draws(data, proposals, 64, seed, enough=128)
             population = normal_of(draws.specimens()[:, data.free])
         else:
-            points = draw_points(data, proposals, 8, seed)
+            count = 8 * proposals.modes.table.shape[1]
+            points = draw_points(data, proposals, count, seed)
             has_point = np.isfinite(points.log_a).any(axis=1)
             z = points.z[has_point][..., data.free]
             population = Normal(*fit_normal(z, points.log_a[has_point]))
-        return cls.weighted(proposals, points, population, points.z[..., data.free])
-
-    @classmethod
-    def weighted(
-        cls, proposals: Proposals, points: SpecimenPoints, population: Normal, z: Floats
-    ) -> Likely:
-        """Return points with their weights under a population."""
-        logs = points.log_a + normal_log_density(z, population.mean, population.root)
-        logs[~np.isfinite(logs).any(axis=1)] = 0.0
-        return cls(proposals, points, population, normalised_weights(logs))
+        return cls(proposals, points, population, likely_weights(data, points, population))
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:
         """Return likely inputs, (count, d), and their specimens; different specimens first."""
@@ -185,7 +174,7 @@ def joined(
     misfit = outputs[: len(sampled)] - emulation.surface.values(sampled)
     error, bias = error_and_bias(data, emulation, likely, sampled, specimens, misfit)
     z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
-    surface, _, _ = fit_surface(z, y, data.readings, data.name)
+    surface, _, _ = fit_surface(z, y, data.readings, data.name, emulation.surface)
     return Emulation(z, y, surface, error, bias)
 
 
@@ -271,7 +260,7 @@ def audited(
     Otherwise the emulation has these runs.
     """
     population = normal_of(draws.specimens()[:, data.free], 1.2)
-    likely = Likely.weighted(proposals, points, population, points.z[..., data.free])
+    likely = Likely(proposals, points, population, likely_weights(data, points, population))
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
     sd = np.sqrt((population.root**2).sum(axis=1))
@@ -286,7 +275,7 @@ def audited(
     all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, y])
     if bias <= 1.5 * data.options.bias:
         return replace(emulation, z=all_z, y=all_y, bias=max(bias, emulation.bias)), True
-    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name)
+    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface)
     return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias), False
 
 

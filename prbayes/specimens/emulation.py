@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 
@@ -109,8 +109,8 @@ class Emulation:
 
 
 def fit_surface(
-    z: Floats, y: Floats, readings: Readings, name: str
-) -> tuple[Interpolant, Floats, NDArray[np.bool_]]:
+    z: Floats, y: Floats, readings: Readings, name: str, previous: Any = None
+) -> tuple[Emulator, Floats, NDArray[np.bool_]]:
     """Return the emulator, left-out errors, (n, m), and which runs are near the data, (n,).
 
     Runs that are equal to nine digits count once. Left-out errors are NaN without a response.
@@ -134,7 +134,8 @@ def fit_surface(
     largest = np.maximum(1e4 * spread, largest)
     yg = np.clip(yg, center - largest, center + largest)
     inside = near_readings(yg, readings)
-    surface = fit_interpolant(z[rows[first]], yg, inside)
+    start = previous if isinstance(previous, Emulator) else None
+    surface = fit_emulator(z[rows[first]], yg, inside, start=start)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near

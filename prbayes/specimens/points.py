@@ -22,6 +22,7 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import normal_log_density, normalised_weights
 from prbayes.specimens.emulation import Emulation, half_difference
 from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
 
@@ -32,8 +33,8 @@ class SpecimenOptions:
 
     starts: int = 12  # of the search for modes, by specimen
     gap: float = 20.0  # largest misfit of a mode above the specimen's best, in nats
-    points: int = 4  # points of each mode in each half; doubled until the halves agree
-    most_points: int = 4096  # largest number of points of a mode; of few specimens, `most_in_all`
+    points: int = 4  # fewest points of a mode in each half; doubled until the halves agree
+    most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
     most_in_all: int = 2**17
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
@@ -60,7 +61,7 @@ class SpecimenPoints:
     # of the readings, for an error that is not known in advance
     log_proposal: Floats
     n_roots: NDArray[np.intp]  # (N,): number of modes of the readings' density
-    count: int = 0  # number of points of each mode
+    mode: NDArray[np.intp]  # (N, K): mode whose proposal drew the point
     difference: float = np.nan  # the half difference of the log-likelihoods
 
     def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
@@ -77,7 +78,7 @@ def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
         np.concatenate([first.log_a, second.log_a], axis=1) - np.log(2),
         np.concatenate([first.log_proposal, second.log_proposal], axis=1) + np.log(2),
         first.n_roots,
-        first.count + second.count,
+        np.concatenate([first.mode, second.mode], axis=1),
     )
 
 
@@ -219,11 +220,11 @@ def _as_starts(modes: Modes, starts: Floats) -> Floats:
 
 
 def draw_points(
-    data: SpecimenData, proposals: Proposals, count: int, seed: int, after: int = 0
+    data: SpecimenData, proposals: Proposals, count: int, seed: int
 ) -> SpecimenPoints:
-    """Return points of all specimens, ``count`` of each mode."""
+    """Return points of all specimens, ``count`` of each."""
     emulation = proposals.residuals.response
-    z, log_proposal = proposals.draw(count, seed, after)
+    z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
     outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
     n_known = d - len(data.free)
@@ -233,7 +234,7 @@ def draw_points(
     log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
-    return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, count)
+    return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
 
 
 def specimen_points(
@@ -247,18 +248,31 @@ def specimen_points(
     """
     options = data.options
     proposals = fit_proposals(data, emulation, population)
-    count, is_open = options.points, proposals.is_open
-    if is_open:
+    if proposals.is_open:
         count = 32 * options.points
         for refit in range(3):
-            draws, points, _ = reliable_draws(data, proposals, count, data.seed + refit)
-            count = points.count
-            population = normal_of(draws.specimens()[:, data.free], 1.3)
-            proposals = fit_proposals(data, emulation, population)
+            draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit)
+            count = points.log_a.shape[1]
+            population = normal_of(draws.specimens()[:, data.free])
+            inflated = Normal(population.mean, 1.15 * population.root)
+            proposals = fit_proposals(data, emulation, inflated)
+        points = draw_points(data, proposals, count, data.seed)
+        weights = likely_weights(data, points, population)
+        mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
+        proposals = proposals.with_shares(mass)
         return *agreeing_points(data, proposals, max(options.points, count // 2), draws), draws
+    count = options.points * proposals.modes.table.shape[1]
     points = draw_points(data, proposals, 2 * count, data.seed)
     draws = data.posterior(points.z, points.log_a, None)
     return *agreeing_points(data, proposals, count, draws), draws
+
+
+def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Normal) -> Floats:
+    """Return weights of the points of each specimen under a population, (N, K)."""
+    z = points.z[..., data.free]
+    logs = points.log_a + normal_log_density(z, population.mean, population.root)
+    logs[~np.isfinite(logs).any(axis=1)] = 0.0
+    return normalised_weights(logs)
 
 
 def agreeing_points(
@@ -322,13 +336,14 @@ def typical_specimens(
 
 
 def reliable_draws(
-    data: SpecimenData, proposals: Proposals, count: int, seed: int
+    data: SpecimenData, proposals: Proposals, count: int, seed: int, enough: int | None = None
 ) -> tuple[Draws, SpecimenPoints, Proposals]:
     """Return draws at which both halves of at least ``count`` points agree, and these points.
 
     Where points lie farther apart than populations are wide, the likely populations are those
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
-    narrow the reference population, until it narrows no more; then points are doubled.
+    narrow the reference population, until it narrows no more; then points are doubled. With
+    ``enough`` points the draws are returned in any case, otherwise a DesignError is raised.
     """
     narrows = False
     while True:
@@ -338,7 +353,7 @@ def reliable_draws(
             draws = data.posterior(points.z, points.log_a, None)
             difference = _half_difference(data, proposals, halves, draws)
             limit = per_hyperparameter(draws)
-            if difference <= limit:
+            if difference <= limit or count == enough:
                 return draws, points, proposals
             if 2 * count > data.options.most_points:
                 raise _monte_carlo_error(data.name, count, difference, limit)

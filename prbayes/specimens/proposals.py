@@ -265,6 +265,7 @@ class Proposals:
     inputs: Floats  # (R, free, free): D V'
     readings: Floats  # (R, free, m): D S U'
     orientation: Floats  # (R,): sign of the map's determinant at the mode
+    share: Floats  # (R,): mixing weight among the modes of the specimen
 
     @classmethod
     @one_thread()
@@ -280,12 +281,15 @@ class Proposals:
         of_left = u[:, :, :rank].swapaxes(1, 2)
         readings[:, :rank] = (scale * inverse)[:, :rank, None] * of_left
         orientation = np.sign(np.linalg.det(vt))
-        return cls(residuals, modes, inverse[:, :, None] * vt, readings, orientation)
+        share = 1 / np.bincount(modes.specimen)[modes.specimen]
+        return cls(residuals, modes, inverse[:, :, None] * vt, readings, orientation, share)
 
     def rows(self, index: Indices) -> Proposals:
-        """Return the proposals of selected modes."""
+        """Return the proposals of selected modes, with equal mixing weights."""
         arrays = self.inputs[index], self.readings[index], self.orientation[index]
-        return Proposals(self.residuals, self.modes.rows(index), *arrays)
+        modes = self.modes.rows(index)
+        share = 1 / np.bincount(modes.specimen)[modes.specimen]
+        return Proposals(self.residuals, modes, *arrays, share)
 
     def without_covered(self) -> Proposals:
         """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
@@ -371,48 +375,78 @@ class Proposals:
         log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
         return a, value, log_det, converged
 
-    @one_thread()
-    def draw(self, count: int, seed: int, after: int = 0) -> tuple[Floats, Floats]:
-        """Draw points of each mode: coordinates (N, K, d), and logs of K times their density, (N, K).
+    def with_shares(self, mass: Floats) -> Proposals:
+        """Return the proposals with mixing weights by the mass of each mode, (R,).
 
-        The first ``after`` points of the seed are left out. The log is infinite where there is no
-        point.
+        A tenth of the points is for all modes alike: another population may be the likely one.
+        """
+        specimen = self.modes.specimen
+        total = np.bincount(specimen, mass)[specimen]
+        count = np.bincount(specimen)[specimen]
+        own = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
+        return replace(self, share=0.9 * own + 0.1 / count)
+
+    def _counts(self, count: int) -> Indices:
+        """Return the number of points of each mode, (R,), which have the sum ``count``."""
+        share, table = self.share, self.modes.table
+        least = np.where(table >= 0, np.floor(count * share[table]), -1)
+        rest = np.where(table >= 0, count * share[table] - least, -1.0)
+        missing = count - np.where(table >= 0, least, 0).sum(axis=1)
+        # The largest remainders get one point more.
+        rank = np.argsort(np.argsort(-rest, axis=1, kind="stable"), axis=1, kind="stable")
+        counts = least + (rank < missing[:, None])
+        return np.asarray(counts[table >= 0], dtype=np.intp)
+
+    @one_thread()
+    def draw(self, count: int, seed: int) -> tuple[Floats, Floats, Indices]:
+        """Draw ``count`` points of each specimen.
+
+        Return coordinates (N, K, d), logs of K times their density, (N, K), and the mode that drew
+        each, (N, K). The log is infinite where there is no point.
         """
         modes, residuals = self.modes, self.residuals
-        size, d = modes.a.shape
-        n, slots = modes.table.shape
-        u = sobol(after + count, d, seed)[after:]
-        shifts = np.random.default_rng([seed, 1]).random((size, 1, d))
-        xi = ndtri(np.clip((u + shifts) % 1.0, 1e-12, 1 - 1e-12)).reshape(-1, d)
-        mode = np.repeat(np.arange(size), count)
+        n, d = len(residuals.known), modes.a.shape[1]
+        counts = self._counts(count)
+        mode = np.repeat(np.arange(len(counts)), counts)
+        place = np.arange(len(mode)) - np.repeat(np.cumsum(counts) - counts, counts)
+        # The first coordinates of the sequence, the most even ones, are those of open directions.
+        u = sobol(int(counts.max()), d, seed)[:, ::-1]
+        shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
+        xi = ndtri(np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
         own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
-        log_q[rows] = self._log_mixture(mode[rows], a[rows], own)
-        log_q[rows] += np.log(count) - d / 2 * np.log(2 * np.pi)
+        log_q[rows] = self._log_mixture(mode[rows], a[rows], own, counts)
+        log_q[rows] -= d / 2 * np.log(2 * np.pi)
         log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
         a[~converged] = 0.0
-        z = residuals.coordinates(modes.specimen[mode], a)
-        filled = np.maximum(modes.table, 0)
-        log_q = log_q.reshape(size, count)[filled]
-        log_q[modes.table < 0] = np.inf
-        return z.reshape(size, count, -1)[filled].reshape(n, slots * count, -1), log_q.reshape(n, -1)
+        specimen = modes.specimen[mode]
+        z = np.zeros((n, count, residuals.known.shape[1]))
+        by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
+        slot = np.arange(len(mode)) - np.searchsorted(specimen, specimen)
+        z[specimen, slot] = residuals.coordinates(specimen, a)
+        by_specimen[specimen, slot], owner[specimen, slot] = log_q, mode
+        return z, by_specimen, owner
 
-    def _log_mixture(self, mode: Indices, a: Floats, own: Floats) -> Floats:
-        """Return the log of the sum of the densities of all modes that reach the points."""
+    def _log_mixture(self, mode: Indices, a: Floats, own: Floats, counts: Indices) -> Floats:
+        """Return the log of the sum of the densities of all modes that reach the points.
+
+        Densities are weighted by the modes' numbers of points.
+        """
         modes = self.modes
         table = modes.table[modes.specimen[mode]]
-        terms = [own]
+        terms = [own + np.log(counts[mode])]
         for slot in range(table.shape[1]):
-            rows = np.flatnonzero((table[:, slot] >= 0) & (table[:, slot] != mode))
+            at = table[:, slot]
+            rows = np.flatnonzero((at >= 0) & (at != mode) & (counts[at] > 0))
             term = np.full(len(a), -np.inf)
             if rows.size:
-                at = table[rows, slot]
+                at = at[rows]
                 value, jacobian = self.mapped(at, a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
-                density = log_det - (value**2).sum(axis=1) / 2
-                matters = (sign == self.orientation[at]) & (density > own[rows] - 10)
+                density = log_det - (value**2).sum(axis=1) / 2 + np.log(counts[at])
+                matters = (sign == self.orientation[at]) & (density > terms[0][rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
                 end, _, _, converged = self.solved(at, value[matters])
                 is_reached = converged & (np.abs(end - a[rows]).max(axis=1, initial=0) < 1e-3)
