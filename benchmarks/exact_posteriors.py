@@ -143,21 +143,66 @@ def importance(
     ).x
     hessian = -np.array([slope(mode + h) - slope(mode - h) for h in 0.01 * np.eye(q)]) / 0.02
     size, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
-    covariance, center = (vectors / np.maximum(size, 0.05)) @ vectors.T, mode
-    degrees = 5.0
+    parts = [(1.0, mode, (vectors / np.maximum(size, 0.05)) @ vectors.T)]
     for seed in range(rounds):
         n = count if seed == rounds - 1 else max(count // 4, 1024)
-        sobol = np.clip(stats.qmc.Sobol(q + 1, seed=seed).random(n), 1e-10, 1 - 1e-10)
-        radius = np.sqrt(degrees / stats.chi2.ppf(sobol[:, 0], degrees))
-        standard = stats.norm.ppf(sobol[:, 1:]) * radius[:, None]
-        u = center + standard @ np.linalg.cholesky(1.1 * covariance).T
-        proposal = -(degrees + q) / 2 * np.log1p((standard**2).sum(axis=1) / degrees)
+        u, log_q = _drawn(parts, n, seed)
         blocks = np.array_split(u, max(1, n // 64))
-        logs = np.concatenate([log_density(block) for block in blocks]) - proposal
+        logs = np.concatenate([log_density(block) for block in blocks]) - log_q
         weights = np.exp(logs - logsumexp(logs))
-        center = weights @ u
-        covariance = (weights[:, None] * (u - center)).T @ (u - center) + 1e-9 * np.eye(q)
+        parts = _mixture(u, weights)
     return u, weights
+
+
+Part = tuple[float, Any, Any]  # share, centre (q,), covariance (q, q)
+
+
+def _log_t(u: Any, center: Any, covariance: Any, degrees: float = 5.0) -> Any:
+    """Return the log-density of a t distribution, up to a constant."""
+    root = np.linalg.cholesky(covariance)
+    square = (np.linalg.solve(root, (u - center).T) ** 2).sum(axis=0)
+    constant = np.log(np.diag(root)).sum()
+    return -(degrees + len(center)) / 2 * np.log1p(square / degrees) - constant
+
+
+def _drawn(parts: list[Part], count: int, seed: int, degrees: float = 5.0) -> tuple[Any, Any]:
+    """Return points (S, q) of a mixture of t distributions, and their log-density."""
+    q = len(parts[0][1])
+    sobol = np.clip(stats.qmc.Sobol(q + 2, seed=seed).random(count), 1e-10, 1 - 1e-10)
+    which = np.searchsorted(np.cumsum([share for share, *_ in parts])[:-1], sobol[:, 0])
+    radius = np.sqrt(degrees / stats.chi2.ppf(sobol[:, 1], degrees))
+    standard = stats.norm.ppf(sobol[:, 2:]) * radius[:, None]
+    roots = np.array([np.linalg.cholesky(covariance) for *_, covariance in parts])
+    u = np.array([center for _, center, _ in parts])[which]
+    u = u + np.einsum("sde,se->sd", roots[which], standard)
+    return u, logsumexp([np.log(p) + _log_t(u, m, c) for p, m, c in parts], axis=0)
+
+
+def _mixture(u: Any, weights: Any, count: int = 8, least: float = 300.0) -> list[Part]:
+    """Return a mixture fitted to weighted points by the EM algorithm, with their overall moments.
+
+    Weights are tempered until their effective number is large enough.
+    """
+    while 1 / (weights**2).sum() < least:
+        weights = weights**0.8 / (weights**0.8).sum()
+    q, rng = u.shape[1], np.random.default_rng(0)
+    center = weights @ u
+    overall = (weights[:, None] * (u - center)).T @ (u - center) + 1e-9 * np.eye(q)
+    means = u[rng.choice(len(u), count, p=weights)]
+    shares, covariances = np.full(count, 1 / count), np.repeat(overall[None] / 2, count, axis=0)
+    for _ in range(30):
+        logs = [
+            np.log(p) + _log_t(u, m, c) for p, m, c in zip(shares, means, covariances, strict=True)
+        ]
+        share = np.exp(logs - logsumexp(logs, axis=0)) * weights
+        shares = share.sum(axis=1) + 1e-6
+        means = (share @ u + 1e-6 * center) / shares[:, None]
+        for k, (row, mean) in enumerate(zip(share, means, strict=True)):
+            own = (row[:, None] * (u - mean)).T @ (u - mean)
+            covariances[k] = (own + 0.02 * overall) / (shares[k] + 0.02)
+        shares /= shares.sum()
+    parts = [(0.9 * p, m, 1.1 * c) for p, m, c in zip(shares, means, covariances, strict=True)]
+    return [*parts, (0.1, center, 1.5 * overall)]
 
 
 def moments(values: Draws, weights: Any) -> dict[str, Any]:
@@ -165,6 +210,13 @@ def moments(values: Draws, weights: Any) -> dict[str, Any]:
     mean = {name: float(weights @ value) for name, value in values.items()}
     sd = {n: float(np.sqrt(weights @ (value - mean[n]) ** 2)) for n, value in values.items()}
     return {"mean": mean, "sd": sd, "effective": float(1 / (weights**2).sum())}
+
+
+def log_sum(logs: Any) -> Any:
+    """Return the logarithm of the sum of exponentials over the last axis; the array is overwritten."""
+    largest = np.maximum(logs.max(axis=-1), -1e300)
+    logs -= largest[..., None]
+    return largest + np.log(np.exp(logs, out=logs).sum(axis=-1))
 
 
 def normal_at_shared_nodes(nodes: Any, likelihood: Any) -> Callable[[Any, Any], Any]:
@@ -200,9 +252,10 @@ def normal_at_nodes(x: Any, log_a: Any) -> Callable[[Any, Any], Any]:
         for rows in np.array_split(np.arange(len(mean)), len(mean) * n * k // _AT_ONCE + 1):
             m, precision = mean[rows] - middle, 1 / sd[rows] ** 2
             logs = np.concatenate([-0.5 * precision, m * precision], axis=1) @ features
-            logs = logs.reshape(len(rows), n, k) + log_a
+            logs = logs.reshape(len(rows), n, k)
+            logs += log_a
             constant = -0.5 * (m**2 * precision + np.log(2 * np.pi)) - np.log(sd[rows])
-            total[rows] = logsumexp(logs, axis=2).sum(axis=1) + n * constant.sum(axis=1)
+            total[rows] = log_sum(logs).sum(axis=1) + n * constant.sum(axis=1)
         return total
 
     return function

@@ -17,7 +17,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -27,35 +27,18 @@ import pymc as pm
 
 import prbayes as prb
 from benchmarks import exact_posteriors as exact
+from benchmarks import reach_cases as cases
 from benchmarks import record
+from benchmarks.reach_cases import Instance
 from benchmarks.scoreboard import in_pymc
-from benchmarks.scoreboard.problem import (
-    Input,
-    Prior,
-    Problem,
-    Response,
-    half_normal,
-    normal,
-    uniform,
-)
-from benchmarks.scoreboard.problems import PROBLEMS
+from benchmarks.scoreboard.problem import Problem, Response, half_normal, normal
 from benchmarks.study import Study
 
 SECONDS = 120.0  # CPU time of a row
 REFERENCES = record.RESULTS / "reach_references.json"
 # Of each figure the largest value that is allowed; of "narrowest" the smallest one.
 GOOD = {"bias": 0.1, "narrowest": 0.9, "widest": 1.1}
-
-
-@dataclass(frozen=True)
-class Instance:
-    """A data set with its model and its exact posterior."""
-
-    problem: Problem
-    observed: Any
-    reference: Callable[[], dict[str, Any]]  # see `exact.moments`; with "modes" of several ones
-    measurement: Callable[[dict[str, Any]], dict[str, Any]] = field(default=lambda values: {})
-    build: Callable[[Response], pm.Model] | None = None  # in place of inputs and formula
+WIDE = {"bias": 0.25, "narrowest": 0.75, "widest": 1.25}
 
 
 @dataclass(frozen=True)
@@ -114,7 +97,7 @@ def model_of(instance: Instance, response: Response) -> pm.Model:
 @cache
 def warm() -> None:
     """Calibrate a linear response, so that no row pays for the first compilation."""
-    posterior_row(lambda _: _scoreboard("linear", 20, 0), "", 0)
+    posterior_row(lambda _: cases._scoreboard("linear", 20, 0), "", SECONDS, 0)
 
 
 def stored_reference(cell: str, number: int, compute: Callable[[], Any]) -> Any:
@@ -129,7 +112,9 @@ def stored_reference(cell: str, number: int, compute: Callable[[], Any]) -> Any:
     return stored[cell][key]
 
 
-def posterior_row(make: Callable[[int], Instance], cell: str, number: int) -> dict[str, Any]:
+def posterior_row(
+    make: Callable[[int], Instance], cell: str, seconds: float, number: int
+) -> dict[str, Any]:
     """Return runs, CPU seconds, and the distance of the posterior from the exact one."""
     if cell:
         warm()
@@ -140,11 +125,11 @@ def posterior_row(make: Callable[[int], Instance], cell: str, number: int) -> di
     begun = time.process_time()
     posterior = None
     try:
-        with limited(SECONDS):
+        with limited(seconds):
             model = model_of(instance, response)
             posterior = prb.sample(model=model, random_seed=1, progressbar=False).posterior
     except TimeLimitError:
-        row["error"] = f"not finished in {SECONDS:.0f} CPU s"
+        row["error"] = f"not finished in {seconds:.0f} CPU s"
     except Exception as error:  # a refusal is a result
         row["error"] = f"{type(error).__name__}: {error}".splitlines()[0][:200]
     row |= {"runs": response.runs, "cpu": round(time.process_time() - begun, 2)}
@@ -155,21 +140,22 @@ def posterior_row(make: Callable[[int], Instance], cell: str, number: int) -> di
 
 def distance(problem: Problem, reference: dict[str, Any], posterior: Any) -> dict[str, Any]:
     """Return the figures of a posterior beside the exact one."""
-    values = {name: posterior[name].to_numpy().ravel() for name in problem.priors}
+    draws = {name: posterior[name].to_numpy().ravel() for name in problem.priors}
+    values = problem.told(draws)
     mean, sd = reference["mean"], reference["sd"]
     bias = {name: (values[name].mean() - mean[name]) / sd[name] for name in mean}
     width = {name: values[name].std() / sd[name] for name in mean}
     figures: dict[str, Any] = {
-        "bias": max(map(abs, bias.values())),
-        "narrowest": min(width.values()),
-        "widest": max(width.values()),
         "by name": {name: [round(bias[name], 3), round(width[name], 3)] for name in mean},
         "sampler": posterior.attrs.get("sampler", ""),
         "efficiency": posterior.attrs.get("efficiency"),
         "findings": [finding["code"] for finding in json.loads(posterior.attrs["findings"])],
     }
+    if mean:
+        figures["bias"] = max(map(abs, bias.values()))
+        figures |= {"narrowest": min(width.values()), "widest": max(width.values())}
     if "modes" in reference:
-        u = exact.coordinates_of(problem.priors, values)
+        u = exact.coordinates_of(problem.priors, draws)
         share = exact.masses(reference["modes"], u, np.full(len(u), 1 / len(u)))
         right = np.array(reference["masses"])
         figures["mass"] = float(np.abs(share - right).max())
@@ -177,287 +163,68 @@ def distance(problem: Problem, reference: dict[str, Any], posterior: Any) -> dic
     return figures
 
 
-def by_grid(
-    priors: dict[str, Prior], log_likelihood: Callable[..., Any], low: Any, high: Any,
-    refinements: int = 1, least: float = 0.01,
-) -> dict[str, Any]:  # fmt: skip
-    """Return the exact posterior of hyperparameters, whose log-likelihood takes their values."""
-    density = exact.log_posterior(priors, lambda v: log_likelihood(*v.values()))
-    u, weights, whole = exact.on_grid(density, low, high, refinements)
-    result = exact.moments(exact.values_of(priors, u), weights)
-    found = exact.modes(u, weights, whole, least)
-    if len(found) > 1:
-        result |= {"modes": found, "masses": exact.masses(found, u, weights).tolist()}
-    return result
+def likelihood_row(is_relative: bool, number: int) -> dict[str, Any]:
+    """Return the largest error of log L over central 98 % of the prior of the reading error, in nats."""
+    warm()
+    mu, sd = cases.POPULATIONS[number]
+    row: dict[str, Any] = {"number": number, "nats": 0.0, "by error": []}
+    response = cases.wang_response()
+    begun = time.process_time()
+    try:
+        with limited(SECONDS):
+            model, y = cases.wang_model(is_relative, response)
+            function = model.compile_logp(vars=[y], jacobian=False)
+            for error in (
+                half_normal(0.3).distribution().ppf([0.01, 0.03, 0.1, 0.3, 0.5, 0.8, 0.99])
+            ):
+                point = {"mu": mu, "s_log__": np.log(sd), "e_log__": np.log(error)}
+                right = cases.wang_log_likelihood(is_relative, mu, sd, error)
+                off = float(function(point)) - right
+                row["by error"].append([round(error, 4), round(off, 3), round(right, 2)])
+                row["nats"] = max(row["nats"], abs(off))
+    except TimeLimitError:
+        row["error"] = f"not finished in {SECONDS:.0f} CPU s"
+    except Exception as error:  # a refusal is a result
+        row["error"] = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+    return row | {"runs": response.runs, "cpu": round(time.process_time() - begun, 2)}
 
 
-def by_importance(
-    priors: dict[str, Prior], log_likelihood: Callable[..., Any], start: dict[str, float],
-    count: int = 8192,
-) -> dict[str, Any]:  # fmt: skip
-    """Return the exact posterior of more hyperparameters, by importance sampling."""
-    density = exact.log_posterior(priors, log_likelihood)
-    u, weights = exact.importance(density, exact.coordinates_of(priors, start), count)
-    return exact.moments(exact.values_of(priors, u), weights)
+def individuals_row(number: int) -> dict[str, Any]:
+    """Return the distance of the specimens' inputs from the exact ones, in their own deviations."""
+    warm()
+    mean, sd = cases.individuals_exact(number)
+    runs = [0]
+
+    def response(a: Any, b: Any = None) -> Any:
+        runs[0] += np.size(a)
+        return 1.0 * a if b is None else np.stack([a + b, a - b], axis=-1)
+
+    row: dict[str, Any] = {"number": number}
+    begun = time.process_time()
+    with limited(SECONDS):
+        model = cases.individuals_model(number, response if len(sd) == 2 else lambda a: response(a))
+        posterior = prb.sample(model=model, random_seed=1, progressbar=False)
+        inputs = prb.individuals(posterior, model=model, random_seed=1, n_draws=4000).posterior
+    row |= {"runs": runs[0], "cpu": round(time.process_time() - begun, 2)}
+    draws = [v.to_numpy().reshape(-1, len(mean)) for v in inputs.data_vars.values()]
+    off = np.array([(d.mean(axis=0) - m) / s for d, m, s in zip(draws, mean.T, sd, strict=True)])
+    width = np.array([d.std(axis=0) / s for d, s in zip(draws, sd, strict=True)])
+    row |= {"bias": float(np.abs(off).max()), "narrowest": float(width.min())}
+    return row | {"widest": float(width.max()), "off by .25": int((np.abs(off) > 0.25).sum())}
 
 
-# -- the scoreboard --------------------------------------------------------------------------------
+def _case(
+    cell: str, make: Callable[[int], Instance], data_sets: int, seconds: float = SECONDS,
+    **bounds: float,
+) -> tuple[str, Case]:  # fmt: skip
+    return cell, Case(partial(posterior_row, make, cell, seconds), data_sets, GOOD | bounds)
 
 
-def _scoreboard(name: str, size: int, number: int) -> Instance:
-    problem = PROBLEMS[name]
-
-    def reference() -> dict[str, Any]:
-        found = problem.reference(size, number)
-        return {"mean": found.center, "sd": found.sd}
-
-    return Instance(problem, problem.data(size, number), reference)
-
-
-# -- one input of unknown population ---------------------------------------------------------------
-
-_MU_SIGMA = {"mu": normal(1, 0.5), "sigma": half_normal(1)}
-_NODES = np.linspace(-4, 4, 2001)
-
-
-def _problem(
-    priors: dict[str, Prior], inputs: Iterable[Input], formula: Any, **more: Any
-) -> Problem:
-    return Problem("", "", "", priors, tuple(inputs), formula, (0,), **more)
-
-
-def _normal(x: Any, sd: Any) -> Any:
-    return np.exp(-0.5 * (x / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
-
-
-def _branch(formula: Any, inputs: list[Input], y: Any, likelihood: Any) -> Instance:
-    """Return a data set of a ~ N(mu, sigma) and inputs of known population, by p(y_i | a)."""
-    log_l = exact.normal_at_shared_nodes(_NODES, likelihood)
-    inputs = [Input("normal", "mu", "sigma"), *inputs]
-    problem = _problem(_MU_SIGMA, inputs, formula)
-    low, high = [-2.5, np.log(0.05)], [4.0, np.log(5.0)]
-    return Instance(problem, y, partial(by_grid, _MU_SIGMA, log_l, low, high))
-
-
-def _square_and_known(number: int) -> Instance:
-    rng = np.random.default_rng(51 + number)
-    mean, sd, known = (1.0, 0.5, 0.1) if number < 3 else (0.9, 0.35, 0.05)
-    a, b = rng.normal(mean, sd, 20), rng.normal(0, known, 20)
-    y = a * a + b
-    likelihood = _normal(y[:, None] - _NODES**2, known)
-    return _branch(lambda xp, a, b: a * a + b, [Input("normal", 0.0, known)], y, likelihood)
-
-
-def _smooth_modulus_and_known(number: int) -> Instance:
-    rng = np.random.default_rng(61 + number)
-    a, b = rng.normal(1, 0.5, 20), rng.normal(0, 0.1, 20)
-    y = np.sqrt(a * a + 0.01) + b
-    likelihood = _normal(y[:, None] - np.sqrt(_NODES**2 + 0.01), 0.1)
-    known = [Input("normal", 0.0, 0.1)]
-    return _branch(lambda xp, a, b: xp.sqrt(a * a + 0.01) + b, known, y, likelihood)
-
-
-def _square_in_two_readings(number: int) -> Instance:
-    rng = np.random.default_rng(71 + number)
-    a, b, c = rng.normal(1, 0.5, 20), rng.normal(0, 0.1, 20), rng.normal(2, 0.3, 20)
-    y = np.stack([a * a + b, c + b], axis=1)
-    b = y[:, :1] - _NODES**2
-    likelihood = _normal(b, 0.1) * _normal(y[:, 1:] - b - 2, 0.3)
-    known = [Input("normal", 0.0, 0.1), Input("normal", 2.0, 0.3)]
-    return _branch(lambda xp, a, b, c: [a * a + b, c + b], known, y, likelihood)
-
-
-def _ring(number: int) -> Instance:
-    rng = np.random.default_rng((12, 20, 21, 22, 23)[number])
-    a, b = rng.normal(1, 0.5, 20), rng.normal(0, 0.3, 20)
-    y = a * a + b * b
-    # dy = 2 r dr, so that p(y) is half of the integral of the joint density over the angle.
-    angle = np.arange(2048) * 2 * np.pi / 2048
-    r = np.sqrt(y)[:, None]
-    log_a = np.log(_normal(r * np.sin(angle), 0.3) * np.pi / 2048 + 1e-300)
-    log_l = exact.normal_at_nodes((r * np.cos(angle))[..., None], log_a)
-    problem = _problem(
-        _MU_SIGMA, [Input("normal", "mu", "sigma"), Input("normal", 0.0, 0.3)],
-        lambda xp, a, b: a * a + b * b,
-    )  # fmt: skip
-    low, high = [-2.5, np.log(0.05)], [4.0, np.log(5.0)]
-    column = lambda mu, sigma: log_l(mu[:, None], sigma[:, None])  # noqa: E731
-    return Instance(problem, y, partial(by_grid, _MU_SIGMA, column, low, high))
-
-
-def _known_error(share: float, number: int) -> Instance:
-    rng = np.random.default_rng(5 + number)
-    x = rng.normal(2, 0.5, 30)
-    error = float(share * np.exp(0.5 * x).std())
-    y = np.exp(0.5 * x) + error * rng.standard_normal(30)
-    priors = {"mu": normal(1.5, 1), "sigma": half_normal(1)}
-    nodes = np.linspace(-3, 6, 3001)
-    log_l = exact.normal_at_shared_nodes(nodes, _normal(y[:, None] - np.exp(0.5 * nodes), error))
-    problem = _problem(priors, [Input("normal", "mu", "sigma")], lambda xp, x: xp.exp(0.5 * x))
-    reference = partial(by_grid, priors, log_l, [-1, np.log(0.05)], [5, np.log(4.0)])
-    return Instance(problem, y, reference, lambda values: {"error": error})
-
-
-def _roots_of_normal(
-    priors: dict[str, Prior], formula: Any, y: Any, roots: Any, slope: Any, low: Any, high: Any
-) -> Instance:
-    """Return a data set whose inputs have the roots (N, K), with dy/dx (N, K)."""
-    log_l = exact.normal_at_nodes(roots[..., None], -np.log(np.abs(slope)))
-    column = lambda mu, sigma: log_l(mu[:, None], sigma[:, None])  # noqa: E731
-    problem = _problem(priors, [Input("normal", "mu", "sigma")], formula)
-    return Instance(problem, y, partial(by_grid, priors, column, low, high, 2))
-
-
-def _mirror(mean: float, center: float, priors: dict[str, Prior], number: int) -> Instance:
-    x = np.random.default_rng(5 + number).normal(mean, 0.3 if mean == 1 else 0.4, 40)
-    y = (x - center) ** 2
-    r = np.sqrt(y)[:, None]
-    roots = center + np.concatenate([r, -r], axis=1)
-    low, high = [-4, np.log(0.03)], [4, np.log(4.0)]
-    formula = lambda xp, x: (x - center) ** 2  # noqa: E731
-    return _roots_of_normal(priors, formula, y, roots, np.tile(2 * r, 2), low, high)
-
-
-def _conflict(number: int) -> Instance:
-    x = np.random.default_rng(5).normal(10, 1, 30)
-    priors = {"mu": normal(0, (1.0, 0.5)[number]), "sigma": half_normal(1)}
-    y = x + 0.02 * x * x
-    roots, slope = x[:, None], 1 + 0.04 * x[:, None]
-    low, high = [-3, np.log(0.3)], [13, np.log(20.0)]
-    return _roots_of_normal(priors, lambda xp, x: x + 0.02 * x * x, y, roots, slope, low, high)
-
-
-def _sine(number: int) -> Instance:
-    """Return exact readings sin(.8 x) of a Weibull population with vague priors."""
-    y = np.sin(0.8 * 1.2 * np.random.default_rng([number, 8]).weibull(3.0, 100))
-    turn, a = 2 * np.pi * np.arange(8), np.arcsin(y)[:, None]
-    roots = np.concatenate([a + turn, np.pi - a + turn], axis=1) / 0.8
-    priors = {
-        "shape": Prior("lognorm", (0.5, 0.0, 2.0)),
-        "scale": Prior("lognorm", (0.5, 0.0, 1.0)),
-    }
-    logs = np.log(np.where(roots > 0, roots, 1.0))
-    log_a = np.where(roots > 0, -np.log(0.8 * np.abs(np.cos(0.8 * roots))), -np.inf)
-
-    def log_l(shape: Any, scale: Any) -> Any:
-        k = shape[:, None, None]
-        z = k * (logs - np.log(scale)[:, None, None])
-        density = np.exp(np.log(k) - logs + z - np.exp(np.minimum(z, 700)) + log_a)
-        return np.log(density.sum(axis=2) + 1e-300).sum(axis=1)
-
-    def build(response: Response) -> pm.Model:
-        with pm.Model() as model:
-            shape = pm.LogNormal("shape", np.log(2), 0.5)
-            x = pm.Weibull.dist(shape, pm.LogNormal("scale", 0, 0.5))
-            prb.Simulator("y", response, x, observed=y, metric=prb.LogLikelihood())
-        return model
-
-    problem = _problem(priors, [], lambda xp, x: xp.sin(0.8 * x))
-    reference = partial(by_grid, priors, log_l, [-1.5, -2.0], [4.0, 3.0], 2)
-    return Instance(problem, y, reference, build=build)
-
-
-def _beam(share: float, number: int) -> Instance:
-    """Return one reading of three inputs, two of which have a known population."""
-    rng = np.random.default_rng([number, 4])
-    f = lambda xp, e, b, load: 3.2e3 * load / (e * b**3)  # noqa: E731
-    e, b = 210 + 9 * rng.standard_normal(25), 10 + 0.1 * rng.standard_normal(25)
-    y = f(np, e, b, np.exp(0.05 * rng.standard_normal(25)))
-    error = float(share * y.std())
-    y = y + error * rng.standard_normal(25)
-    priors = {"mu": normal(200, 50), "sigma": half_normal(30)}
-
-    def reference(steps: int = 401) -> dict[str, Any]:
-        nodes = np.linspace(90, 360, 271)
-        z, w = np.polynomial.hermite_e.hermegauss(12)
-        log_load = np.linspace(-0.3, 0.3, steps)
-        load_weight = _normal(log_load, 0.05) * (log_load[1] - log_load[0])
-        p = np.zeros((len(y), len(nodes)))  # p(y_i | e_k)
-        for height, weight in zip(10 + 0.1 * z, w / w.sum(), strict=True):
-            values = f(np, nodes[:, None], height, np.exp(log_load))
-            p += weight * np.stack([_normal(r - values, error) @ load_weight for r in y])
-        log_p = np.log(p + 1e-300)
-        g = np.linspace(-6, 6, 97)
-
-        def log_l(mu: Any, sigma: Any) -> Any:
-            at = mu[:, None] + sigma[:, None] * g
-            place = np.clip(at - nodes[0], 0, len(nodes) - 1.001)
-            left = place.astype(int)
-            part = place - left
-            total = 0.0
-            for row in log_p:
-                inner = (1 - part) * row[left] + part * row[left + 1]
-                total = total + np.log(np.exp(inner) @ (_normal(g, 1) * (g[1] - g[0])) + 1e-300)
-            return total
-
-        return by_grid(priors, log_l, [150, np.log(0.05)], [280, np.log(80.0)])
-
-    inputs = [
-        Input("normal", "mu", "sigma"), Input("normal", 10.0, 0.1), Input("lognormal", 0.0, 0.05),
-    ]  # fmt: skip
-    return Instance(_problem(priors, inputs, f), y, reference, lambda values: {"error": error})
-
-
-# -- several hyperparameters -----------------------------------------------------------------------
-
-
-def _unknown_error(number: int) -> Instance:
-    seed, error = ((5, 0.05), (5, 0.3), (6, 0.3))[number]
-    rng = np.random.default_rng(seed)
-    f = lambda xp, x: [x, 0.5 * x + 0.1 * x**2, xp.sin(x)]  # noqa: E731
-    y = np.stack(f(np, rng.normal(2, 0.5, 30)), axis=1)
-    y = y + error * rng.standard_normal(y.shape)
-    priors = {"mu": normal(1.5, 1), "sigma": half_normal(1), "error": half_normal(0.5)}
-    g = np.linspace(-6, 6, 481)
-
-    def log_l(v: dict[str, Any]) -> Any:
-        total = np.zeros(len(v["mu"]))
-        x = v["mu"][:, None] + v["sigma"][:, None] * g
-        outputs = f(np, x)
-        for reading in y:
-            square = sum((r - o) ** 2 for r, o in zip(reading, outputs, strict=True))
-            inner = np.exp(-0.5 * square / v["error"][:, None] ** 2)
-            total += np.log(inner @ _normal(g, 1) + 1e-300) - 3 * np.log(v["error"])
-        return total
-
-    problem = _problem(priors, [Input("normal", "mu", "sigma")], f)
-    start = {"mu": 2.0, "sigma": 0.5, "error": error}
-    reference = partial(by_importance, priors, log_l, start)
-    return Instance(problem, y, reference, lambda values: {"error": values["error"]})
-
-
-def _correlated(number: int) -> Instance:
-    z = np.random.default_rng(5 + number).standard_normal((40, 2))
-    x = np.stack([1 + 0.2 * z[:, 0], 2 + 0.3 * (0.7 * z[:, 0] + np.sqrt(0.51) * z[:, 1])], axis=1)
-    f = lambda xp, a, b: [a * b**2, xp.exp(a) + b]  # noqa: E731
-    half = half_normal(0.5)
-    priors = {
-        "m1": normal(1.3, 0.5), "s1": half, "m2": normal(1.6, 0.5), "s2": half,
-        "rho": uniform(-1.0, 1.0),
-    }  # fmt: skip
-
-    def log_l(v: dict[str, Any]) -> Any:
-        a = (x[:, 0] - v["m1"][:, None]) / v["s1"][:, None]
-        b = (x[:, 1] - v["m2"][:, None]) / v["s2"][:, None]
-        rho = v["rho"][:, None]
-        square = (a * a - 2 * rho * a * b + b * b) / (1 - rho**2)
-        constant = np.log(v["s1"] * v["s2"]) + 0.5 * np.log1p(-(v["rho"] ** 2))
-        return -0.5 * square.sum(axis=1) - len(x) * constant
-
-    inputs = [Input("normal", "m1", "s1"), Input("normal", "m2", "s2")]
-    problem = _problem(priors, inputs, f, correlation="rho")
-    start = {"m1": 1.0, "s1": 0.2, "m2": 2.0, "s2": 0.3, "rho": 0.5}
-    observed = np.stack(f(np, *x.T), axis=1)
-    return Instance(problem, observed, partial(by_importance, priors, log_l, start))
-
-
-def _case(cell: str, make: Callable[[int], Instance], data_sets: int, **bounds: float) -> Any:
-    return cell, Case(partial(posterior_row, make, cell), data_sets, GOOD | bounds)
-
-
-def _board(name: str, size: int, data_sets: int, **bounds: float) -> Any:
-    cell = f"{name} {size}"
-    return _case(cell, partial(_scoreboard, name, size), data_sets, **bounds)
+def _board(
+    name: str, size: int, data_sets: int, seconds: float = SECONDS, **bounds: float
+) -> tuple[str, Case]:
+    make = partial(cases._scoreboard, name, size)
+    return _case(f"{name} {size}", make, data_sets, seconds, **bounds)
 
 
 _SYMMETRIC = {"mu": normal(0, 3), "sigma": half_normal(1)}
@@ -470,23 +237,45 @@ CASES: dict[str, Case] = dict(
         _board("folded", 50, 3, runs=60),
         _board("folded", 20, 3, runs=60),
         _board("frame", 20, 3, runs=60),
+        _case("growth, one dose", cases._growth_at_one_dose, 3),
+        _case("Virkler", cases._virkler, 1),
+        _case("Virkler, one error", cases._virkler_with_one_error, 1, **WIDE),
+        _case("a^2 + b", cases._square_and_known, 5),
+        _case("a^2 + b^2", cases._ring, 5),
+        _case("sqrt(a^2 + .01) + b", cases._smooth_modulus_and_known, 3),
+        _case("a^2 + b, c + b", cases._square_in_two_readings, 3),
+        _case("error of 3 %", partial(cases._known_error, 0.03), 3),
+        _case("error of 10 %", partial(cases._known_error, 0.1), 3),
+        _case("error unknown, three readings", cases._unknown_error, 3),
+        _case("mirror", partial(cases._mirror, 1.0, 0.0, _SYMMETRIC), 3, mass=0.05),
+        _case(
+            "mirror, prior to one side",
+            partial(cases._mirror, 2.0, 0.3, _TO_ONE_SIDE),
+            3,
+            mass=0.05,
+        ),
+        _case("prior in conflict", cases._conflict, 2),
+        _case("correlated inputs", cases._correlated, 3),
+        _case("beam, error of 10 %", partial(cases._beam, 0.1), 3, cpu=1.5),
+        _case("beam, error of 3 %", partial(cases._beam, 0.03), 3, cpu=1.5),
+        _case("sine of Weibull", cases._sine, 20, runs=200, mass=0.05),
+        _case("own times", cases._own_times, 5, runs=150, bias=0.15, narrowest=0.85, widest=1.15),
+        _case(
+            "two readings of three",
+            cases._panel,
+            3,
+            runs=110,
+            bias=0.15,
+            narrowest=0.87,
+            widest=1.13,
+        ),
+        _case("four readings of eight", cases._eight, 3, runs=480, bias=0.25),
+        ("log L, relative error", Case(partial(likelihood_row, True), 5, {"nats": 0.1})),
+        ("log L, additive error", Case(partial(likelihood_row, False), 5, {"nats": 0.1})),
+        ("inputs of specimens", Case(individuals_row, 7, GOOD)),
         _board("three masses, well separated", 200, 3, runs=110),
-        _board("three masses, close", 200, 3, runs=900),
-        _board("growth", 100, 3),
-        _case("a^2 + b", _square_and_known, 5),
-        _case("a^2 + b^2", _ring, 5),
-        _case("sqrt(a^2 + .01) + b", _smooth_modulus_and_known, 3),
-        _case("a^2 + b, c + b", _square_in_two_readings, 3),
-        _case("error of 3 %", partial(_known_error, 0.03), 3),
-        _case("error of 10 %", partial(_known_error, 0.1), 3),
-        _case("error unknown, three readings", _unknown_error, 3),
-        _case("mirror", partial(_mirror, 1.0, 0.0, _SYMMETRIC), 3, mass=0.05),
-        _case("mirror, prior to one side", partial(_mirror, 2.0, 0.3, _TO_ONE_SIDE), 3, mass=0.05),
-        _case("prior in conflict", _conflict, 2),
-        _case("correlated inputs", _correlated, 3),
-        _case("beam, error of 10 %", partial(_beam, 0.1), 3, cpu=1.5),
-        _case("beam, error of 3 %", partial(_beam, 0.03), 3, cpu=1.5),
-        _case("sine of Weibull", _sine, 20, runs=200, mass=0.05),
+        _board("three masses, close", 200, 3, 400.0, runs=900),
+        _board("growth", 100, 3, 600.0),
     )
 )
 
