@@ -343,8 +343,7 @@ def _growth_at_one_dose(number: int) -> Instance:
         grid = dict(zip((names[0], *names[2:]), np.meshgrid(*axes, indexing="ij"), strict=True))
         return exact.moments({n: v.ravel() for n, v in grid.items()}, weights.ravel())
 
-    given = {name: getattr(problem, name) for name in ("priors", "inputs")}
-    one = _problem(*given.values(), lambda xp, r, k: problem.formula(xp, r, k)[0])
+    one = replace(problem, formula=lambda xp, r, k: problem.formula(xp, r, k)[0], separate=False)
     return Instance(one, y[:, 0], reference)
 
 
@@ -357,7 +356,13 @@ def exact_normal(x: Any, mean: Any, sd: Any) -> Any:
 def _populations(names: Iterable[str]) -> Callable[[dict[str, Any]], tuple[Any, Any]]:
     """Return the means and standard deviations (S, d) of inputs mu0, s0, mu1, ... from values."""
     d = len(list(names)) // 2
-    return lambda v: tuple(np.stack([v[f"{n}{i}"] for i in range(d)], axis=1) for n in ("mu", "s"))
+
+    def function(v: dict[str, Any]) -> tuple[Any, Any]:
+        columns = ([v[f"{name}{i}"] for i in range(d)] for name in ("mu", "s"))
+        mean, sd = (np.stack(column, axis=1) for column in columns)
+        return mean, sd
+
+    return function
 
 
 def _panel(number: int) -> Instance:
@@ -368,7 +373,7 @@ def _panel(number: int) -> Instance:
 
     z = np.random.default_rng(12 + number).standard_normal((80, 3))
     y = np.stack(f(np, *([2.0, 1.2, 0.8] + np.array([0.25, 0.08, 0.2]) * z).T), axis=1)
-    priors = {}
+    priors: dict[str, Prior] = {}
     for i, (m, s, t) in enumerate(
         zip((2.2, 1.1, 1), (0.6, 0.2, 0.5), (0.5, 0.2, 0.5), strict=True)
     ):
@@ -614,7 +619,8 @@ def _own_times(number: int) -> Instance:
             columns = np.broadcast_arrays(*[np.asarray(x, float) for x in (ka, cl, v, dose)])
             response.runs += columns[0].size
             time = np.atleast_1d(time)
-            rows = [solved(*row, time) for row in zip(*map(np.ravel, columns), strict=True)]
+            table = np.stack(columns, axis=-1).reshape(-1, 4)
+            rows = [solved(a, b, c, d, time) for a, b, c, d in table]
             return np.reshape(rows, (*columns[0].shape, len(time)))
 
         with pm.Model() as model:
@@ -642,7 +648,7 @@ def _own_times(number: int) -> Instance:
     return Instance(problem, data["readings"], reference, build=build)
 
 
-def own_times_log_likelihood(data: dict[str, Any], v: dict[str, Any], nodes: int = 5) -> Any:
+def own_times_log_likelihood(data: dict[str, Any], v: dict[str, Any], nodes: int = 7) -> Any:
     """Return log L (S,) by adaptive Gauss-Hermite quadrature over the inputs of each subject."""
     mean = np.stack([v["log_ka"], v["log_cl"], v["log_v"]], axis=1)[:, None]
     shift = v["beta"][:, None] * np.log(data["weight"] / 70)
@@ -652,8 +658,9 @@ def own_times_log_likelihood(data: dict[str, Any], v: dict[str, Any], nodes: int
     y = data["readings"]
 
     def log_f(z: Any) -> Any:  # (S, N, 3) -> (S, N, T)
-        inputs = np.moveaxis(np.exp(np.clip(mean + sd * z, -10, 10)), -1, 0)
-        return np.log(np.maximum(concentration(*inputs, data["dose"], data["time"]), 1e-12))
+        ka, cl, volume = np.moveaxis(np.exp(np.clip(mean + sd * z, -10, 10)), -1, 0)
+        f = concentration(ka, cl, volume, data["dose"], data["time"])
+        return np.log(np.maximum(f, 1e-12))
 
     def log_density(z: Any) -> Any:
         logs = log_f(z)
