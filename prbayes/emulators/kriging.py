@@ -21,9 +21,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import comb
 from typing import Any
 
@@ -33,6 +33,11 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from prbayes._validate import IN_CACHE, Floats
+
+# Runs of a surface, whose cost grows with their cube.
+MOST_RUNS = 2000
+# Runs for the choice of lengths and degrees.
+MOST_TUNED = 256
 
 # From squared distances, which are overwritten, to the kernel and minus twice its slope.
 Kernel = Callable[[Floats], tuple[Floats, Floats]]
@@ -70,10 +75,29 @@ def quintic(square: Floats) -> tuple[Floats, Floats]:
     return np.negative(square, out=square), slope
 
 
+def cubic(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel r^3 of squared distances, and minus twice its slope."""
+    slope = np.sqrt(square)
+    square *= slope
+    slope *= -3
+    return square, slope
+
+
+def thin_plate_spline(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel r^2 log r of squared distances, and minus twice its slope."""
+    logs = np.log(np.maximum(square, 1e-300))
+    square *= 0.5 * logs
+    return square, -1 - logs
+
+
+def linear(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel -r of squared distances, and minus twice its slope; none at zero."""
+    r = np.sqrt(square)
+    return -r, np.divide(1.0, r, out=np.zeros_like(r), where=r > 1e-12)
+
+
 KERNELS: dict[str, Kernel] = {
-    "squared_exponential": squared_exponential,
-    "matern": matern,
-    "quintic": quintic,
+    f.__name__: f for f in (squared_exponential, matern, linear, thin_plate_spline, cubic, quintic)
 }
 
 
@@ -82,13 +106,15 @@ class Kriging:
     """A surface of one kernel through outputs of runs, equation (1)."""
 
     z: Floats  # (n, d): runs
+    y: Floats  # (n, m): their outputs
+    rows: NDArray[np.intp]  # (n,): indices among all runs
     kernel: str
     lengths: Floats  # (d,): units of distances
+    degree: int  # degree of the polynomial
+    nugget: float  # in units of the largest kernel
     weights: Floats  # (n, m)
     coefficients: Floats  # (terms, m)
-    degrees: NDArray[np.intp]  # (m,): degree of the polynomial of each output
-    nuggets: Floats  # (m,)
-    left_out: Floats  # (n, m): error at each run of the surface through all others
+    left_out: Floats  # error at each of all runs of the surface without the run, by output
     errors: Floats  # (m,): weighted root mean square of the left-out errors
     scales: Floats  # (m,): variance of each output in units of the kernel
 
@@ -124,45 +150,69 @@ class Kriging:
 
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances at points, (k, d) -> (k, m)."""
-        kernel, matrix = KERNELS[self.kernel], kernel_matrix(self.kernel, self.z / self.lengths)
-        unit, at_zero = np.abs(matrix).max(), kernel(np.zeros(1))[0]
-        variances = np.empty((len(z), self.weights.shape[1]))
-        for degree, nugget in sorted({*zip(self.degrees, self.nuggets, strict=True)}):
-            columns = np.flatnonzero((self.degrees == degree) & (self.nuggets == nugget))
-            polynomials = Polynomials.of(self.z, int(degree))
-            basis, root = np.linalg.qr(polynomials(self.z).T)
-            inverse = Projected.of(matrix, basis).solved(nugget * unit)
-            assert inverse is not None  # the fit has solved the same system
-            for rows, _, square in self._distances(z):
-                kernels = kernel(square)[0]  # (n, k)
-                # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
-                # polynomials determine a part B t of u; the best other part is Q (k - K B t).
-                trend = basis @ np.linalg.solve(root.T, polynomials(z[rows]))
-                rest = kernels - matrix @ trend
-                error = at_zero - (trend * (kernels + rest)).sum(axis=0)
-                error -= (rest * (inverse @ rest)).sum(axis=0)
-                variances[rows, columns] = np.maximum(error, 0)[:, None] * self.scales[columns]
-        return variances
+        system, kernel = self._system(), KERNELS[self.kernel]
+        errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
+        for rows, _, square in self._distances(z):
+            kernels = kernel(square)[0]  # (n, k)
+            # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
+            # polynomials determine a part B t of u; the best other part is Q (k - K B t).
+            trend = system.basis @ np.linalg.solve(system.root.T, self.polynomials(z[rows]))
+            rest = kernels - system.matrix @ trend
+            errors[rows] = at_zero - (trend * (kernels + rest)).sum(axis=0)
+            errors[rows] -= (rest * (system.inverse @ rest)).sum(axis=0)
+        return np.maximum(errors, 0)[:, None] * self.scales
 
-    def selected(self, columns: NDArray[np.intp]) -> Kriging:
-        """Return the surface of some outputs."""
-        degrees = self.degrees[columns]
-        terms = comb(self.z.shape[1] + int(degrees.max()), self.z.shape[1])
-        return replace(
-            self,
-            weights=self.weights[:, columns],
-            coefficients=self.coefficients[:terms, columns],
-            degrees=degrees,
-            nuggets=self.nuggets[columns],
-            left_out=self.left_out[:, columns],
-            errors=self.errors[columns],
-            scales=self.scales[columns],
-        )
+    def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
+        """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...).
+
+        A surface without runs is the one through their left-out predictions in their place.
+        """
+        system, surfaces = self._system(), []
+        for mask in masks[:, self.rows]:
+            y = self.y.copy()
+            among = system.inverse[np.ix_(mask, mask)]
+            y[mask] -= np.linalg.solve(among, (system.inverse @ y)[mask])
+            weights = system.inverse @ off_basis(system.basis, y)
+            weights[mask] = 0
+            coefficients = system.trend(y, weights)
+            surfaces.append(replace(self, weights=weights, coefficients=coefficients))
+        return surfaces
+
+    def in_units(self, unit: float) -> Kriging:
+        """Return the surface of outputs that are larger by a factor."""
+        linear: dict[str, Any] = {
+            name: getattr(self, name) * unit
+            for name in ("y", "weights", "coefficients", "left_out", "errors")
+        }
+        return replace(self, scales=self.scales * unit**2, **linear)
+
+    def joined(self, more: Kriging) -> Kriging | None:
+        """Return the surface of the outputs of both; None if their kernels or systems differ."""
+        same = ("kernel", "degree", "nugget")
+        if any(getattr(self, name) != getattr(more, name) for name in same):
+            return None
+        if not np.array_equal(self.lengths, more.lengths):
+            return None
+        by_output = ("y", "weights", "coefficients", "left_out", "errors", "scales")
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(more, name)], axis=-1)
+            for name in by_output
+        }
+        return replace(self, **parts)
+
+    def _system(self) -> System:
+        """Return the linear system of the outputs."""
+        matrix = kernel_matrix(self.kernel, self.z / self.lengths)
+        polynomials = self.polynomials(self.z)
+        system = System.of(matrix, polynomials, self.nugget)
+        if system is None:
+            raise np.linalg.LinAlgError(f"interpolation: {len(self.z)} runs are singular")
+        return system
 
     @cached_property
     def polynomials(self) -> Polynomials:
-        """The polynomials up to the largest degree."""
-        return Polynomials.of(self.z, int(self.degrees.max()))
+        """The polynomials."""
+        return Polynomials.of(self.z, self.degree)
 
     @cached_property
     def _scaled_runs(self) -> Floats:
@@ -284,6 +334,36 @@ class Polynomials:
 
 
 @dataclass(frozen=True, eq=False)
+class System:
+    """The linear system of outputs at runs."""
+
+    matrix: Floats  # (n, n): K
+    nugget: float  # in units of K
+    basis: Floats  # (n, p): B
+    root: Floats  # (p, p): B root are the polynomials at the runs
+    inverse: Floats  # (n, n): Q
+
+    @classmethod
+    def of(
+        cls, matrix: Floats, terms: Floats, nugget: float, projected: Projected | None = None
+    ) -> System | None:
+        """Solve the system of polynomials (p, n) at runs; None if it is singular to rounding.
+
+        The nugget is in units of the largest kernel.
+        """
+        basis, root = np.linalg.qr(terms.T)
+        nugget *= float(np.abs(matrix).max())
+        projected = Projected.of(matrix, basis) if projected is None else projected
+        inverse = projected.solved(nugget)
+        return None if inverse is None else cls(matrix, nugget, basis, root, inverse)
+
+    def trend(self, y: Floats, weights: Floats) -> Floats:
+        """Return the coefficients of the polynomials, (p, m)."""
+        rest = y - self.matrix @ weights - self.nugget * weights
+        return np.asarray(np.linalg.solve(self.root, self.basis.T @ rest))
+
+
+@dataclass(frozen=True, eq=False)
 class Projected:
     """A kernel matrix on the complement of polynomials, P K P + sigma B B'."""
 
@@ -334,18 +414,47 @@ def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
     return KERNELS[kernel](square)[0]
 
 
-def orthonormal(terms: Floats) -> Floats | None:
-    """Return an orthonormal basis (n, p) of polynomials at runs, (p, n); None if they depend."""
+def determine(terms: Floats) -> bool:
+    """Return whether runs determine polynomials, (p, n), and leave some to estimate an error."""
     if terms.shape[0] >= terms.shape[1]:
-        return None
-    basis, root = np.linalg.qr(terms.T)
-    sizes = np.abs(np.diag(root))
-    return basis if sizes.min() > 1e-10 * sizes.max() else None
+        return False
+    sizes = np.abs(np.diag(np.linalg.qr(terms.T, mode="r")))
+    return bool(sizes.min() > 1e-10 * sizes.max())
+
+
+def spread_of(z: Floats) -> Floats:
+    """Return the standard deviation of each input, (n, d) -> (d,), or one if it is constant."""
+    spread = z.std(axis=0)
+    return np.where(spread > 0, spread, 1.0)
+
+
+def values_of_one(surfaces: Sequence[Kriging]) -> Callable[[Floats], Floats]:
+    """Return the values of the surface of one output, (k, d) -> (k,)."""
+    if not surfaces:
+        raise np.linalg.LinAlgError("interpolation: the points determine no surface")
+    return partial(_column, surfaces[0])
+
+
+def _column(surface: Kriging, at: Floats) -> Floats:
+    return surface.values(at)[:, 0]
 
 
 def off_basis(basis: Floats, y: Floats) -> Floats:
     """Return outputs (n, ...) less their part in an orthonormal basis (n, p)."""
     return np.asarray(y - basis @ (basis.T @ y))
+
+
+def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
+    """Return at most so many runs: half are those of the largest weights, others are spread."""
+    n = len(weights)
+    if n <= most:
+        return np.arange(n)
+    order = np.argsort(-weights, kind="stable")
+    n_important = min(most // 2, int((weights > weights.mean()).sum()))
+    spread = np.linspace(n_important, n - 1, most - n_important).astype(int)
+    # In the order of the runs, so that those of equal weights are spread over a sequence.
+    rest = np.sort(order[n_important:])[spread - n_important]
+    return np.sort(np.concatenate([order[:n_important], rest]))
 
 
 def fit_kriging(
@@ -354,64 +463,60 @@ def fit_kriging(
     weights: Floats,
     kernel: str,
     lengths: Floats,
-    degrees: list[int],
-    nuggets: list[float],
-) -> Kriging | None:
-    """Return the surface with the degree and nugget of the least left-out errors of each output.
+    degrees: Sequence[int],
+    nuggets: Sequence[float],
+) -> list[Kriging]:
+    """Return a surface of each output, of the degree and nugget of the least left-out errors.
 
     Points (n, d) have outputs (n, m) of spread about one; ``weights``, (n,), of sum one, are those
-    of squared left-out errors. Nuggets are in units of the largest kernel. None if no system can be
-    solved.
+    of squared left-out errors. Nuggets are in units of the largest kernel. Of too many runs a
+    part has the surface, and the others only test it. Empty if no system can be solved.
     """
-    n, m = y.shape
+    rows = spread_rows(weights, MOST_RUNS)
+    all_z, all_y, z, y = z, y, z[rows], y[rows]
+    weights = weights[rows] / weights[rows].sum()
     matrix = kernel_matrix(kernel, z / lengths)
-    unit = float(np.abs(matrix).max())
-    largest = Polynomials.of(z, max(degrees))
-    terms = largest(z)
-    of_degrees = largest.powers.sum(axis=1)
-    least = np.full(m, np.inf)
-    solution, left_out = np.zeros((n, m)), np.zeros((n, m))
-    coefficients = np.zeros((len(terms), m))
-    chosen, chosen_nuggets, scales = np.zeros(m, dtype=np.intp), np.zeros(m), np.zeros(m)
+    best: list[Kriging | None] = [None] * y.shape[1]
+    least = np.full(y.shape[1], np.inf)
     for degree in degrees:
-        rows = terms[of_degrees <= degree]
-        basis = orthonormal(rows)
-        if basis is None:
+        terms = Polynomials.of(z, degree)(z)
+        if not determine(terms):
             continue
-        projected = Projected.of(matrix, basis)
-        contrasts = off_basis(basis, y)
+        projected = Projected.of(matrix, np.linalg.qr(terms.T)[0])
         for nugget in nuggets:
-            inverse = projected.solved(nugget * unit)
-            if inverse is None:
+            system = System.of(matrix, terms, nugget, projected)
+            if system is None:
                 continue
+            inverse, basis, contrasts = system.inverse, system.basis, off_basis(system.basis, y)
             w = inverse @ contrasts
-            # One step of iterative refinement: close runs make the matrix badly conditioned.
+            # Two steps of iterative refinement: close runs make the matrix badly conditioned.
             for _ in range(2):
-                rest = off_basis(basis, contrasts - matrix @ w - nugget * unit * w)
+                rest = off_basis(basis, contrasts - matrix @ w - system.nugget * w)
                 w += off_basis(basis, inverse @ rest)
-            unsolved = np.abs(inverse @ rest / np.diag(inverse)[:, None]).max(axis=0)
-            errors = w / np.diag(inverse)[:, None]
-            # Left-out errors are too small where the matrix is singular to rounding.
-            # Large weights have values that are rough by rounding, which roots need to be found.
-            rounding = np.finfo(float).eps * unit * np.linalg.norm(w, axis=0)
-            error = np.sqrt(weights @ errors**2) + unsolved + 100 * rounding
-            better = np.flatnonzero(error < 0.9 * least)
-            if not better.size:
-                continue
-            least[better] = error[better]
-            solution[:, better], left_out[:, better] = w[:, better], errors[:, better]
-            trend = np.linalg.lstsq(rows.T, y[:, better] - matrix @ w[:, better], rcond=None)[0]
-            coefficients[:, better] = 0
-            coefficients[: len(rows), better] = trend
-            chosen[better], chosen_nuggets[better] = degree, nugget
-            scales[better] = weights @ (errors[:, better] ** 2 * np.diag(inverse)[:, None])
-    if not np.isfinite(least).all():
-        return None
-    used = of_degrees <= chosen.max()
-    return Kriging(
-        *(z, kernel, lengths, solution, coefficients[used], chosen, chosen_nuggets),
-        *(left_out, least, scales),
-    )
+            precisions = np.diag(inverse)[:, None]
+            left_out = w / precisions
+            # Left-out errors are too small where the matrix is singular to rounding, and large
+            # weights have values that are rough by rounding, which roots need to be found.
+            unsolved = np.abs(inverse @ rest / precisions).max(axis=0)
+            size = np.finfo(float).eps * np.abs(matrix).max()
+            error = np.sqrt(weights @ left_out**2) + unsolved
+            error += 100 * size * np.linalg.norm(w, axis=0)
+            for k in np.flatnonzero(error < 0.9 * least):
+                least[k], column = error[k], slice(k, k + 1)
+                best[k] = Kriging(
+                    *(z, y[:, column], rows, kernel, lengths, degree, nugget, w[:, column]),
+                    coefficients=system.trend(y[:, column], w[:, column]),
+                    left_out=left_out[:, column],
+                    errors=error[column],
+                    scales=weights @ (left_out[:, column] ** 2 * precisions),
+                )
+    surfaces = [surface for surface in best if surface is not None]
+    if len(rows) < len(all_z):
+        for column, surface in enumerate(surfaces):
+            errors = all_y[:, [column]] - surface.values(all_z)
+            errors[rows] = surface.left_out
+            surfaces[column] = replace(surface, left_out=errors)
+    return surfaces if len(surfaces) == y.shape[1] else []
 
 
 def likeliest(
