@@ -20,7 +20,7 @@ from prbayes.emulators.surfaces import FittedSurface, Surface
 from prbayes.numerics.threads import one_thread
 
 # Surfaces that compete; a Matern process is better for kinks and jumps.
-CANDIDATES: tuple[Surface, ...] = (GaussianProcess(), RadialBasis("quintic"))
+CANDIDATES: tuple[Surface, ...] = (GaussianProcess(), RadialBasis("quintic", degree="best"))
 ROUGH_CANDIDATES: tuple[Surface, ...] = (*CANDIDATES, GaussianProcess("matern"))
 
 

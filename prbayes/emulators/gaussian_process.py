@@ -21,7 +21,7 @@ from prbayes.emulators.kriging import (
     spread_rows,
     values_of_one,
 )
-from prbayes.emulators.surfaces import Predict, Surface
+from prbayes.emulators.surfaces import Following, Predict, Surface
 
 _KERNELS = ["squared_exponential", "matern"]
 
@@ -85,9 +85,9 @@ class GaussianProcess(Surface):
         """Return the least number of points."""
         return 2
 
-    def following(self) -> Surface:
+    def following(self) -> Sequence[Surface]:
         """Return the same: with its plane it follows an input that has a great length."""
-        return self
+        return (self,) if self.lengths is None else (Following(self),)
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the mean of the process given the points."""

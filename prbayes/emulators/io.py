@@ -13,9 +13,10 @@ import xarray as xr
 
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
+from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
+from prbayes.emulators.surfaces import Polynomial, Surface
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import Outputs, outputs_of_keys
 from prbayes.response.store import StoreError, replace_files

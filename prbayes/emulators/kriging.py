@@ -502,7 +502,7 @@ def fit_kriging(
             error = np.sqrt(weights @ left_out**2) + unsolved
             error += 100 * size * np.linalg.norm(w, axis=0)
             for k in np.flatnonzero(error < 0.9 * least):
-                least[k], column = error[k], slice(k, k + 1)
+                least[k], column = error[k], [int(k)]
                 best[k] = Kriging(
                     *(z, y[:, column], rows, kernel, lengths, degree, nugget, w[:, column]),
                     coefficients=system.trend(y[:, column], w[:, column]),
@@ -512,10 +512,10 @@ def fit_kriging(
                 )
     surfaces = [surface for surface in best if surface is not None]
     if len(rows) < len(all_z):
-        for column, surface in enumerate(surfaces):
-            errors = all_y[:, [column]] - surface.values(all_z)
+        for place, surface in enumerate(surfaces):
+            errors = all_y[:, [place]] - surface.values(all_z)
             errors[rows] = surface.left_out
-            surfaces[column] = replace(surface, left_out=errors)
+            surfaces[place] = replace(surface, left_out=errors)
     return surfaces if len(surfaces) == y.shape[1] else []
 
 

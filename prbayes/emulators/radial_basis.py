@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
 from math import comb
 from typing import Any
 
@@ -35,8 +34,9 @@ class RadialBasis(Surface):
     ----------
     kernel : str
         linear, thin_plate_spline, cubic or quintic, which need no scale.
-    degree : int, optional
-        Of the polynomial; by default that of the least left-out errors.
+    degree : int or "best", optional
+        Of the polynomial; by default the lowest that the kernel needs. "best" is that of the least
+        left-out errors, with distances in units of the spread of each input.
     smoothing : float
         0 passes through the points; more smooths a response that is noisy.
 
@@ -53,14 +53,14 @@ class RadialBasis(Surface):
 
     kernel: str = "cubic"
     _: KW_ONLY
-    degree: int | None = None
+    degree: int | str | None = None
     smoothing: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kernel not in _LOWEST_DEGREE:
             kernels = list(_LOWEST_DEGREE)
             raise ValueError(f"RadialBasis: kernel: got {self.kernel!r}, expected one of {kernels}")
-        if self.degree is not None:
+        if self.degree not in (None, "best"):
             lowest = _LOWEST_DEGREE[self.kernel]
             positive_integer(self.degree, "RadialBasis: degree", minimum=lowest)
         is_number = isinstance(self.smoothing, int | float) and self.smoothing is not True
@@ -71,8 +71,13 @@ class RadialBasis(Surface):
 
     def terms(self, dimensions: int) -> int:
         """Return the number of terms of the polynomial, or of the least one."""
-        degree = _LOWEST_DEGREE[self.kernel] if self.degree is None else self.degree
+        degree = self._degree
         return comb(dimensions + degree, degree)
+
+    @property
+    def _degree(self) -> int:
+        """The degree, or the lowest of several."""
+        return self.degree if isinstance(self.degree, int) else _LOWEST_DEGREE[self.kernel]
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the surface."""
@@ -83,24 +88,26 @@ class RadialBasis(Surface):
     ) -> list[Kriging]:
         """Return the surface of each output."""
         n, d = z.shape
-        spread = spread_of(z)
-        # Units of distances matter only beside the smoothing, which is in units of the points.
-        lengths = spread / np.exp(np.log(spread).mean())
         nuggets = [1e-16, 1e-14, 1e-12, 1e-10, 1e-8]
-        if self.smoothing:
-            matrix = kernel_matrix(self.kernel, z / lengths)
-            nuggets = [self.smoothing / float(np.abs(matrix).max())]
-        lowest = _LOWEST_DEGREE[self.kernel]
-        fit = partial(fit_kriging, kernel=self.kernel, lengths=lengths)
-        # Polynomials with at most a third as many terms as runs.
-        degrees = [lowest, *(p for p in range(lowest + 1, 17) if 3 * comb(d + p, d) <= n)]
-        if self.degree is not None:
-            degrees = [self.degree]
-        rows = spread_rows(weights, MOST_TUNED)
+        if self.degree != "best":
+            lengths = np.ones(d)
+            if self.smoothing:
+                largest = np.abs(kernel_matrix(self.kernel, z)).max()
+                nuggets = [self.smoothing / float(largest)]
+            fits = (
+                fit_kriging(z, y, weights, self.kernel, lengths, [self._degree], [nugget])
+                for nugget in nuggets
+            )
+            return next(filter(None, fits), [])
+        # Polynomials with at most a third as many terms as runs. Fewer runs select among those that
+        # they determine.
+        degrees = [
+            p for p in range(self._degree, 17) if p == self._degree or 3 * comb(d + p, d) <= n
+        ]
+        rows, lengths = spread_rows(weights, MOST_TUNED), spread_of(z)
         if len(rows) < n:
-            # Fewer runs select among the degrees that they determine.
             quick = [p for p in degrees if 3 * comb(d + p, d) <= len(rows)]
             of_rows = weights[rows] / weights[rows].sum()
-            surfaces = fit(z[rows], y[rows], of_rows, degrees=quick, nuggets=nuggets)
+            surfaces = fit_kriging(z[rows], y[rows], of_rows, self.kernel, lengths, quick, nuggets)
             degrees = sorted({*(s.degree for s in surfaces), *(set(degrees) - set(quick))})
-        return fit(z, y, weights, degrees=degrees or [lowest], nuggets=nuggets)
+        return fit_kriging(z, y, weights, self.kernel, lengths, degrees or [self._degree], nuggets)

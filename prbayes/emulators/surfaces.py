@@ -125,9 +125,9 @@ class Surface(ABC):
             fold[rows] = True
         return [Refitted(self, z, y[:, [k]], folds, weights) for k in range(y.shape[1])]
 
-    def following(self) -> Surface:
-        """Return a surface that follows its last input by a constant factor."""
-        return Following(self)
+    def following(self) -> Sequence[Surface]:
+        """Return the surfaces to try if the last input is a coarse response."""
+        return self, Following(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from typing import Any, cast
 
@@ -26,22 +26,13 @@ from prbayes._validate import (
     seed_number,
     share,
 )
+from prbayes.emulators.emulator import ROUGH_CANDIDATES
+from prbayes.emulators.following import FollowingEmulator, fit_follower, fit_following
 from prbayes.emulators.io import read, write
+from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
-from prbayes.emulators.selection import (
-    CANDIDATES,
-    CrossValidation,
-    cross_validated,
-    points_needed,
-)
-from prbayes.emulators.surfaces import (
-    MultifidelityModel,
-    Predict,
-    RadialBasis,
-    Surface,
-    fit_multifidelity,
-    fitted,
-)
+from prbayes.emulators.selection import CrossValidation, points_needed
+from prbayes.emulators.surfaces import Following, Surface, as_surface
 from prbayes.emulators.table import Table, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
@@ -65,8 +56,9 @@ class FittedSurface:
     domain: Ranges
     unit: Floats  # (n, d): the design in the unit cube
     usable: NDArray[np.bool_]  # (n,): which runs have only finite outputs
-    surface: Any  # fitted in the unit cube
-    coarse: Callable[..., Any] | None
+    event: tuple[int, ...]  # shape of a response
+    emulator: FollowingEmulator  # fitted in the unit cube
+    coarse: Callable[..., Any] | None  # the coarse response that it follows
 
     @classmethod
     def of(
@@ -75,30 +67,41 @@ class FittedSurface:
         domain: Ranges,
         points: Floats,
         responses: Floats,
-        coarse: Callable[..., Any] | None,
+        coarse: Callable[..., Any] | None = None,
+        coarse_values: Floats | None = None,
         *,
-        joined: bool,
+        joined: bool | None = None,
+        seed: int = 0,
     ) -> FittedSurface:
-        """Fit a surface to runs; ``joined`` makes the coarse response one of its inputs."""
+        """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller.
+
+        If it is given, ``joined`` states whether the coarse response is an input of the surface.
+        """
         unit, usable = domain.scaled(points), _usable(responses)
-        x, y = unit[usable], responses[usable]
-        surface: Any
-        if y.ndim > 1:
-            surface = partial(_outputs, [fitted(model, x, output) for output in y.T])
-        elif coarse is None:
-            surface = fitted(model, x, y)
+        x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
+        model = as_surface(model)
+        of_usable = None if coarse_values is None else coarse_values[usable]
+        if of_usable is None or joined is None:
+            columns = None if of_usable is None else of_usable[:, None]
+            emulator = fit_following(x, y, columns, tried=[model], seed=seed)
         else:
-            following = MultifidelityModel(model, model, joined)
-            coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
-            surface = fit_multifidelity(following, x, y, coarse_values)
-        return cls(domain, unit, usable, surface, coarse)
+            tried = [model if joined else Following(model)]
+            equal = np.ones(len(x))
+            follower = fit_follower(x, y[:, 0], of_usable, equal, tried=tried, seed=seed)
+            alone = fit_following(x, y, tried=[model], seed=seed).alone
+            emulator = FollowingEmulator(alone, (follower,))
+        is_followed = any(follower is not None for follower in emulator.following)
+        return cls(
+            *(domain, unit, usable, responses.shape[1:], emulator),
+            coarse if is_followed else None,
+        )
 
     def __call__(self, columns: Floats) -> Floats:
         """Return values at rows inside the ranges, (n,) or (n, m)."""
         # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
         if self.coarse is None:
-            return np.asarray(self.surface(unit))
+            return self.emulator.values(unit).reshape(-1, *self.event)
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
         n_lost = (~np.isfinite(coarse)).sum()
         if n_lost:
@@ -110,12 +113,24 @@ class FittedSurface:
                     "many.",
                 )
             )
-        return np.asarray(self.surface(unit, coarse))
+        return self.emulator.values(unit, coarse[:, None])[:, 0]
+
+    @property
+    def left_out(self) -> Floats:
+        """Left-out errors, (n,) or (n, m); NaN without a response."""
+        left_out = np.full((len(self.usable), *self.event), np.nan)
+        left_out[self.usable] = self.emulator.left_out.reshape(-1, *self.event)
+        return left_out
 
     @property
     def joined(self) -> bool | None:
         """Whether a coarse response is an input of the surface; None if it follows none."""
-        return None if self.coarse is None else self.surface.scaling is not None
+        if self.coarse is None:
+            return None
+        (follower,) = self.emulator.following
+        assert follower is not None  # since there is a coarse response
+        (surface,) = follower.emulator.surfaces
+        return not isinstance(getattr(surface, "model", None), Following)
 
     def probes(self) -> Floats:
         """Return values at 64 fixed points, which identify the surface."""
@@ -327,25 +342,21 @@ class Surrogate(Shown):
             responses = respond(settings, runs, tally)
             if tally.computed >= n:  # stored runs are checked as they are read
                 refuse_other_runs(settings, runs, responses, tally)
-        usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
-        # Estimate the error, then fit the surface.
-        x, y = domain.scaled(design)[usable], responses[usable]
-        coarse_values = None if coarse_values is None else coarse_values[usable]
-        residuals = np.full(responses.shape, np.nan)
-        residuals[usable], joined = _best(model, x, y, coarse_values, seed)
-        if coarse is not None and joined is None:
-            coarse = None
+        # Fit the surface, and estimate its error.
+        surface = FittedSurface.of(
+            model, domain, design, responses, coarse, coarse_values, seed=seed
+        )
+        if coarse is not None and surface.coarse is None:
             _log.info("%s: the coarse response does not improve the fit, and is not used", name)
+        residuals = surface.left_out
         surrogate = cls(
             *(domain, design, responses, model, outside, tally.computed),
-            error=CrossValidation(residuals, _spread(y)),
-            coarse=coarse,
+            error=CrossValidation(residuals, _spread(responses[surface.usable])),
+            coarse=surface.coarse,
             _named=tally.named,
-            _surface=FittedSurface.of(
-                model, domain, design, responses, coarse, joined=bool(joined)
-            ),
+            _surface=surface,
         )
         if predictive is not None:
             values = surrogate._at(predictive)
@@ -409,26 +420,25 @@ class Surrogate(Shown):
         outside = Replace() if outside is None else outside
         domain, design, values = table.domain, table.points, table.responses
         seed = seed_number(random_seed, f"{name}: random_seed")
-        # Splines are better where responses of scattered runs differ by powers of ten.
-        models = (*CANDIDATES, RadialBasis("quintic")) if model is None else (model,)
+        models = ROUGH_CANDIDATES if model is None else (model,)
         for candidate in models:
             refuse_wrong_surface(name, candidate, outside)
-        usable = _usable(values)
-        _refuse_unfit(name, values, max(points_needed(m, design.shape[1]) for m in models))
-        x, y = domain.scaled(design)[usable], values[usable]
-        spread = _spread(y)
+        # A kind of surface that has too few runs is left out of several.
+        needed = [points_needed(m, design.shape[1]) for m in models]
+        _refuse_unfit(name, values, min(needed))
+        n_usable = _usable(values).sum()
+        models = tuple(m for m, n in zip(models, needed, strict=True) if n <= n_usable)
+        surfaces = [FittedSurface.of(m, domain, design, values, seed=seed) for m in models]
+        spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
-        left_out = [cross_validated(candidate, x, y, seed) for candidate in models]
         # The largest residuals are those of the most extreme runs.
-        errors = [np.quantile(np.abs(r / unit), 0.9, axis=0).sum() for r in left_out]
+        errors = [np.nanquantile(np.abs(s.left_out / unit), 0.9, axis=0).sum() for s in surfaces]
         best = int(np.argmin(errors))
-        residuals = np.full(values.shape, np.nan)
-        residuals[usable] = left_out[best]
         return cls(
             *(domain, design, values, models[best], outside, 0),
-            error=CrossValidation(residuals, spread),
+            error=CrossValidation(surfaces[best].left_out, spread),
             _named=table.labels,
-            _surface=FittedSurface.of(models[best], domain, design, values, None, joined=False),
+            _surface=surfaces[best],
         )
 
     @property
@@ -502,8 +512,7 @@ class Surrogate(Shown):
             once = f"{text}; they give {replacement}; this warning appears once."
             report(Finding("outside-ranges", once), level=level)
             self._warned[:] = [True]
-        values = values.reshape((*batch, *event))
-        return values if self._named is None else self._named.by_key(values)
+        return self._labelled(values, batch)
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
         """Return the root mean square of the cross-validation residuals nearby.
@@ -606,7 +615,10 @@ class Surrogate(Shown):
         responses = fields["responses"]
         surface = FittedSurface.of(
             *(model, fields["domain"], fields["points"], responses, coarse),
-            joined=bool(saved.joined),
+            None
+            if coarse is None
+            else _coarse_at("Surrogate.load", coarse, fields["domain"], fields["points"]),
+            joined=saved.joined,
         )
         spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
@@ -620,6 +632,11 @@ class Surrogate(Shown):
                 f"settings (and a fixed random seed){and_coarse}"
             )
         return cls(**fields, model=model, coarse=coarse, _surface=surface)
+
+    def _labelled(self, values: Floats, batch: tuple[int, ...]) -> Any:
+        """Return values of rows in the shape of a batch, with the labels of the outputs."""
+        values = values.reshape((*batch, *self.responses.shape[1:]))
+        return values if self._named is None else self._named.by_key(values)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
@@ -666,11 +683,6 @@ def _spread(values: Floats) -> Any:
     """Return the standard deviation of responses, a number or one for each output."""
     sd = values.std(axis=0)
     return float(sd) if sd.ndim == 0 else sd
-
-
-def _outputs(surfaces: Sequence[Predict], at: Floats) -> Floats:
-    """Return the values of the surfaces of several outputs, (k, m)."""
-    return np.stack([surface(at) for surface in surfaces], axis=-1)
 
 
 def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
@@ -733,27 +745,6 @@ def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns
             "of the same inputs; repair it, or leave coarse= out"
         )
     return values
-
-
-def _best(
-    model: Any, x: Floats, y: Floats, coarse: Floats | None, seed: int
-) -> tuple[Floats, bool | None]:
-    """Return the least cross-validated residuals, and how a coarse response is followed for them.
-
-    None if it is not followed; else whether it is also an input of the surface.
-    """
-    least = cross_validated(model, x, y, seed)
-    choice = None
-    if coarse is None:
-        return least, choice
-    n = int(np.isfinite(coarse).sum())
-    for joined in (False, True):
-        if n < points_needed(model, x.shape[1] + joined):
-            continue
-        residuals = cross_validated(MultifidelityModel(model, model, joined), x, y, seed, coarse)
-        if (residuals**2).sum() < (least**2).sum():
-            least, choice = residuals, joined
-    return least, choice
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.continued import Continued, LeftOut
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.fibre_points import fibre_points
@@ -57,13 +57,13 @@ class OfTables:
     of_conditions: float  # one for values of conditions, zero for their errors
 
     @classmethod
-    def of(cls, likelihood: SpecimenLikelihood, kind: Callable[[Runs], Any]) -> OfTables:
+    def of(cls, likelihood: SpecimenLikelihood, function: Callable[..., Any]) -> OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:
-            function, outputs = kind(_table(m)), m.responses.outputs
-            responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
-        is_error = kind is LeftOut
+            of_table, outputs = partial(function, _table(m)), m.responses.outputs
+            responses.append(Responses(m.name, of_table, m.responses.inputs, outputs=outputs))
+        is_error = function is left_out_nearby
         return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
 
     def __call__(self, z: Floats) -> Floats:
@@ -100,7 +100,7 @@ def points_of_tables(
             likely = likely_roots(roots, emulation.box)
             inside = likely[_is_inside(likely, ranges)]
             if len(inside) >= 4:
-                error = _error(problem, OfTables.of(likelihood, LeftOut)(inside))
+                error = _error(problem, OfTables.of(likelihood, left_out_nearby)(inside))
                 emulation = replace(emulation, error=error)
                 roots = specimen_roots(emulation, readings, options)
         roots = all_roots(emulation, readings, options, roots, problem.seed)
@@ -151,7 +151,7 @@ def _with_bias(
     rows = np.isfinite(jacobian).all(axis=(1, 2))  # not beside failed runs
     if rows.sum() < 2:
         return replace(emulation, bias=0.0)
-    misfit = OfTables.of(likelihood, LeftOut)(inside[rows])
+    misfit = OfTables.of(likelihood, left_out_nearby)(inside[rows])
     bias = shift_by_misfit(problem, emulation.error, misfit, jacobian[rows], inside[rows])
     # The error of the comparison, if it is too large, narrows the population by half its share of
     # the variance. Beside a turning point its linear form for each root would be far too large.
@@ -191,10 +191,10 @@ def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple
     z = np.unique(np.concatenate(runs), axis=0)
     z = z[np.isfinite(z).all(axis=1)]
     y = problem.run(z)
-    residuals = OfTables.of(likelihood, LeftOut)(z[near_readings(y, problem.readings)])
+    residuals = OfTables.of(likelihood, left_out_nearby)(z[near_readings(y, problem.readings)])
     error = _error(problem, residuals)
     # The noise of a process in double precision is far below its change over a thousandth.
-    surface = DifferencedResponse(OfTables.of(likelihood, Continued), step=1e-3)
+    surface = DifferencedResponse(OfTables.of(likelihood, continued), step=1e-3)
     whole = np.stack([np.full(len(low), -np.inf), np.full(len(low), np.inf)])
     return Emulation(z, y, box, surface, error, np.inf, whole), ranges
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.emulators.emulator import Emulator as Interpolant
+from prbayes.emulators.emulator import fit_emulator as fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError

@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.emulators.continued import Continued, LeftOut
 from prbayes.numerics.points import sobol
 
 X = np.array([0.0, 1.0]) + sobol(48, 2, 1)
