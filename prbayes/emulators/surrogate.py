@@ -512,7 +512,7 @@ class Surrogate(Shown):
             once = f"{text}; they give {replacement}; this warning appears once."
             report(Finding("outside-ranges", once), level=level)
             self._warned[:] = [True]
-        return self._labelled(values, batch)
+        return labelled(self, values, batch)
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
         """Return the root mean square of the cross-validation residuals nearby.
@@ -633,11 +633,6 @@ class Surrogate(Shown):
             )
         return cls(**fields, model=model, coarse=coarse, _surface=surface)
 
-    def _labelled(self, values: Floats, batch: tuple[int, ...]) -> Any:
-        """Return values of rows in the shape of a batch, with the labels of the outputs."""
-        values = values.reshape((*batch, *self.responses.shape[1:]))
-        return values if self._named is None else self._named.by_key(values)
-
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
@@ -656,6 +651,12 @@ class Surrogate(Shown):
             is_failed = ~self._surface.usable[nearest]
             values[is_failed] = self.responses[nearest[is_failed]]
         return values
+
+
+def labelled(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
+    """Return values of rows in the shape of a batch, with the labels of the outputs."""
+    values = values.reshape((*batch, *surrogate.responses.shape[1:]))
+    return values if surrogate._named is None else surrogate._named.by_key(values)
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:

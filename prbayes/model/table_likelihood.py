@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -61,8 +60,12 @@ class OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:
-            of_table, outputs = partial(function, _table(m)), m.responses.outputs
-            responses.append(Responses(m.name, of_table, m.responses.inputs, outputs=outputs))
+            table, inputs, outputs = _table(m), m.responses.inputs, m.responses.outputs
+
+            def of_table(*values: Any, table: Runs = table) -> Any:
+                return function(table, *values)
+
+            responses.append(Responses(m.name, of_table, inputs, outputs=outputs))
         is_error = function is left_out_nearby
         return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
 
