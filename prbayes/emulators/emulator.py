@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +38,8 @@ class Emulator:
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
-        values = np.empty((len(z), len(self.surfaces)))
-        jacobian = np.empty((*values.shape, z.shape[1]))
-        for columns, surface in self._parts:
-            values[:, columns], jacobian[:, columns] = surface(z)
+        columns, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
+        values, jacobian = np.stack(columns, axis=1), np.stack(slopes, axis=1)
         if self.components is not None:
             values = values @ self.components
             jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
@@ -51,18 +47,14 @@ class Emulator:
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m)."""
-        values = np.empty((len(z), len(self.surfaces)))
-        for columns, surface in self._parts:
-            values[:, columns] = surface.values(z)
+        values = np.stack([surface.values(z) for surface in self.surfaces], axis=1)
         if self.components is not None:
             values = values @ self.components
         return np.asarray(self.center + self.unit * values)
 
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances at points, (k, d) -> (k, m), in squared units of outputs."""
-        variances = np.empty((len(z), len(self.surfaces)))
-        for columns, surface in self._parts:
-            variances[:, columns] = surface.variance(z)
+        variances = np.stack([surface.variance(z) for surface in self.surfaces], axis=1)
         if self.components is not None:
             variances = variances @ self.components**2
         return np.asarray(self.unit**2 * variances)
@@ -71,20 +63,6 @@ class Emulator:
         """Return emulators with the same settings that lack some runs each, (B, n)."""
         parts = zip(*(surface.without_each(masks) for surface in self.surfaces), strict=True)
         return [replace(self, surfaces=surfaces) for surfaces in parts]
-
-    @cached_property
-    def _parts(self) -> list[tuple[list[int], Any]]:
-        """Surfaces with their columns; those of the same system are one."""
-        parts: list[tuple[list[int], Any]] = []
-        for k, surface in enumerate(self.surfaces):
-            for place, (columns, part) in enumerate(parts):
-                joined = part.joined(surface) if type(part) is type(surface) else None
-                if joined is not None:
-                    parts[place] = ([*columns, k], joined)
-                    break
-            else:
-                parts.append(([k], surface))
-        return parts
 
 
 @one_thread()
@@ -134,48 +112,34 @@ def fit_emulator(
     is_constant = unit <= 1e-14 * np.abs(y).max(axis=0)
     center, unit = np.where(is_constant, y[0], center), np.where(is_constant, 1.0, unit)
     scaled = np.where(is_constant, 0.0, (y - center) / unit)
-    components, scores, at_once = None, scaled, 6
-    if y.shape[1] > at_once:
+    components, scores = None, scaled.T
+    if y.shape[1] > 6:
         u, sizes, components = np.linalg.svd(scaled, full_matrices=False)
-        scores = u * sizes
-    units = np.sqrt((scores**2).mean(axis=0))
-    units[units == 0] = 1.0
+        # Scores and components of unit spread, as the outputs.
+        scores, components = np.sqrt(n) * u.T, (sizes / np.sqrt(n))[:, None] * components
     surfaces: list[FittedSurface] = []
     left_out, rest = np.zeros_like(y), scaled
-    for first in range(0, scores.shape[1], at_once):
-        columns = slice(first, first + at_once)
-        earlier = () if start is None else start.surfaces[columns]
-        fits = [
-            surface.fit(z, scores[:, columns] / units[columns], weights, earlier, seed)
-            for surface in tried
-        ]
-        fits = [fit for fit in fits if fit]
-        if not fits:
+    for k, output in enumerate(scores):
+        earlier = start.surfaces[k] if start is not None and k < len(start.surfaces) else None
+        fits = [surface.fit(z, output, weights, earlier, seed) for surface in tried]
+        solved = [fit for fit in fits if fit is not None]
+        if not solved:
             raise np.linalg.LinAlgError(
                 f"interpolation: got {n} points that determine no surface of {z.shape[1]} inputs"
             )
-        best = [
-            # A surface alone needs no left-out errors.
-            same[0] if len(same) == 1 else min(same, key=lambda fit: float(fit.errors[0]))
-            for same in zip(*fits, strict=True)
-        ]
-        surfaces += [fit.in_units(u) for fit, u in zip(best, units[columns], strict=True)]
+        # A surface alone needs no left-out errors to be selected.
+        best = min(solved, key=lambda fit: fit.error) if len(solved) > 1 else solved[0]
+        surfaces.append(best)
         if components is None:
+            left_out[:, k] = best.left_out
             continue
         # Further components do not matter if what they add is far below the left-out errors.
-        rest = rest - scores[:, columns] @ components[columns]
-        left_out += by_output(surfaces[columns]) @ components[columns]
+        rest = rest - output[:, None] * components[k]
+        left_out += best.left_out[:, None] * components[k]
         error = np.sqrt(weights @ left_out**2)
         if (np.sqrt((rest**2).mean(axis=0)) <= np.maximum(1e-6, 0.03 * error)).all():
+            components = components[: k + 1]
             break
-    if components is None:
-        left_out = by_output(surfaces)
-    else:
-        components = components[: len(surfaces)]
+    if components is not None:
         left_out += rest
     return Emulator(z, unit * left_out, center, unit, components, tuple(surfaces))
-
-
-def by_output(surfaces: Sequence[FittedSurface]) -> Floats:
-    """Return the left-out errors of surfaces, (n, m)."""
-    return np.concatenate([surface.left_out for surface in surfaces], axis=1)

@@ -106,7 +106,12 @@ def fit_following(
         if follower is not None:
             weights_of_rows = weights[follower.rows]
             error = weights_of_rows @ follower.emulator.left_out[:, 0] ** 2
-            if error >= weights_of_rows @ alone.left_out[follower.rows, k] ** 2:
+            # By more than rounding and luck.
+            alone_error = weights_of_rows @ alone.left_out[follower.rows, k] ** 2
+            if (
+                error > 0.9 * alone_error
+                or alone_error < 1e-18 * weights_of_rows.sum() * y[:, k].var()
+            ):
                 follower = None
         following.append(follower)
     return FollowingEmulator(alone, tuple(following))

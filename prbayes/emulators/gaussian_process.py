@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,18 +17,16 @@ from prbayes.emulators.kriging import (
     determine,
     fit_kriging,
     likeliest,
-    off_basis,
     spread_of,
     spread_rows,
-    values_of_one,
 )
-from prbayes.emulators.surfaces import Following, Predict, Surface
+from prbayes.emulators.surfaces import Following, KernelSurface, Surface
 
 _KERNELS = ["squared_exponential", "matern"]
 
 
 @dataclass(frozen=True)
-class GaussianProcess(Surface):
+class GaussianProcess(KernelSurface):
     """A Gaussian process around a plane, with a length for each input and a nugget.
 
     Lengths and nugget maximise the likelihood, profiled over the variance and the plane. The plane
@@ -89,14 +88,10 @@ class GaussianProcess(Surface):
         """Return the same: with its plane it follows an input that has a great length."""
         return (self,) if self.lengths is None else (Following(self),)
 
-    def through(self, x: Floats, y: Floats) -> Predict:
-        """Return the mean of the process given the points."""
-        return values_of_one(self.fit(x, y[:, None], np.full(len(x), 1 / len(x))))
-
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Sequence[Any] = (), seed: int = 0
-    ) -> list[Kriging]:
-        """Return the process of each output; none if the matrix of one is singular."""
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+    ) -> Kriging | None:
+        """Return the process given the runs; None if its matrix is singular."""
         n, d = z.shape
         if self.lengths is not None and len(self.lengths) != d:
             raise ValueError(
@@ -104,25 +99,21 @@ class GaussianProcess(Surface):
                 f"{d} inputs"
             )
         degree = 1 if n >= 2 * (d + 1) and determine(Polynomials.of(z, 1)(z)) else 0
-        rows = spread_rows(weights, MOST_TUNED)
-        basis = np.linalg.qr(Polynomials.of(z[rows], degree)(z[rows]).T)[0]
-        center, spread = z.mean(axis=0), spread_of(z)
-        surfaces = []
-        for k, output in enumerate(y.T):
-            if self.lengths is not None and self.nugget is not None:
-                lengths = np.array(self.lengths)
-                nuggets = [self.nugget, *(x for x in (1e-13, 1e-11, 1e-9) if x > self.nugget)][:3]
-            else:
-                lengths, nugget = 2 * np.sqrt(d) * spread, 1e-9
-                contrasts = off_basis(basis, output[rows])
-                if np.sqrt((contrasts**2).mean()) > 1e-12 * np.abs(output).max():
-                    first = None
-                    if k < len(start) and getattr(start[k], "kernel", "") == self.kernel:
-                        first = np.log([*(start[k].lengths / spread), 1e-7])
-                    x = (z[rows] - center) / spread
-                    *logs, log_nugget = likeliest(self.kernel, x, output[rows], basis, first)
-                    lengths, nugget = np.exp(logs) * spread, float(np.exp(log_nugget))
-                numerical = [1e-13, 1e-11, 1e-9] if n <= 512 else [1e-10]
-                nuggets = sorted({*numerical, nugget})
-            surfaces += fit_kriging(z, y[:, [k]], weights, self.kernel, lengths, [degree], nuggets)
-        return surfaces if len(surfaces) == y.shape[1] else []
+        fit = partial(fit_kriging, z, y, weights, self.kernel, degrees=[degree])
+        if self.lengths is not None and self.nugget is not None:
+            # Larger nuggets where the matrix is singular with this one.
+            nuggets = [self.nugget, *(x for x in (1e-13, 1e-11, 1e-9) if x > self.nugget)]
+            fits = (fit(np.array(self.lengths), nuggets=[nugget]) for nugget in nuggets)
+            return next((surface for surface in fits if surface is not None), None)
+        rows, spread = spread_rows(weights, MOST_TUNED), spread_of(z)
+        terms = Polynomials.of(z[rows], degree)(z[rows])
+        plane = np.linalg.lstsq(terms.T, y[rows], rcond=None)[0]
+        if np.sqrt(((y[rows] - plane @ terms) ** 2).mean()) <= 1e-12 * np.abs(y).max():
+            return fit(2 * np.sqrt(d) * spread, nuggets=[1e-9])
+        first = None
+        if getattr(start, "kernel", "") == self.kernel:
+            first = np.log([*(start.lengths / spread), 1e-7])
+        x = (z[rows] - z.mean(axis=0)) / spread
+        *lengths, nugget = np.exp(likeliest(self.kernel, x, y[rows], terms, first)).tolist()
+        numerical = [1e-13, 1e-11, 1e-9] if n <= 512 else [1e-10]
+        return fit(spread * lengths, nuggets=sorted({*numerical, nugget}))

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from math import comb
 from typing import Any
 
@@ -103,111 +103,90 @@ KERNELS: dict[str, Kernel] = {
 
 @dataclass(frozen=True, eq=False)
 class Kriging:
-    """A surface of one kernel through outputs of runs, equation (1)."""
+    """A surface of one kernel through an output of runs, equation (1)."""
 
     z: Floats  # (n, d): runs
-    y: Floats  # (n, m): their outputs
+    y: Floats  # (n,): their outputs
     rows: NDArray[np.intp]  # (n,): indices among all runs
     kernel: str
     lengths: Floats  # (d,): units of distances
     degree: int  # degree of the polynomial
     nugget: float  # in units of the largest kernel
-    weights: Floats  # (n, m)
-    coefficients: Floats  # (terms, m)
-    left_out: Floats  # error at each of all runs of the surface without the run, by output
-    errors: Floats  # (m,): weighted root mean square of the left-out errors
-    scales: Floats  # (m,): variance of each output in units of the kernel
+    weights: Floats  # (n,)
+    coefficients: Floats  # (terms,)
+    left_out: Floats  # error at each of all runs of the surface without the run
+    error: float  # weighted root mean square of the left-out errors
+    scale: float  # variance of the output in units of the kernel
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
-        m, d = self.weights.shape[1], self.z.shape[1]
+        """Return values and Jacobian at points, (k, d) -> (k,), (k, d)."""
         if self._on_line is not None:
-            return self.values(z), self._slopes_on_line(z)[..., None]
+            series = self._on_line[1]
+            polynomials = self.polynomials
+            slopes = legval(polynomials.scaled(z)[0], legder(series)) / polynomials.half_width
+            return self.values(z), (self._on_line[0](z[:, 0], 1) + slopes)[:, None]
         kernel, runs = KERNELS[self.kernel], self._scaled_runs
-        values, jacobian = np.empty((len(z), m)), np.empty((len(z), m, d))
-        moments = [self.weights, *(column[:, None] * self.weights for column in runs.T)]
-        factors = np.concatenate(moments, axis=1).T
+        values, jacobian = np.empty(len(z)), np.empty(z.shape)
+        factors = np.concatenate([self.weights[None], self.weights * runs.T])
         for rows, points, square in self._distances(z):
             value, slope = kernel(square)
-            steepness, *by_axis = (factors @ slope).reshape(d + 1, m, -1)
-            values[rows] = (steepness if value is slope else self.weights.T @ value).T
-            for a, length in enumerate(self.lengths):
-                jacobian[rows, :, a] = ((by_axis[a] - points[a] * steepness) / length).T
-            self._add_polynomial(z[rows], values[rows], jacobian[rows])
+            steepness, *by_axis = factors @ slope
+            values[rows] = steepness if value is slope else self.weights @ value
+            jacobian[rows] = ((by_axis - points * steepness) / self.lengths[:, None]).T
+            single = self.polynomials.by_input(z[rows])
+            values[rows] += self.coefficients @ self.polynomials.terms(single)
+            self._add_slopes(single, jacobian[rows])
         return values, jacobian
 
     def values(self, z: Floats) -> Floats:
-        """Return values at points, (k, d) -> (k, m)."""
+        """Return values at points, (k, d) -> (k,)."""
         if self._on_line is not None:
             radial, series = self._on_line
-            return np.asarray(radial(z[:, 0]) + legval(self.polynomials.scaled(z)[0], series).T)
-        kernel = KERNELS[self.kernel]
-        values = np.empty((len(z), self.weights.shape[1]))
+            return np.asarray(radial(z[:, 0]) + legval(self.polynomials.scaled(z)[0], series))
+        kernel, values = KERNELS[self.kernel], np.empty(len(z))
         for rows, _, square in self._distances(z):
-            values[rows] = (self.weights.T @ kernel(square)[0]).T
-            self._add_polynomial(z[rows], values[rows], None)
+            values[rows] = self.weights @ kernel(square)[0]
+            values[rows] += self.coefficients @ self.polynomials(z[rows])
         return values
 
     def variance(self, z: Floats) -> Floats:
-        """Return predictive variances at points, (k, d) -> (k, m)."""
-        system, kernel = self._system(), KERNELS[self.kernel]
+        """Return predictive variances at points, (k, d) -> (k,)."""
+        system, kernel = self._system, KERNELS[self.kernel]
+        inverse = system.solved(self.nugget)
+        assert inverse is not None  # since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
         for rows, _, square in self._distances(z):
             kernels = kernel(square)[0]  # (n, k)
             # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
             # polynomials determine a part B t of u; the best other part is Q (k - K B t).
             trend = system.basis @ np.linalg.solve(system.root.T, self.polynomials(z[rows]))
-            rest = kernels - system.matrix @ trend
+            rest = kernels - system.kernels @ trend
             errors[rows] = at_zero - (trend * (kernels + rest)).sum(axis=0)
-            errors[rows] -= (rest * (system.inverse @ rest)).sum(axis=0)
-        return np.maximum(errors, 0)[:, None] * self.scales
+            errors[rows] -= (rest * (inverse @ rest)).sum(axis=0)
+        return np.maximum(errors, 0) * self.scale
 
     def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
         """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...).
 
         A surface without runs is the one through their left-out predictions in their place.
         """
-        system, surfaces = self._system(), []
+        system, surfaces = self._system, []
+        inverse = system.solved(self.nugget)
+        assert inverse is not None  # since the fit has solved the same system
         for mask in masks[:, self.rows]:
             y = self.y.copy()
-            among = system.inverse[np.ix_(mask, mask)]
-            y[mask] -= np.linalg.solve(among, (system.inverse @ y)[mask])
-            weights = system.inverse @ off_basis(system.basis, y)
+            y[mask] -= np.linalg.solve(inverse[np.ix_(mask, mask)], (inverse @ y)[mask])
+            weights = inverse @ system.contrasts(y)
             weights[mask] = 0
             coefficients = system.trend(y, weights)
             surfaces.append(replace(self, weights=weights, coefficients=coefficients))
         return surfaces
 
-    def in_units(self, unit: float) -> Kriging:
-        """Return the surface of outputs that are larger by a factor."""
-        linear: dict[str, Any] = {
-            name: getattr(self, name) * unit
-            for name in ("y", "weights", "coefficients", "left_out", "errors")
-        }
-        return replace(self, scales=self.scales * unit**2, **linear)
-
-    def joined(self, more: Kriging) -> Kriging | None:
-        """Return the surface of the outputs of both; None if their kernels or systems differ."""
-        same = ("kernel", "degree", "nugget")
-        if any(getattr(self, name) != getattr(more, name) for name in same):
-            return None
-        if not np.array_equal(self.lengths, more.lengths):
-            return None
-        by_output = ("y", "weights", "coefficients", "left_out", "errors", "scales")
-        parts: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), getattr(more, name)], axis=-1)
-            for name in by_output
-        }
-        return replace(self, **parts)
-
+    @property
     def _system(self) -> System:
-        """Return the linear system of the outputs."""
+        """The linear system of the output."""
         matrix = kernel_matrix(self.kernel, self.z / self.lengths)
-        polynomials = self.polynomials(self.z)
-        system = System.of(matrix, polynomials, self.nugget)
-        if system is None:
-            raise np.linalg.LinAlgError(f"interpolation: {len(self.z)} runs are singular")
-        return system
+        return System.of(matrix, *np.linalg.qr(self.polynomials(self.z).T))
 
     @cached_property
     def polynomials(self) -> Polynomials:
@@ -230,37 +209,25 @@ class Kriging:
         from scipy.interpolate import PPoly  # takes long to import
 
         order = np.argsort(self.z[:, 0])
-        runs, weights = self.z[order, 0], self.weights[order] / self.lengths**5
+        runs, weights = self.z[order, 0], self.weights[order] / self.lengths[0] ** 5
         ends = np.concatenate([runs[:1] - 1, runs, runs[-1:] + 1])
         distances = ends[:-1, None] - runs
         side = np.where(distances < 0, -1.0, 1.0)
         pieces = [-comb(5, p) * (side * distances**p) @ weights for p in range(6)]
         return PPoly(np.stack(pieces), ends), self.coefficients
 
-    def _slopes_on_line(self, z: Floats) -> Floats:
-        """Return derivatives at points of one input, (k, 1) -> (k, m)."""
-        assert self._on_line is not None
-        radial, series = self._on_line
+    def _add_slopes(self, single: Floats, jacobian: Floats) -> None:
+        """Add the polynomial's slopes to a Jacobian, (k, d), from the polynomials of each input."""
         polynomials = self.polynomials
-        slopes = legval(polynomials.scaled(z)[0], legder(series)).T / polynomials.half_width
-        return np.asarray(radial(z[:, 0], 1) + slopes)
-
-    def _add_polynomial(self, z: Floats, values: Floats, jacobian: Floats | None) -> None:
-        """Add the polynomial to values (k, m) and Jacobian (k, m, d) at points (k, d)."""
-        polynomials = self.polynomials
-        single = polynomials.by_input(z)
-        values += (self.coefficients.T @ polynomials.terms(single)).T
-        if jacobian is None:
-            return
         if len(single) == 2:  # constant slopes
             linear = self.coefficients[polynomials.powers.argmax(axis=0)]
-            jacobian += (linear / polynomials.half_width[:, None]).T
+            jacobian += linear / polynomials.half_width
             return
         derivative = legder(np.eye(len(single)))  # columns of Legendre series
         for a, half_width in enumerate(polynomials.half_width):
             factors = single.copy()
             factors[:, a] = derivative.T @ single[:-1, a]
-            jacobian[:, :, a] += (self.coefficients.T @ polynomials.terms(factors)).T / half_width
+            jacobian[:, a] += self.coefficients @ polynomials.terms(factors) / half_width
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield rows of a block of points, the points (d, k) and squared distances to runs (n, k).
@@ -337,72 +304,53 @@ class Polynomials:
 class System:
     """The linear system of outputs at runs."""
 
-    matrix: Floats  # (n, n): K
-    nugget: float  # in units of K
+    kernels: Floats  # (n, n): K
     basis: Floats  # (n, p): B
     root: Floats  # (p, p): B root are the polynomials at the runs
-    inverse: Floats  # (n, n): Q
-
-    @classmethod
-    def of(
-        cls, matrix: Floats, terms: Floats, nugget: float, projected: Projected | None = None
-    ) -> System | None:
-        """Solve the system of polynomials (p, n) at runs; None if it is singular to rounding.
-
-        The nugget is in units of the largest kernel.
-        """
-        basis, root = np.linalg.qr(terms.T)
-        nugget *= float(np.abs(matrix).max())
-        projected = Projected.of(matrix, basis) if projected is None else projected
-        inverse = projected.solved(nugget)
-        return None if inverse is None else cls(matrix, nugget, basis, root, inverse)
-
-    def trend(self, y: Floats, weights: Floats) -> Floats:
-        """Return the coefficients of the polynomials, (p, m)."""
-        rest = y - self.matrix @ weights - self.nugget * weights
-        return np.asarray(np.linalg.solve(self.root, self.basis.T @ rest))
-
-
-@dataclass(frozen=True, eq=False)
-class Projected:
-    """A kernel matrix on the complement of polynomials, P K P + sigma B B'."""
-
-    matrix: Floats  # (n, n), positive definite but for rounding
-    basis: Floats  # (n, p): B
+    projected: Floats  # (n, n): P K P + sigma B B', positive definite but for rounding
     sigma: float  # at least the largest eigenvalue of P K P
+    unit: float  # largest kernel, the unit of nuggets
 
     @classmethod
-    def of(cls, kernels: Floats, basis: Floats) -> Projected:
-        """Project a kernel matrix, (n, n)."""
+    def of(cls, kernels: Floats, basis: Floats, root: Floats) -> System:
+        """Project a kernel matrix."""
         products = basis.T @ kernels
         both = products @ basis
-        sigma = float(np.trace(kernels) - np.trace(both))
-        sigma = max(sigma, 1e-300)
+        sigma = max(float(np.trace(kernels) - np.trace(both)), 1e-300)
         half = basis @ (products - 0.5 * (both + sigma * np.eye(len(both))) @ basis.T)
-        matrix = kernels - half
-        matrix -= half.T
-        return cls(matrix, basis, sigma)
+        projected = kernels - half
+        projected -= half.T
+        return cls(kernels, basis, root, projected, sigma, float(np.abs(kernels).max()))
 
     def solved(self, nugget: float) -> Floats | None:
         """Return Q, (n, n); None if the matrix is singular to rounding."""
-        root = self.root(nugget)
-        return None if root is None else self.inverse(root, nugget)
+        factor = self.factor(nugget)
+        return None if factor is None else self.inverse(factor, nugget)
 
-    def root(self, nugget: float) -> Floats | None:
-        """Return the lower root of the matrix with a nugget; None if it is singular."""
-        matrix = self.matrix.copy()
-        np.einsum("ii->i", matrix)[...] += nugget
-        root, singular = dpotrf(matrix, lower=True, clean=False)
-        return None if singular else root
+    def factor(self, nugget: float) -> Floats | None:
+        """Return the lower factor of the matrix with a nugget; None if it is singular."""
+        matrix = self.projected.copy()
+        np.einsum("ii->i", matrix)[...] += nugget * self.unit
+        factor, singular = dpotrf(matrix, lower=True, clean=False)
+        return None if singular else factor
 
-    def inverse(self, root: Floats, nugget: float) -> Floats:
-        """Return Q from the lower root."""
-        inverse, _ = dpotri(root, lower=True)
+    def inverse(self, factor: Floats, nugget: float) -> Floats:
+        """Return Q from the lower factor."""
+        inverse, _ = dpotri(factor, lower=True)
         lower = np.tril(inverse, -1)
         full = lower + lower.T
         np.einsum("ii->i", full)[...] = np.einsum("ii->i", inverse)
-        full -= (self.basis / (self.sigma + nugget)) @ self.basis.T
+        full -= (self.basis / (self.sigma + nugget * self.unit)) @ self.basis.T
         return np.asarray(full)
+
+    def contrasts(self, y: Floats) -> Floats:
+        """Return P y, (n,)."""
+        return np.asarray(y - self.basis @ (self.basis.T @ y))
+
+    def trend(self, y: Floats, weights: Floats) -> Floats:
+        """Return the coefficients of the polynomials, (p,)."""
+        rest = self.basis.T @ (y - self.kernels @ weights)
+        return np.asarray(np.linalg.solve(self.root, rest))
 
 
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
@@ -428,22 +376,6 @@ def spread_of(z: Floats) -> Floats:
     return np.where(spread > 0, spread, 1.0)
 
 
-def values_of_one(surfaces: Sequence[Kriging]) -> Callable[[Floats], Floats]:
-    """Return the values of the surface of one output, (k, d) -> (k,)."""
-    if not surfaces:
-        raise np.linalg.LinAlgError("interpolation: the points determine no surface")
-    return partial(_column, surfaces[0])
-
-
-def _column(surface: Kriging, at: Floats) -> Floats:
-    return surface.values(at)[:, 0]
-
-
-def off_basis(basis: Floats, y: Floats) -> Floats:
-    """Return outputs (n, ...) less their part in an orthonormal basis (n, p)."""
-    return np.asarray(y - basis @ (basis.T @ y))
-
-
 def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
     """Return at most so many runs: half are those of the largest weights, others are spread."""
     n = len(weights)
@@ -465,76 +397,70 @@ def fit_kriging(
     lengths: Floats,
     degrees: Sequence[int],
     nuggets: Sequence[float],
-) -> list[Kriging]:
-    """Return a surface of each output, of the degree and nugget of the least left-out errors.
+) -> Kriging | None:
+    """Return the surface of the degree and nugget with the least left-out errors.
 
-    Points (n, d) have outputs (n, m) of spread about one; ``weights``, (n,), of sum one, are those
+    Points (n, d) have outputs (n,) of spread about one; ``weights``, (n,), of sum one, are those
     of squared left-out errors. Nuggets are in units of the largest kernel. Of too many runs a
-    part has the surface, and the others only test it. Empty if no system can be solved.
+    part has the surface, and the others only test it. None if no system can be solved.
     """
     rows = spread_rows(weights, MOST_RUNS)
-    all_z, all_y, z, y = z, y, z[rows], y[rows]
-    weights = weights[rows] / weights[rows].sum()
-    matrix = kernel_matrix(kernel, z / lengths)
-    best: list[Kriging | None] = [None] * y.shape[1]
-    least = np.full(y.shape[1], np.inf)
+    runs, outputs, weights = z[rows], y[rows], weights[rows] / weights[rows].sum()
+    matrix = kernel_matrix(kernel, runs / lengths)
+    best, least = None, np.inf
     for degree in degrees:
-        terms = Polynomials.of(z, degree)(z)
+        terms = Polynomials.of(runs, degree)(runs)
         if not determine(terms):
             continue
-        projected = Projected.of(matrix, np.linalg.qr(terms.T)[0])
+        system = System.of(matrix, *np.linalg.qr(terms.T))
         for nugget in nuggets:
-            system = System.of(matrix, terms, nugget, projected)
-            if system is None:
+            inverse = system.solved(nugget)
+            if inverse is None:
                 continue
-            inverse, basis, contrasts = system.inverse, system.basis, off_basis(system.basis, y)
+            contrasts = system.contrasts(outputs)
             w = inverse @ contrasts
             # Two steps of iterative refinement: close runs make the matrix badly conditioned.
             for _ in range(2):
-                rest = off_basis(basis, contrasts - matrix @ w - system.nugget * w)
-                w += off_basis(basis, inverse @ rest)
-            precisions = np.diag(inverse)[:, None]
+                rest = system.contrasts(contrasts - matrix @ w - nugget * system.unit * w)
+                w += system.contrasts(inverse @ rest)
+            precisions = np.diag(inverse)
             left_out = w / precisions
             # Left-out errors are too small where the matrix is singular to rounding, and large
             # weights have values that are rough by rounding, which roots need to be found.
-            unsolved = np.abs(inverse @ rest / precisions).max(axis=0)
-            size = np.finfo(float).eps * np.abs(matrix).max()
-            error = np.sqrt(weights @ left_out**2) + unsolved
-            error += 100 * size * np.linalg.norm(w, axis=0)
-            for k in np.flatnonzero(error < 0.9 * least):
-                least[k], column = error[k], [int(k)]
-                best[k] = Kriging(
-                    *(z, y[:, column], rows, kernel, lengths, degree, nugget, w[:, column]),
-                    coefficients=system.trend(y[:, column], w[:, column]),
-                    left_out=left_out[:, column],
-                    errors=error[column],
-                    scales=weights @ (left_out[:, column] ** 2 * precisions),
+            unsolved = np.abs(inverse @ rest / precisions).max()
+            rounding = np.finfo(float).eps * system.unit * np.linalg.norm(w)
+            error = float(np.sqrt(weights @ left_out**2) + unsolved + 100 * rounding)
+            if error < 0.9 * least:
+                least = error
+                best = Kriging(
+                    *(runs, outputs, rows, kernel, lengths, degree, nugget, w),
+                    *(system.trend(outputs, w), left_out, error),
+                    scale=float(weights @ (left_out**2 * precisions)),
                 )
-    surfaces = [surface for surface in best if surface is not None]
-    if len(rows) < len(all_z):
-        for place, surface in enumerate(surfaces):
-            errors = all_y[:, [place]] - surface.values(all_z)
-            errors[rows] = surface.left_out
-            surfaces[place] = replace(surface, left_out=errors)
-    return surfaces if len(surfaces) == y.shape[1] else []
+    if best is None or len(rows) == len(z):
+        return best
+    errors = y - best.values(z)
+    errors[rows] = best.left_out
+    return replace(best, left_out=errors)
 
 
 def likeliest(
-    kernel: str, x: Floats, y: Floats, basis: Floats, start: Floats | None = None
+    kernel: str, x: Floats, y: Floats, terms: Floats, start: Floats | None = None
 ) -> Floats:
     """Return log lengths and log nugget, (d + 1,), that maximise the likelihood of contrasts.
 
-    Points (n, d) have spread one. The search starts from the likelier one of ``start``, (d + 1,),
-    and of equal lengths; without it, from the likeliest equal lengths with little and much noise,
-    since long lengths alone miss a resonance, and short ones alone a near-polynomial.
+    Points (n, d) have spread one, outputs (n,), and polynomials (p, n). The search starts from the
+    likelier one of ``start``, (d + 1,), and of equal lengths; without it, from the likeliest equal
+    lengths with little and much noise, since long lengths alone miss a resonance, and short ones
+    alone a near-polynomial.
     """
     from scipy.optimize import minimize as scipy_minimize
 
     d = x.shape[1]
     bounds = [(np.log(0.05), np.log(200))] * d + [(np.log(1e-9), np.log(0.1))]
     low, high = np.array(bounds).T
-    contrasts = off_basis(basis, y)
-    problem = KERNELS[kernel], x, contrasts / np.sqrt((contrasts**2).mean()), basis
+    basis, root = np.linalg.qr(terms.T)
+    problem = KERNELS[kernel], x, y - basis @ (basis.T @ y), basis, root
 
     def value(parameters: Floats) -> float:
         return negative_log_likelihood(parameters, *problem)[0]
@@ -562,7 +488,7 @@ def likeliest(
 
 
 def negative_log_likelihood(
-    parameters: Floats, kernel: Kernel, x: Floats, y: Floats, basis: Floats
+    parameters: Floats, kernel: Kernel, x: Floats, y: Floats, basis: Floats, root: Floats
 ) -> tuple[float, Floats]:
     """Return minus the log posterior density of log lengths and log nugget, and its gradient.
 
@@ -577,14 +503,12 @@ def negative_log_likelihood(
     square = np.maximum(of_points[:, None] + of_points - 2 * scaled @ scaled.T, 0)
     np.einsum("ii->i", square)[...] = 0
     kernels, slope = kernel(square)
-    projected = Projected.of(kernels, basis)
-    root = projected.root(nugget)
-    if root is None:
+    system = System.of(kernels, basis, root)
+    factor = system.factor(nugget)
+    if factor is None:
         return 1e10, np.zeros(d + 1)
-    log_determinant = float(np.log(np.diag(root)).sum()) - 0.5 * p * np.log(
-        projected.sigma + nugget
-    )
-    inverse = projected.inverse(root, nugget)
+    log_determinant = np.log(np.diag(factor)).sum() - 0.5 * p * np.log(system.sigma + nugget)
+    inverse = system.inverse(factor, nugget)
     weights = inverse @ y
     variance = max(float(y @ weights) / (n - p), 1e-300)
     outer = np.outer(weights, weights / variance) - inverse

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from math import comb
 from typing import Any
@@ -17,9 +16,8 @@ from prbayes.emulators.kriging import (
     kernel_matrix,
     spread_of,
     spread_rows,
-    values_of_one,
 )
-from prbayes.emulators.surfaces import Predict, Surface
+from prbayes.emulators.surfaces import KernelSurface
 
 # The lowest degree with which a kernel is conditionally positive definite, and the interpolant
 # unique: Wendland (2005), Scattered Data Approximation, ch. 8.
@@ -27,7 +25,7 @@ _LOWEST_DEGREE = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}
 
 
 @dataclass(frozen=True)
-class RadialBasis(Surface):
+class RadialBasis(KernelSurface):
     """Radial basis functions with a polynomial, which pass through all points.
 
     Parameters
@@ -79,35 +77,31 @@ class RadialBasis(Surface):
         """The degree, or the lowest of several."""
         return self.degree if isinstance(self.degree, int) else _LOWEST_DEGREE[self.kernel]
 
-    def through(self, x: Floats, y: Floats) -> Predict:
-        """Return the surface."""
-        return values_of_one(self.fit(x, y[:, None], np.full(len(x), 1 / len(x))))
-
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Sequence[Any] = (), seed: int = 0
-    ) -> list[Kriging]:
-        """Return the surface of each output."""
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+    ) -> Kriging | None:
+        """Return the surface; None if the runs determine none."""
         n, d = z.shape
-        nuggets = [1e-16, 1e-14, 1e-12, 1e-10, 1e-8]
+        nuggets = [1e-16, 1e-14, 1e-12, 1e-10, 1e-8] if n <= 512 else [1e-14, 1e-10]
         if self.degree != "best":
-            lengths = np.ones(d)
             if self.smoothing:
-                largest = np.abs(kernel_matrix(self.kernel, z)).max()
-                nuggets = [self.smoothing / float(largest)]
+                nuggets = [self.smoothing / float(np.abs(kernel_matrix(self.kernel, z)).max())]
             fits = (
-                fit_kriging(z, y, weights, self.kernel, lengths, [self._degree], [nugget])
+                fit_kriging(z, y, weights, self.kernel, np.ones(d), [self._degree], [nugget])
                 for nugget in nuggets
             )
-            return next(filter(None, fits), [])
-        # Polynomials with at most a third as many terms as runs. Fewer runs select among those that
-        # they determine.
-        degrees = [
-            p for p in range(self._degree, 17) if p == self._degree or 3 * comb(d + p, d) <= n
-        ]
-        rows, lengths = spread_rows(weights, MOST_TUNED), spread_of(z)
-        if len(rows) < n:
-            quick = [p for p in degrees if 3 * comb(d + p, d) <= len(rows)]
+            return next((surface for surface in fits if surface is not None), None)
+        lengths = spread_of(z)
+
+        def degrees(n: int) -> list[int]:  # with at most a third as many terms as runs
+            more = range(self._degree + 1, 17)
+            return [self._degree, *(p for p in more if 3 * comb(d + p, d) <= n)]
+
+        among, rows = degrees(n), spread_rows(weights, MOST_TUNED)
+        if len(rows) < n:  # fewer runs select among the degrees that they determine
+            quick = degrees(len(rows))
             of_rows = weights[rows] / weights[rows].sum()
-            surfaces = fit_kriging(z[rows], y[rows], of_rows, self.kernel, lengths, quick, nuggets)
-            degrees = sorted({*(s.degree for s in surfaces), *(set(degrees) - set(quick))})
-        return fit_kriging(z, y, weights, self.kernel, lengths, degrees or [self._degree], nuggets)
+            surface = fit_kriging(z[rows], y[rows], of_rows, self.kernel, lengths, quick, nuggets)
+            best = self._degree if surface is None else surface.degree
+            among = [best, *among[len(quick) :]]
+        return fit_kriging(z, y, weights, self.kernel, lengths, among, nuggets)

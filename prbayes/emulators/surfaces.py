@@ -14,13 +14,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import comb
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, positive_integer
-from prbayes.emulators.kriging import Polynomials
+from prbayes.emulators.kriging import Kriging, Polynomials, spread_of
 
 Predict = Callable[[Floats], Floats]
 
@@ -29,33 +29,27 @@ FOLDS = 10
 
 
 class FittedSurface(Protocol):
-    """A surface through outputs of runs."""
+    """A surface through one output of runs."""
 
     @property
     def left_out(self) -> Floats:
-        """Error at each run of the surface without the run, (n, m)."""
+        """Error at each run of the surface without the run, (n,)."""
 
     @property
-    def errors(self) -> Floats:
-        """Weighted root mean square of the left-out errors by output, (m,)."""
+    def error(self) -> float:
+        """Weighted root mean square of the left-out errors."""
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
+        """Return values and Jacobian at points, (k, d) -> (k,), (k, d)."""
 
     def values(self, z: Floats) -> Floats:
-        """Return values at points, (k, d) -> (k, m)."""
+        """Return values at points, (k, d) -> (k,)."""
 
     def variance(self, z: Floats) -> Floats:
-        """Return predictive variances at points, (k, d) -> (k, m)."""
+        """Return predictive variances at points, (k, d) -> (k,)."""
 
-    def without_each(self, masks: NDArray[np.bool_]) -> Sequence[Self]:
+    def without_each(self, masks: NDArray[np.bool_]) -> Sequence[FittedSurface]:
         """Return surfaces with the same settings that lack some runs each, (B, n)."""
-
-    def in_units(self, unit: float) -> Self:
-        """Return the surface of outputs that are larger by a factor."""
-
-    def joined(self, more: Any) -> Self | None:
-        """Return the surface of the outputs of both; None if that saves no time."""
 
 
 class Surface(ABC):
@@ -101,33 +95,50 @@ class Surface(ABC):
         """
 
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Sequence[Any] = (), seed: int = 0
-    ) -> Sequence[FittedSurface]:
-        """Return a surface of each output; none if the runs determine none.
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+    ) -> FittedSurface | None:
+        """Return the surface with its derivatives and errors; None if the runs determine none.
 
         Parameters
         ----------
         z : ndarray, shape (n, d)
-        y : ndarray, shape (n, m)
-            Outputs of mean 0 and spread about 1.
+        y : ndarray, shape (n,)
+            Outputs of mean 0 and standard deviation 1.
         weights : ndarray, shape (n,)
             Weights of squared left-out errors, of sum one.
-        start : sequence of FittedSurface
-            Surfaces through earlier runs by output, whose settings are near these.
+        start : FittedSurface, optional
+            A surface through earlier runs, whose settings are near those of this one.
         seed : int
             Of the tenths of the runs that are left out.
         """
         if len(z) <= self.terms(z.shape[1]):
-            return []
+            return None
         order = np.random.default_rng(seed).permutation(len(z))
         folds = np.zeros((min(FOLDS, len(z)), len(z)), dtype=bool)
         for fold, rows in zip(folds, np.array_split(order, len(folds)), strict=True):
             fold[rows] = True
-        return [Refitted(self, z, y[:, [k]], folds, weights) for k in range(y.shape[1])]
+        return Refitted(self, z, y, folds, weights)
 
     def following(self) -> Sequence[Surface]:
         """Return the surfaces to try if the last input is a coarse response."""
         return self, Following(self)
+
+
+class KernelSurface(Surface):
+    """A surface of kernels, whose derivatives and left-out errors have formulas."""
+
+    def through(self, x: Floats, y: Floats) -> Predict:
+        """Return the surface."""
+        surface = self.fit(x, y, np.full(len(x), 1 / len(x)))
+        if surface is None:
+            raise np.linalg.LinAlgError("interpolation: the points determine no surface")
+        return surface.values
+
+    @abstractmethod
+    def fit(
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+    ) -> Kriging | None:
+        """Return the surface with its derivatives and errors; None if the runs determine none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,71 +147,58 @@ class Refitted:
 
     model: Surface
     z: Floats  # (n, d)
-    y: Floats  # (n, 1)
+    y: Floats  # (n,)
     folds: NDArray[np.bool_]  # (B, n): runs that are left out together
     weights: Floats  # (n,)
-    rows: NDArray[np.bool_] | None = None  # (n,): runs that are used
-    unit: float = 1.0
+    used: NDArray[np.bool_] | slice = slice(None)  # runs of the fit
 
     @cached_property
     def predict(self) -> Predict:
         """The fitted surface."""
-        rows = slice(None) if self.rows is None else self.rows
-        return self.model.through(self.z[rows], self.y[rows, 0])
+        return self.model.through(self.z[self.used], self.y[self.used])
 
     def values(self, z: Floats) -> Floats:
-        """Return values at points, (k, d) -> (k, 1)."""
+        """Return values at points, (k, d) -> (k,)."""
         # Some regressors return a column.
-        values = np.asarray(self.predict(z), dtype=np.float64).reshape(len(z), 1)
-        return np.asarray(self.unit * values)
+        return np.asarray(self.predict(z), dtype=np.float64).reshape(len(z))
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and central differences at points, (k, d) -> (k, 1), (k, 1, d)."""
-        steps = 1e-4 * np.diag(np.maximum(self.z.std(axis=0), 1e-300))
-        slopes = [
-            (self.values(z + step) - self.values(z - step)) / (2 * step.sum()) for step in steps
-        ]
-        return self.values(z), np.stack(slopes, axis=-1)
+        """Return values and central differences at points, (k, d) -> (k,), (k, d)."""
+        steps = 1e-4 * np.diag(spread_of(self.z))
+        ends = [(self.values(z + step), self.values(z - step)) for step in steps]
+        slopes = [(a - b) / (2 * step.sum()) for (a, b), step in zip(ends, steps, strict=True)]
+        return self.values(z), np.stack(slopes, axis=1)
 
     @cached_property
     def left_out(self) -> Floats:
-        """Errors of surfaces without each fold of the runs, (n, 1)."""
-        errors = np.empty_like(self.y)
+        """Errors of surfaces without each fold of the runs, (n,)."""
+        errors = self.y.copy()
         for fold, surface in zip(self.folds, self.without_each(self.folds), strict=True):
-            errors[fold] = self.unit * self.y[fold] - surface.values(self.z[fold])
+            errors[fold] -= surface.values(self.z[fold])
         return errors
 
     @property
-    def errors(self) -> Floats:
-        """Weighted root mean square of the left-out errors, (1,)."""
-        return np.asarray(np.sqrt(self.weights @ self.left_out**2))
+    def error(self) -> float:
+        """Weighted root mean square of the left-out errors."""
+        return float(np.sqrt(self.weights @ self.left_out**2))
 
     def variance(self, z: Floats) -> Floats:
-        """Return left-out variances nearby, (k, d) -> (k, 1).
+        """Return left-out variances nearby, (k, d) -> (k,).
 
         They grow with the squared distance to the nearest run, from zero there.
         """
         from scipy.spatial import cKDTree
 
-        spread = np.where(self.z.std(axis=0) > 0, self.z.std(axis=0), 1.0)
+        spread = spread_of(self.z)
         tree = cKDTree(self.z / spread)
-        own_distances = tree.query(self.z / spread, 2)[0][:, 1]
+        gaps = tree.query(self.z / spread, 2)[0][:, 1]
         distances, nearest = tree.query(z / spread, min(len(self.z), 2 * z.shape[1] + 2))
-        squares = (self.left_out[nearest, 0] ** 2).mean(axis=1)
-        ratio = distances[:, 0] / own_distances[nearest].mean(axis=1)
-        return np.asarray((squares * ratio**2)[:, None])
+        squares = (self.left_out[nearest] ** 2).mean(axis=1)
+        return np.asarray(squares * (distances[:, 0] / gaps[nearest].mean(axis=1)) ** 2)
 
     def without_each(self, masks: NDArray[np.bool_]) -> list[Refitted]:
         """Return surfaces that lack some runs each, (B, n)."""
-        return [replace(self, rows=~mask) for mask in masks]
-
-    def in_units(self, unit: float) -> Refitted:
-        """Return the surface of outputs that are larger by a factor."""
-        return replace(self, unit=self.unit * unit)
-
-    def joined(self, more: Any) -> None:
-        """Return None: each output has a fit."""
-        return
+        return [replace(self, used=~mask) for mask in masks]
 
 
 @dataclass(frozen=True)

@@ -81,33 +81,34 @@ SYSTEMS = [(kernel, degree) for kernel, lowest in LOWEST.items() for degree in {
 
 @pytest.mark.parametrize(("kernel", "degree"), SYSTEMS)
 def test_left_out_errors_are_those_of_refits(kernel: str, degree: int) -> None:
-    z = design(60, 2)
-    y = smooth(z) + 0.1 * np.sin(9 * z[:, :1])
+    z, points = design(60, 2), design(10, 2, seed=5)
+    y = smooth(z)[:, 0] + 0.1 * np.sin(9 * z[:, 0])
 
-    def fit(rows: Any) -> list[Kriging]:
+    def fit(rows: Any) -> Kriging:
         weights = np.full(len(rows), 1 / len(rows))
-        return fit_kriging(z[rows], y[rows], weights, kernel, np.ones(2), [degree], [1e-9])
+        surface = fit_kriging(z[rows], y[rows], weights, kernel, np.ones(2), [degree], [1e-9])
+        assert surface is not None
+        return surface
 
-    surfaces = fit(np.arange(60))
-    points = design(10, 2, seed=5)
-    for k, surface in enumerate(surfaces):
-        for block in ([0], [59], [7, 20, 31]):
-            mask = np.isin(np.arange(60), block)
-            refit = fit(np.flatnonzero(~mask))[k]
-            (without,) = surface.without_each(mask[None])
-            for at in (points, z[block]):
-                np.testing.assert_allclose(without.values(at), refit.values(at), atol=1e-5)
-            if len(block) == 1:
-                error = y[block, k] - refit.values(z[block])[0]
-                np.testing.assert_allclose(surface.left_out[block, 0], error, atol=1e-5)
+    surface = fit(np.arange(60))
+    for block in ([0], [59], [7, 20, 31]):
+        mask = np.isin(np.arange(60), block)
+        refit = fit(np.flatnonzero(~mask))
+        (without,) = surface.without_each(mask[None])
+        for at in (points, z[block]):
+            np.testing.assert_allclose(without.values(at), refit.values(at), atol=1e-5)
+        if len(block) == 1:
+            error = y[block] - refit.values(z[block])
+            np.testing.assert_allclose(surface.left_out[block], error, atol=1e-5)
 
 
 @pytest.mark.parametrize(("kernel", "degree"), SYSTEMS)
 def test_means_and_variances_are_those_of_the_closed_form(kernel: str, degree: int) -> None:
     """Predictions are u' y, and their errors have the variance k(0) - 2 u' k + u' K u."""
     z, points = design(40, 2), design(16, 2, seed=5)
-    weights = np.full(40, 1 / 40)
-    surface, _ = fit_kriging(z, smooth(z), weights, kernel, np.ones(2), [degree], [1e-9])
+    y, weights = smooth(z)[:, 0], np.full(40, 1 / 40)
+    surface = fit_kriging(z, y, weights, kernel, np.ones(2), [degree], [1e-9])
+    assert surface is not None
     polynomials = Polynomials.of(z, degree)
 
     def kernels(a: Floats, b: Floats) -> Floats:
@@ -118,12 +119,10 @@ def test_means_and_variances_are_those_of_the_closed_form(kernel: str, degree: i
     system = np.block([[matrix, terms.T], [terms, np.zeros((len(terms),) * 2)]])
     right = np.concatenate([kernels(z, points), polynomials(points)])
     solution = np.linalg.solve(system, right)
-    np.testing.assert_allclose(
-        surface.values(points)[:, 0], solution[:40].T @ smooth(z)[:, 0], atol=1e-6
-    )
+    np.testing.assert_allclose(surface.values(points), solution[:40].T @ y, atol=1e-6)
     variance = kernels(points[:1], points[:1])[0] - (right * solution).sum(axis=0)
-    expected = variance * surface.scales[0]
-    np.testing.assert_allclose(surface.variance(points)[:, 0], expected, rtol=1e-3, atol=1e-9)
+    expected = variance * surface.scale
+    np.testing.assert_allclose(surface.variance(points), expected, rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("tried", [*CANDIDATES, Polynomial(3)], ids=str)
@@ -142,14 +141,13 @@ def test_the_variance_is_zero_at_runs_and_grows_between(tried: Surface) -> None:
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern"])
 def test_the_gradient_of_the_likelihood_is_its_derivative(kernel: str) -> None:
     z = design(30, 3)
-    basis = np.linalg.qr(Polynomials.of(z, 1)(z).T)[0]
+    basis, root = np.linalg.qr(Polynomials.of(z, 1)(z).T)
     y = smooth(z)[:, 0] - basis @ (basis.T @ smooth(z)[:, 0])
+    problem = KERNELS[kernel], z, y, basis, root
     at = np.log([1.3, 2.0, 3.5, 1e-4])
-    _, gradient = negative_log_likelihood(at, KERNELS[kernel], z, y, basis)
+    _, gradient = negative_log_likelihood(at, *problem)
     for a, step in enumerate(1e-5 * np.eye(4)):
-        ends = [
-            negative_log_likelihood(at + s, KERNELS[kernel], z, y, basis)[0] for s in (step, -step)
-        ]
+        ends = [negative_log_likelihood(at + s, *problem)[0] for s in (step, -step)]
         assert gradient[a] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5, abs=1e-6)
 
 

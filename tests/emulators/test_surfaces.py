@@ -181,7 +181,7 @@ def test_what_follows_is_that_of_the_runs_that_are_kept(model: Surface) -> None:
         (part,) = without.following
         assert part is not None
         values.append(part.values(X[block], rough(X[block])))
-    np.testing.assert_allclose(*values, atol=1e-8)
+    np.testing.assert_allclose(values[0], values[1], atol=1e-8)
     assert np.abs(values[0] - fine(X[block])).max() < 0.5 * np.ptp(fine(X))
 
 
