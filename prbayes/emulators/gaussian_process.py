@@ -107,9 +107,6 @@ class GaussianProcess(KernelSurface):
             return next((surface for surface in fits if surface is not None), None)
         rows, spread = spread_rows(weights, MOST_TUNED), spread_of(z)
         terms = Polynomials.of(z[rows], degree)(z[rows])
-        plane = np.linalg.lstsq(terms.T, y[rows], rcond=None)[0]
-        if np.sqrt(((y[rows] - plane @ terms) ** 2).mean()) <= 1e-12 * np.abs(y).max():
-            return fit(2 * np.sqrt(d) * spread, nuggets=[1e-9])
         first = None
         if getattr(start, "kernel", "") == self.kernel:
             first = np.log([*(start.lengths / spread), 1e-7])

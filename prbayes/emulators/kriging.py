@@ -91,9 +91,9 @@ def thin_plate_spline(square: Floats) -> tuple[Floats, Floats]:
 
 
 def linear(square: Floats) -> tuple[Floats, Floats]:
-    """Return the kernel -r of squared distances, and minus twice its slope; none at zero."""
+    """Return the kernel -r of squared distances, and minus twice its slope."""
     r = np.sqrt(square)
-    return -r, np.divide(1.0, r, out=np.zeros_like(r), where=r > 1e-12)
+    return -r, 1 / np.maximum(r, 1e-12)
 
 
 KERNELS: dict[str, Kernel] = {
@@ -337,9 +337,7 @@ class System:
     def inverse(self, factor: Floats, nugget: float) -> Floats:
         """Return Q from the lower factor."""
         inverse, _ = dpotri(factor, lower=True)
-        lower = np.tril(inverse, -1)
-        full = lower + lower.T
-        np.einsum("ii->i", full)[...] = np.einsum("ii->i", inverse)
+        full = np.tril(inverse) + np.tril(inverse, -1).T
         full -= (self.basis / (self.sigma + nugget * self.unit)) @ self.basis.T
         return np.asarray(full)
 

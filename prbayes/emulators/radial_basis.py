@@ -10,12 +10,10 @@ import numpy as np
 
 from prbayes._validate import Floats, positive_integer
 from prbayes.emulators.kriging import (
-    MOST_TUNED,
     Kriging,
     fit_kriging,
     kernel_matrix,
     spread_of,
-    spread_rows,
 )
 from prbayes.emulators.surfaces import KernelSurface
 
@@ -91,17 +89,9 @@ class RadialBasis(KernelSurface):
                 for nugget in nuggets
             )
             return next((surface for surface in fits if surface is not None), None)
-        lengths = spread_of(z)
-
-        def degrees(n: int) -> list[int]:  # with at most a third as many terms as runs
-            more = range(self._degree + 1, 17)
-            return [self._degree, *(p for p in more if 3 * comb(d + p, d) <= n)]
-
-        among, rows = degrees(n), spread_rows(weights, MOST_TUNED)
-        if len(rows) < n:  # fewer runs select among the degrees that they determine
-            quick = degrees(len(rows))
-            of_rows = weights[rows] / weights[rows].sum()
-            surface = fit_kriging(z[rows], y[rows], of_rows, self.kernel, lengths, quick, nuggets)
-            best = self._degree if surface is None else surface.degree
-            among = [best, *among[len(quick) :]]
-        return fit_kriging(z, y, weights, self.kernel, lengths, among, nuggets)
+        # Polynomials with at most a third as many terms as runs. With many runs they matter little,
+        # and take most of the time.
+        highest = 17 if n <= 256 else self._degree + 2
+        more = range(self._degree + 1, highest)
+        degrees = [self._degree, *(p for p in more if 3 * comb(d + p, d) <= n)]
+        return fit_kriging(z, y, weights, self.kernel, spread_of(z), degrees, nuggets)

@@ -108,19 +108,14 @@ class Runs:
         return np.sort(rows[np.unique(self.x[rows], axis=0, return_index=True)[1]])
 
     @cached_property
-    def center(self) -> Floats:
-        """The mean of the inputs in the relevant populations, (d,)."""
-        return self.importance @ self.x
-
-    @cached_property
     def spread(self) -> Floats:
-        """Their standard deviation, (d,)."""
-        sd = np.sqrt(self.importance @ (self.x - self.center) ** 2)
+        """The standard deviation of the inputs in the relevant populations, (d,)."""
+        sd = np.sqrt(self.importance @ (self.x - self.importance @ self.x) ** 2)
         return np.where(sd > 0, sd, 1.0)
 
     def scaled(self, x: Floats) -> Floats:
         """Return inputs in units of their spread."""
-        return np.asarray((x - self.center) / self.spread)
+        return np.asarray(x / self.spread)
 
     @cached_property
     def block_masks(self) -> NDArray[np.bool_]:

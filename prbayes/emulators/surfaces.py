@@ -183,18 +183,17 @@ class Refitted:
         return float(np.sqrt(self.weights @ self.left_out**2))
 
     def variance(self, z: Floats) -> Floats:
-        """Return left-out variances nearby, (k, d) -> (k,).
+        """Return the squared left-out error, (k, d) -> (k,), zero at the runs.
 
-        They grow with the squared distance to the nearest run, from zero there.
+        It grows with the squared distance to the nearest run, in units of that to its neighbour.
         """
         from scipy.spatial import cKDTree
 
         spread = spread_of(self.z)
         tree = cKDTree(self.z / spread)
-        gaps = tree.query(self.z / spread, 2)[0][:, 1]
-        distances, nearest = tree.query(z / spread, min(len(self.z), 2 * z.shape[1] + 2))
-        squares = (self.left_out[nearest] ** 2).mean(axis=1)
-        return np.asarray(squares * (distances[:, 0] / gaps[nearest].mean(axis=1)) ** 2)
+        gaps = tree.query(tree.data, 2)[0][:, 1]
+        distances, nearest = tree.query(z / spread)
+        return np.asarray((self.error * distances / gaps[nearest]) ** 2)
 
     def without_each(self, masks: NDArray[np.bool_]) -> list[Refitted]:
         """Return surfaces that lack some runs each, (B, n)."""

@@ -27,12 +27,12 @@ from prbayes._validate import (
     share,
 )
 from prbayes.emulators.emulator import ROUGH_CANDIDATES
-from prbayes.emulators.following import FollowingEmulator, fit_follower, fit_following
+from prbayes.emulators.following import FollowingEmulator, fit_following
 from prbayes.emulators.io import read, write
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.selection import CrossValidation, points_needed
-from prbayes.emulators.surfaces import Following, Surface, as_surface
+from prbayes.emulators.surfaces import Surface, as_surface
 from prbayes.emulators.table import Table, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
@@ -69,32 +69,19 @@ class FittedSurface:
         responses: Floats,
         coarse: Callable[..., Any] | None = None,
         coarse_values: Floats | None = None,
-        *,
-        joined: bool | None = None,
         seed: int = 0,
     ) -> FittedSurface:
-        """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller.
-
-        If it is given, ``joined`` states whether the coarse response is an input of the surface.
-        """
+        """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller."""
         unit, usable = domain.scaled(points), _usable(responses)
         x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
-        model = as_surface(model)
-        of_usable = None if coarse_values is None else coarse_values[usable]
-        if of_usable is None or joined is None:
-            columns = None if of_usable is None else of_usable[:, None]
-            emulator = fit_following(x, y, columns, tried=[model], seed=seed)
-        else:
-            tried = [model if joined else Following(model)]
-            equal = np.ones(len(x))
-            follower = fit_follower(x, y[:, 0], of_usable, equal, tried=tried, seed=seed)
-            alone = fit_following(x, y, tried=[model], seed=seed).alone
-            emulator = FollowingEmulator(alone, (follower,))
+        of_usable = None
+        if coarse_values is not None:
+            # Fixed parts are left out, so that a file of the surrogate follows in the same way.
+            of_usable, seed = coarse_values[usable, None], 0
+        emulator = fit_following(x, y, of_usable, tried=[as_surface(model)], seed=seed)
         is_followed = any(follower is not None for follower in emulator.following)
-        return cls(
-            *(domain, unit, usable, responses.shape[1:], emulator),
-            coarse if is_followed else None,
-        )
+        event = responses.shape[1:]
+        return cls(domain, unit, usable, event, emulator, coarse if is_followed else None)
 
     def __call__(self, columns: Floats) -> Floats:
         """Return values at rows inside the ranges, (n,) or (n, m)."""
@@ -121,16 +108,6 @@ class FittedSurface:
         left_out = np.full((len(self.usable), *self.event), np.nan)
         left_out[self.usable] = self.emulator.left_out.reshape(-1, *self.event)
         return left_out
-
-    @property
-    def joined(self) -> bool | None:
-        """Whether a coarse response is an input of the surface; None if it follows none."""
-        if self.coarse is None:
-            return None
-        (follower,) = self.emulator.following
-        assert follower is not None  # since there is a coarse response
-        (surface,) = follower.emulator.surfaces
-        return not isinstance(getattr(surface, "model", None), Following)
 
     def probes(self) -> Floats:
         """Return values at 64 fixed points, which identify the surface."""
@@ -345,9 +322,7 @@ class Surrogate(Shown):
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
         # Fit the surface, and estimate its error.
-        surface = FittedSurface.of(
-            model, domain, design, responses, coarse, coarse_values, seed=seed
-        )
+        surface = FittedSurface.of(model, domain, design, responses, coarse, coarse_values, seed)
         if coarse is not None and surface.coarse is None:
             _log.info("%s: the coarse response does not improve the fit, and is not used", name)
         residuals = surface.left_out
@@ -566,7 +541,7 @@ class Surrogate(Shown):
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._surface.joined, self._surface.probes())
+        write(path, self, self._surface.probes())
 
     @classmethod
     def load(
@@ -604,28 +579,24 @@ class Surrogate(Shown):
                 f"Surrogate.load: got no model, expected the {saved.kind} it was fitted with; "
                 "pass model="
             )
-        follows_coarse = saved.joined is not None
-        if follows_coarse and coarse is None:
+        if saved.follows_coarse and coarse is None:
             raise TypeError(
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        coarse = coarse if follows_coarse else None
         fields = saved.fields
-        responses = fields["responses"]
-        surface = FittedSurface.of(
-            *(model, fields["domain"], fields["points"], responses, coarse),
-            None
-            if coarse is None
-            else _coarse_at("Surrogate.load", coarse, fields["domain"], fields["points"]),
-            joined=saved.joined,
-        )
+        domain, points, responses = (fields[key] for key in ("domain", "points", "responses"))
+        coarse = coarse if saved.follows_coarse else None
+        coarse_values = None
+        if coarse is not None:
+            coarse_values = _coarse_at("Surrogate.load", coarse, domain, points)
+        surface = FittedSurface.of(model, domain, points, responses, coarse, coarse_values)
         spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
         probes, expected = surface.probes() / size, saved.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
         if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
-            and_coarse = ", and the same coarse response" if follows_coarse else ""
+            and_coarse = ", and the same coarse response" if coarse is not None else ""
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
