@@ -21,7 +21,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
@@ -33,6 +33,11 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from prbayes._validate import IN_CACHE, Floats
+
+# Runs of a surface, whose cost grows with their cube.
+MOST_RUNS = 2000
+# Runs for the choice of lengths and degrees.
+MOST_TUNED = 256
 
 # From squared distances, which are overwritten, to the kernel and minus twice its slope.
 Kernel = Callable[[Floats], tuple[Floats, Floats]]
@@ -70,99 +75,123 @@ def quintic(square: Floats) -> tuple[Floats, Floats]:
     return np.negative(square, out=square), slope
 
 
+def cubic(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel r^3 of squared distances, and minus twice its slope."""
+    slope = np.sqrt(square)
+    square *= slope
+    slope *= -3
+    return square, slope
+
+
+def thin_plate_spline(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel r^2 log r of squared distances, and minus twice its slope."""
+    logs = np.log(np.maximum(square, 1e-300))
+    square *= 0.5 * logs
+    return square, -1 - logs
+
+
+def linear(square: Floats) -> tuple[Floats, Floats]:
+    """Return the kernel -r of squared distances, and minus twice its slope."""
+    r = np.sqrt(square)
+    return -r, 1 / np.maximum(r, 1e-12)
+
+
 KERNELS: dict[str, Kernel] = {
-    "squared_exponential": squared_exponential,
-    "matern": matern,
-    "quintic": quintic,
+    f.__name__: f for f in (squared_exponential, matern, linear, thin_plate_spline, cubic, quintic)
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Kriging:
-    """A surface of one kernel through outputs of runs, equation (1)."""
+    """A surface of one kernel through an output of runs, equation (1)."""
 
     z: Floats  # (n, d): runs
+    y: Floats  # (n,): their outputs
+    rows: NDArray[np.intp]  # (n,): indices among all runs
     kernel: str
     lengths: Floats  # (d,): units of distances
-    weights: Floats  # (n, m)
-    coefficients: Floats  # (terms, m)
-    degrees: NDArray[np.intp]  # (m,): degree of the polynomial of each output
-    nuggets: Floats  # (m,)
-    left_out: Floats  # (n, m): error at each run of the surface through all others
-    errors: Floats  # (m,): weighted root mean square of the left-out errors
-    scales: Floats  # (m,): variance of each output in units of the kernel
+    degree: int  # degree of the polynomial
+    nugget: float  # in units of the largest kernel
+    weights: Floats  # (n,)
+    coefficients: Floats  # (terms,)
+    left_out: Floats  # error at each of all runs of the surface without the run
+    error: float  # weighted root mean square of the left-out errors
+    scale: float  # variance of the output in units of the kernel
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
-        m, d = self.weights.shape[1], self.z.shape[1]
+        """Return values and Jacobian at points, (k, d) -> (k,), (k, d)."""
         if self._on_line is not None:
-            return self.values(z), self._slopes_on_line(z)[..., None]
+            series = self._on_line[1]
+            polynomials = self.polynomials
+            slopes = legval(polynomials.scaled(z)[0], legder(series)) / polynomials.half_width
+            return self.values(z), (self._on_line[0](z[:, 0], 1) + slopes)[:, None]
         kernel, runs = KERNELS[self.kernel], self._scaled_runs
-        values, jacobian = np.empty((len(z), m)), np.empty((len(z), m, d))
-        moments = [self.weights, *(column[:, None] * self.weights for column in runs.T)]
-        factors = np.concatenate(moments, axis=1).T
+        values, jacobian = np.empty(len(z)), np.empty(z.shape)
+        factors = np.concatenate([self.weights[None], self.weights * runs.T])
         for rows, points, square in self._distances(z):
             value, slope = kernel(square)
-            steepness, *by_axis = (factors @ slope).reshape(d + 1, m, -1)
-            values[rows] = (steepness if value is slope else self.weights.T @ value).T
-            for a, length in enumerate(self.lengths):
-                jacobian[rows, :, a] = ((by_axis[a] - points[a] * steepness) / length).T
-            self._add_polynomial(z[rows], values[rows], jacobian[rows])
+            steepness, *by_axis = factors @ slope
+            values[rows] = steepness if value is slope else self.weights @ value
+            jacobian[rows] = ((by_axis - points * steepness) / self.lengths[:, None]).T
+            single = self.polynomials.by_input(z[rows])
+            values[rows] += self.coefficients @ self.polynomials.terms(single)
+            self._add_slopes(single, jacobian[rows])
         return values, jacobian
 
     def values(self, z: Floats) -> Floats:
-        """Return values at points, (k, d) -> (k, m)."""
+        """Return values at points, (k, d) -> (k,)."""
         if self._on_line is not None:
             radial, series = self._on_line
-            return np.asarray(radial(z[:, 0]) + legval(self.polynomials.scaled(z)[0], series).T)
-        kernel = KERNELS[self.kernel]
-        values = np.empty((len(z), self.weights.shape[1]))
+            return np.asarray(radial(z[:, 0]) + legval(self.polynomials.scaled(z)[0], series))
+        kernel, values = KERNELS[self.kernel], np.empty(len(z))
         for rows, _, square in self._distances(z):
-            values[rows] = (self.weights.T @ kernel(square)[0]).T
-            self._add_polynomial(z[rows], values[rows], None)
+            values[rows] = self.weights @ kernel(square)[0]
+            values[rows] += self.coefficients @ self.polynomials(z[rows])
         return values
 
     def variance(self, z: Floats) -> Floats:
-        """Return predictive variances at points, (k, d) -> (k, m)."""
-        kernel, matrix = KERNELS[self.kernel], kernel_matrix(self.kernel, self.z / self.lengths)
-        unit, at_zero = np.abs(matrix).max(), kernel(np.zeros(1))[0]
-        variances = np.empty((len(z), self.weights.shape[1]))
-        for degree, nugget in sorted({*zip(self.degrees, self.nuggets, strict=True)}):
-            columns = np.flatnonzero((self.degrees == degree) & (self.nuggets == nugget))
-            polynomials = Polynomials.of(self.z, int(degree))
-            basis, root = np.linalg.qr(polynomials(self.z).T)
-            inverse = Projected.of(matrix, basis).solved(nugget * unit)
-            assert inverse is not None  # the fit has solved the same system
-            for rows, _, square in self._distances(z):
-                kernels = kernel(square)[0]  # (n, k)
-                # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
-                # polynomials determine a part B t of u; the best other part is Q (k - K B t).
-                trend = basis @ np.linalg.solve(root.T, polynomials(z[rows]))
-                rest = kernels - matrix @ trend
-                error = at_zero - (trend * (kernels + rest)).sum(axis=0)
-                error -= (rest * (inverse @ rest)).sum(axis=0)
-                variances[rows, columns] = np.maximum(error, 0)[:, None] * self.scales[columns]
-        return variances
+        """Return predictive variances at points, (k, d) -> (k,)."""
+        system, kernel = self._system, KERNELS[self.kernel]
+        inverse = system.solved(self.nugget)
+        assert inverse is not None  # since the fit has solved the same system
+        errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
+        for rows, _, square in self._distances(z):
+            kernels = kernel(square)[0]  # (n, k)
+            # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
+            # polynomials determine a part B t of u; the best other part is Q (k - K B t).
+            trend = system.basis @ np.linalg.solve(system.root.T, self.polynomials(z[rows]))
+            rest = kernels - system.kernels @ trend
+            errors[rows] = at_zero - (trend * (kernels + rest)).sum(axis=0)
+            errors[rows] -= (rest * (inverse @ rest)).sum(axis=0)
+        return np.maximum(errors, 0) * self.scale
 
-    def selected(self, columns: NDArray[np.intp]) -> Kriging:
-        """Return the surface of some outputs."""
-        degrees = self.degrees[columns]
-        terms = comb(self.z.shape[1] + int(degrees.max()), self.z.shape[1])
-        return replace(
-            self,
-            weights=self.weights[:, columns],
-            coefficients=self.coefficients[:terms, columns],
-            degrees=degrees,
-            nuggets=self.nuggets[columns],
-            left_out=self.left_out[:, columns],
-            errors=self.errors[columns],
-            scales=self.scales[columns],
-        )
+    def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
+        """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...).
+
+        A surface without runs is the one through their left-out predictions in their place.
+        """
+        system, surfaces = self._system, []
+        inverse = system.solved(self.nugget)
+        assert inverse is not None  # since the fit has solved the same system
+        for mask in masks[:, self.rows]:
+            y = self.y.copy()
+            y[mask] -= np.linalg.solve(inverse[np.ix_(mask, mask)], (inverse @ y)[mask])
+            weights = inverse @ system.contrasts(y)
+            weights[mask] = 0
+            coefficients = system.trend(y, weights)
+            surfaces.append(replace(self, weights=weights, coefficients=coefficients))
+        return surfaces
+
+    @property
+    def _system(self) -> System:
+        """The linear system of the output."""
+        matrix = kernel_matrix(self.kernel, self.z / self.lengths)
+        return System.of(matrix, *np.linalg.qr(self.polynomials(self.z).T))
 
     @cached_property
     def polynomials(self) -> Polynomials:
-        """The polynomials up to the largest degree."""
-        return Polynomials.of(self.z, int(self.degrees.max()))
+        """The polynomials."""
+        return Polynomials.of(self.z, self.degree)
 
     @cached_property
     def _scaled_runs(self) -> Floats:
@@ -180,37 +209,25 @@ class Kriging:
         from scipy.interpolate import PPoly  # takes long to import
 
         order = np.argsort(self.z[:, 0])
-        runs, weights = self.z[order, 0], self.weights[order] / self.lengths**5
+        runs, weights = self.z[order, 0], self.weights[order] / self.lengths[0] ** 5
         ends = np.concatenate([runs[:1] - 1, runs, runs[-1:] + 1])
         distances = ends[:-1, None] - runs
         side = np.where(distances < 0, -1.0, 1.0)
         pieces = [-comb(5, p) * (side * distances**p) @ weights for p in range(6)]
         return PPoly(np.stack(pieces), ends), self.coefficients
 
-    def _slopes_on_line(self, z: Floats) -> Floats:
-        """Return derivatives at points of one input, (k, 1) -> (k, m)."""
-        assert self._on_line is not None
-        radial, series = self._on_line
+    def _add_slopes(self, single: Floats, jacobian: Floats) -> None:
+        """Add the polynomial's slopes to a Jacobian, (k, d), from the polynomials of each input."""
         polynomials = self.polynomials
-        slopes = legval(polynomials.scaled(z)[0], legder(series)).T / polynomials.half_width
-        return np.asarray(radial(z[:, 0], 1) + slopes)
-
-    def _add_polynomial(self, z: Floats, values: Floats, jacobian: Floats | None) -> None:
-        """Add the polynomial to values (k, m) and Jacobian (k, m, d) at points (k, d)."""
-        polynomials = self.polynomials
-        single = polynomials.by_input(z)
-        values += (self.coefficients.T @ polynomials.terms(single)).T
-        if jacobian is None:
-            return
         if len(single) == 2:  # constant slopes
             linear = self.coefficients[polynomials.powers.argmax(axis=0)]
-            jacobian += (linear / polynomials.half_width[:, None]).T
+            jacobian += linear / polynomials.half_width
             return
         derivative = legder(np.eye(len(single)))  # columns of Legendre series
         for a, half_width in enumerate(polynomials.half_width):
             factors = single.copy()
             factors[:, a] = derivative.T @ single[:-1, a]
-            jacobian[:, :, a] += (self.coefficients.T @ polynomials.terms(factors)).T / half_width
+            jacobian[:, a] += self.coefficients @ polynomials.terms(factors) / half_width
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield rows of a block of points, the points (d, k) and squared distances to runs (n, k).
@@ -284,45 +301,54 @@ class Polynomials:
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
-    """A kernel matrix on the complement of polynomials, P K P + sigma B B'."""
+class System:
+    """The linear system of outputs at runs."""
 
-    matrix: Floats  # (n, n), positive definite but for rounding
+    kernels: Floats  # (n, n): K
     basis: Floats  # (n, p): B
+    root: Floats  # (p, p): B root are the polynomials at the runs
+    projected: Floats  # (n, n): P K P + sigma B B', positive definite but for rounding
     sigma: float  # at least the largest eigenvalue of P K P
+    unit: float  # largest kernel, the unit of nuggets
 
     @classmethod
-    def of(cls, kernels: Floats, basis: Floats) -> Projected:
-        """Project a kernel matrix, (n, n)."""
+    def of(cls, kernels: Floats, basis: Floats, root: Floats) -> System:
+        """Project a kernel matrix."""
         products = basis.T @ kernels
         both = products @ basis
-        sigma = float(np.trace(kernels) - np.trace(both))
-        sigma = max(sigma, 1e-300)
+        sigma = max(float(np.trace(kernels) - np.trace(both)), 1e-300)
         half = basis @ (products - 0.5 * (both + sigma * np.eye(len(both))) @ basis.T)
-        matrix = kernels - half
-        matrix -= half.T
-        return cls(matrix, basis, sigma)
+        projected = kernels - half
+        projected -= half.T
+        return cls(kernels, basis, root, projected, sigma, float(np.abs(kernels).max()))
 
     def solved(self, nugget: float) -> Floats | None:
         """Return Q, (n, n); None if the matrix is singular to rounding."""
-        root = self.root(nugget)
-        return None if root is None else self.inverse(root, nugget)
+        factor = self.factor(nugget)
+        return None if factor is None else self.inverse(factor, nugget)
 
-    def root(self, nugget: float) -> Floats | None:
-        """Return the lower root of the matrix with a nugget; None if it is singular."""
-        matrix = self.matrix.copy()
-        np.einsum("ii->i", matrix)[...] += nugget
-        root, singular = dpotrf(matrix, lower=True, clean=False)
-        return None if singular else root
+    def factor(self, nugget: float) -> Floats | None:
+        """Return the lower factor of the matrix with a nugget; None if it is singular."""
+        matrix = self.projected.copy()
+        np.einsum("ii->i", matrix)[...] += nugget * self.unit
+        factor, singular = dpotrf(matrix, lower=True, clean=False)
+        return None if singular else factor
 
-    def inverse(self, root: Floats, nugget: float) -> Floats:
-        """Return Q from the lower root."""
-        inverse, _ = dpotri(root, lower=True)
-        lower = np.tril(inverse, -1)
-        full = lower + lower.T
-        np.einsum("ii->i", full)[...] = np.einsum("ii->i", inverse)
-        full -= (self.basis / (self.sigma + nugget)) @ self.basis.T
+    def inverse(self, factor: Floats, nugget: float) -> Floats:
+        """Return Q from the lower factor."""
+        inverse, _ = dpotri(factor, lower=True)
+        full = np.tril(inverse) + np.tril(inverse, -1).T
+        full -= (self.basis / (self.sigma + nugget * self.unit)) @ self.basis.T
         return np.asarray(full)
+
+    def contrasts(self, y: Floats) -> Floats:
+        """Return P y, (n,)."""
+        return np.asarray(y - self.basis @ (self.basis.T @ y))
+
+    def trend(self, y: Floats, weights: Floats) -> Floats:
+        """Return the coefficients of the polynomials, (p,)."""
+        rest = self.basis.T @ (y - self.kernels @ weights)
+        return np.asarray(np.linalg.solve(self.root, rest))
 
 
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
@@ -334,18 +360,31 @@ def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
     return KERNELS[kernel](square)[0]
 
 
-def orthonormal(terms: Floats) -> Floats | None:
-    """Return an orthonormal basis (n, p) of polynomials at runs, (p, n); None if they depend."""
+def determine(terms: Floats) -> bool:
+    """Return whether runs determine polynomials, (p, n), and leave some to estimate an error."""
     if terms.shape[0] >= terms.shape[1]:
-        return None
-    basis, root = np.linalg.qr(terms.T)
-    sizes = np.abs(np.diag(root))
-    return basis if sizes.min() > 1e-10 * sizes.max() else None
+        return False
+    sizes = np.abs(np.diag(np.linalg.qr(terms.T, mode="r")))
+    return bool(sizes.min() > 1e-10 * sizes.max())
 
 
-def off_basis(basis: Floats, y: Floats) -> Floats:
-    """Return outputs (n, ...) less their part in an orthonormal basis (n, p)."""
-    return np.asarray(y - basis @ (basis.T @ y))
+def spread_of(z: Floats) -> Floats:
+    """Return the standard deviation of each input, (n, d) -> (d,), or one if it is constant."""
+    spread = z.std(axis=0)
+    return np.where(spread > 0, spread, 1.0)
+
+
+def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
+    """Return at most so many runs: half are those of the largest weights, others are spread."""
+    n = len(weights)
+    if n <= most:
+        return np.arange(n)
+    order = np.argsort(-weights, kind="stable")
+    n_important = min(most // 2, int((weights > weights.mean()).sum()))
+    spread = np.linspace(n_important, n - 1, most - n_important).astype(int)
+    # In the order of the runs, so that those of equal weights are spread over a sequence.
+    rest = np.sort(order[n_important:])[spread - n_important]
+    return np.sort(np.concatenate([order[:n_important], rest]))
 
 
 def fit_kriging(
@@ -354,82 +393,72 @@ def fit_kriging(
     weights: Floats,
     kernel: str,
     lengths: Floats,
-    degrees: list[int],
-    nuggets: list[float],
+    degrees: Sequence[int],
+    nuggets: Sequence[float],
 ) -> Kriging | None:
-    """Return the surface with the degree and nugget of the least left-out errors of each output.
+    """Return the surface of the degree and nugget with the least left-out errors.
 
-    Points (n, d) have outputs (n, m) of spread about one; ``weights``, (n,), of sum one, are those
-    of squared left-out errors. Nuggets are in units of the largest kernel. None if no system can be
-    solved.
+    Points (n, d) have outputs (n,) of spread about one; ``weights``, (n,), of sum one, are those
+    of squared left-out errors. Nuggets are in units of the largest kernel. Of too many runs a
+    part has the surface, and the others only test it. None if no system can be solved.
     """
-    n, m = y.shape
-    matrix = kernel_matrix(kernel, z / lengths)
-    unit = float(np.abs(matrix).max())
-    largest = Polynomials.of(z, max(degrees))
-    terms = largest(z)
-    of_degrees = largest.powers.sum(axis=1)
-    least = np.full(m, np.inf)
-    solution, left_out = np.zeros((n, m)), np.zeros((n, m))
-    coefficients = np.zeros((len(terms), m))
-    chosen, chosen_nuggets, scales = np.zeros(m, dtype=np.intp), np.zeros(m), np.zeros(m)
+    rows = spread_rows(weights, MOST_RUNS)
+    runs, outputs, weights = z[rows], y[rows], weights[rows] / weights[rows].sum()
+    matrix = kernel_matrix(kernel, runs / lengths)
+    best, least = None, np.inf
     for degree in degrees:
-        rows = terms[of_degrees <= degree]
-        basis = orthonormal(rows)
-        if basis is None:
+        terms = Polynomials.of(runs, degree)(runs)
+        if not determine(terms):
             continue
-        projected = Projected.of(matrix, basis)
-        contrasts = off_basis(basis, y)
+        system = System.of(matrix, *np.linalg.qr(terms.T))
         for nugget in nuggets:
-            inverse = projected.solved(nugget * unit)
+            inverse = system.solved(nugget)
             if inverse is None:
                 continue
+            contrasts = system.contrasts(outputs)
             w = inverse @ contrasts
-            # One step of iterative refinement: close runs make the matrix badly conditioned.
+            # Two steps of iterative refinement: close runs make the matrix badly conditioned.
             for _ in range(2):
-                rest = off_basis(basis, contrasts - matrix @ w - nugget * unit * w)
-                w += off_basis(basis, inverse @ rest)
-            unsolved = np.abs(inverse @ rest / np.diag(inverse)[:, None]).max(axis=0)
-            errors = w / np.diag(inverse)[:, None]
-            # Left-out errors are too small where the matrix is singular to rounding.
-            # Large weights have values that are rough by rounding, which roots need to be found.
-            rounding = np.finfo(float).eps * unit * np.linalg.norm(w, axis=0)
-            error = np.sqrt(weights @ errors**2) + unsolved + 100 * rounding
-            better = np.flatnonzero(error < 0.9 * least)
-            if not better.size:
-                continue
-            least[better] = error[better]
-            solution[:, better], left_out[:, better] = w[:, better], errors[:, better]
-            trend = np.linalg.lstsq(rows.T, y[:, better] - matrix @ w[:, better], rcond=None)[0]
-            coefficients[:, better] = 0
-            coefficients[: len(rows), better] = trend
-            chosen[better], chosen_nuggets[better] = degree, nugget
-            scales[better] = weights @ (errors[:, better] ** 2 * np.diag(inverse)[:, None])
-    if not np.isfinite(least).all():
-        return None
-    used = of_degrees <= chosen.max()
-    return Kriging(
-        *(z, kernel, lengths, solution, coefficients[used], chosen, chosen_nuggets),
-        *(left_out, least, scales),
-    )
+                rest = system.contrasts(contrasts - matrix @ w - nugget * system.unit * w)
+                w += system.contrasts(inverse @ rest)
+            precisions = np.diag(inverse)
+            left_out = w / precisions
+            # Left-out errors are too small where the matrix is singular to rounding, and large
+            # weights have values that are rough by rounding, which roots need to be found.
+            unsolved = np.abs(inverse @ rest / precisions).max()
+            rounding = np.finfo(float).eps * system.unit * np.linalg.norm(w)
+            error = float(np.sqrt(weights @ left_out**2) + unsolved + 100 * rounding)
+            if error < 0.9 * least:
+                least = error
+                best = Kriging(
+                    *(runs, outputs, rows, kernel, lengths, degree, nugget, w),
+                    *(system.trend(outputs, w), left_out, error),
+                    scale=float(weights @ (left_out**2 * precisions)),
+                )
+    if best is None or len(rows) == len(z):
+        return best
+    errors = y - best.values(z)
+    errors[rows] = best.left_out
+    return replace(best, left_out=errors)
 
 
 def likeliest(
-    kernel: str, x: Floats, y: Floats, basis: Floats, start: Floats | None = None
+    kernel: str, x: Floats, y: Floats, terms: Floats, start: Floats | None = None
 ) -> Floats:
     """Return log lengths and log nugget, (d + 1,), that maximise the likelihood of contrasts.
 
-    Points (n, d) have spread one. The search starts from the likelier one of ``start``, (d + 1,),
-    and of equal lengths; without it, from the likeliest equal lengths with little and much noise,
-    since long lengths alone miss a resonance, and short ones alone a near-polynomial.
+    Points (n, d) have spread one, outputs (n,), and polynomials (p, n). The search starts from the
+    likelier one of ``start``, (d + 1,), and of equal lengths; without it, from the likeliest equal
+    lengths with little and much noise, since long lengths alone miss a resonance, and short ones
+    alone a near-polynomial.
     """
     from scipy.optimize import minimize as scipy_minimize
 
     d = x.shape[1]
     bounds = [(np.log(0.05), np.log(200))] * d + [(np.log(1e-9), np.log(0.1))]
     low, high = np.array(bounds).T
-    contrasts = off_basis(basis, y)
-    problem = KERNELS[kernel], x, contrasts / np.sqrt((contrasts**2).mean()), basis
+    basis, root = np.linalg.qr(terms.T)
+    problem = KERNELS[kernel], x, y - basis @ (basis.T @ y), basis, root
 
     def value(parameters: Floats) -> float:
         return negative_log_likelihood(parameters, *problem)[0]
@@ -457,7 +486,7 @@ def likeliest(
 
 
 def negative_log_likelihood(
-    parameters: Floats, kernel: Kernel, x: Floats, y: Floats, basis: Floats
+    parameters: Floats, kernel: Kernel, x: Floats, y: Floats, basis: Floats, root: Floats
 ) -> tuple[float, Floats]:
     """Return minus the log posterior density of log lengths and log nugget, and its gradient.
 
@@ -472,14 +501,12 @@ def negative_log_likelihood(
     square = np.maximum(of_points[:, None] + of_points - 2 * scaled @ scaled.T, 0)
     np.einsum("ii->i", square)[...] = 0
     kernels, slope = kernel(square)
-    projected = Projected.of(kernels, basis)
-    root = projected.root(nugget)
-    if root is None:
+    system = System.of(kernels, basis, root)
+    factor = system.factor(nugget)
+    if factor is None:
         return 1e10, np.zeros(d + 1)
-    log_determinant = float(np.log(np.diag(root)).sum()) - 0.5 * p * np.log(
-        projected.sigma + nugget
-    )
-    inverse = projected.inverse(root, nugget)
+    log_determinant = np.log(np.diag(factor)).sum() - 0.5 * p * np.log(system.sigma + nugget)
+    inverse = system.inverse(factor, nugget)
     weights = inverse @ y
     variance = max(float(y @ weights) / (n - p), 1e-300)
     outer = np.outer(weights, weights / variance) - inverse

@@ -21,7 +21,7 @@ from scipy.special import bdtrc
 from prbayes._finding import Finding, report
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
-from prbayes.emulators.interpolant import fit_interpolant
+from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.proposals import Modes, Proposals
@@ -575,7 +575,7 @@ def refuse_unused_inputs(
     if d < 2 or m < d or is_finite.sum() < 4 * d:
         return
     z, outputs = z[is_finite], outputs[is_finite]
-    surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
+    surface = fit_emulator(z, outputs)
     _, jacobian = surface(z)
     spread = outputs.std(axis=0)
     values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])

@@ -29,6 +29,7 @@ from prbayes.model.data_checks import (
     repeat_findings,
     unreached,
 )
+from prbayes.emulators.runs import Runs as TableRuns
 from prbayes.model.measurement import SpecimenLikelihood, output_columns
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
@@ -111,7 +112,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         points = first.points
         refined, share = response_share(
             # A call of a table's surface is no run.
-            OfTables.of(likelihood, lambda table: table) if likelihood.has_table else runs,
+            OfTables.of(likelihood, TableRuns.__call__) if likelihood.has_table else runs,
             data,
             first.emulation,
             lambda share: Populations(likelihood).posterior(points.z, points.log_a, share=share),

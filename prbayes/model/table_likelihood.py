@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.continued import Continued, LeftOut
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import unlimited
@@ -38,13 +38,13 @@ class OfTables:
     of_conditions: float  # one for values of conditions, zero for their errors
 
     @classmethod
-    def of(cls, likelihood: SpecimenLikelihood, kind: Callable[[Runs], Any]) -> OfTables:
+    def of(cls, likelihood: SpecimenLikelihood, function: Callable[..., Any]) -> OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:
-            function, outputs = kind(_table(m)), m.responses.outputs
-            responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
-        is_error = kind is LeftOut
+            of_table, inputs = partial(function, _table(m)), m.responses.inputs
+            responses.append(Responses(m.name, of_table, inputs, outputs=m.responses.outputs))
+        is_error = function is left_out_nearby
         return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
 
     def __call__(self, z: Floats) -> Floats:
@@ -69,7 +69,7 @@ def points_of_tables(
     z, specimens = likely.sample(512, np.random.default_rng(data.seed))
     inside = _is_inside(z, ranges)
     if inside.sum() >= 4:
-        misfit = OfTables.of(likelihood, LeftOut)(z[inside])
+        misfit = OfTables.of(likelihood, left_out_nearby)(z[inside])
         error, bias = error_and_bias(data, emulation, likely, z[inside], specimens[inside], misfit)
         # The error of the comparison, if it is too large, narrows the population by half its share
         # of the variance. Beside a turning point its linear form would be far too large.
@@ -122,12 +122,12 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
         )
     z = np.unique(np.concatenate(runs), axis=0)
     z = z[np.isfinite(z).all(axis=1)]
-    y = OfTables.of(likelihood, lambda table: table)(z)
-    residuals = OfTables.of(likelihood, LeftOut)(z[near_readings(y, data.readings)])
+    y = OfTables.of(likelihood, Runs.__call__)(z)
+    residuals = OfTables.of(likelihood, left_out_nearby)(z[near_readings(y, data.readings)])
     error = 2 * np.sqrt((residuals**2).mean(axis=0))
     error = np.maximum(error, data.options.floor * data.readings.spread())
     # The noise of a process in double precision is far below its change over a thousandth.
-    surface = DifferencedResponse(OfTables.of(likelihood, Continued), step=1e-3)
+    surface = DifferencedResponse(OfTables.of(likelihood, continued), step=1e-3)
     return Emulation(z, y, surface, error, 0.0, ranges), ranges
 
 

@@ -341,7 +341,7 @@ def test_runs_are_added_while_the_error_could_narrow_a_population() -> None:
     """A population that is narrow beside the emulator's error at a distant mirror population."""
 
     def cosh(z: Floats) -> Floats:
-        return np.stack([z[:, 0] + 0.2 * z[:, 1], np.cosh(3 * z[:, 1] - 0.9)], axis=1)
+        return np.stack([z[:, 0] + 0.2 * z[:, 1], np.cosh(5 * z[:, 1] - 1.5)], axis=1)
 
     rng = np.random.default_rng(2)
     x = np.stack([rng.normal(0.2, 0.02, 15), rng.normal(0.35, 0.9, 15)], axis=1)
