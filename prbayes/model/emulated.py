@@ -31,12 +31,12 @@ from prbayes.model.specimen_likelihood import measurements_of, specimen_likeliho
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.importance import new_specimens
-from prbayes.specimens.coordinates import Coordinates
-from prbayes.specimens.emulation import Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Surface
 
 
 @dataclass(frozen=True)

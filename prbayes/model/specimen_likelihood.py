@@ -45,9 +45,9 @@ from prbayes.model.random_variable import (
 from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.model.unknown_error import ReadingDensity
 from prbayes.propagation.population_density import WeightedPoints
-from prbayes.specimens.response_share import ResponseShare
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
+from prbayes.specimens.response_share import ResponseShare
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:

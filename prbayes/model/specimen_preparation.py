@@ -17,19 +17,18 @@ from scipy.special import chdtri, ndtri
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
+from prbayes.emulators.runs import Runs as TableRuns
 from prbayes.model.data_checks import (
     check_failing_region,
     data_findings,
     emulator_findings,
     misfit_findings,
     outlier_findings,
-    refuse_undetermined,
     refuse_unreachable,
     refuse_unused_inputs,
     repeat_findings,
     unreached,
 )
-from prbayes.emulators.runs import Runs as TableRuns
 from prbayes.model.measurement import SpecimenLikelihood, output_columns
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
@@ -37,7 +36,6 @@ from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.population_density import WeightedPoints
-from prbayes.specimens.response_share import ResponseShare, response_share
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
@@ -45,6 +43,7 @@ from prbayes.specimens.design import emulate, first_runs, most_runs
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
 from prbayes.specimens.points import SpecimenData, SpecimenPoints, normal_of, specimen_points
 from prbayes.specimens.proposals import Proposals
+from prbayes.specimens.response_share import ResponseShare, response_share
 
 
 @dataclass(frozen=True, eq=False)

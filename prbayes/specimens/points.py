@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
 from scipy.special import ndtri
 
 from prbayes._validate import Floats
