@@ -310,17 +310,18 @@ def summary(bounds: dict[str, float], rows: list[Any]) -> dict[str, Any]:
 def table(results: dict[str, Any]) -> str:
     """Return a table of the rows, each with its verdict."""
     lines = [
-        f"{'case':34s} {'runs':>6s} {'CPU s':>6s} {'bias':>6s} {'widths':>12s} {'mass':>5s} verdict"
+        f"{'case':34s} {'runs':>6s} {'CPU s':>6s} {'bias':>6s} {'widths':>12s} {'mass':>5s} "
+        f"{'nats':>5s} verdict"
     ]
     for cell, rows in results["rows"].items():
         for row in rows:
-            shown = {k: f"{row[k]:.2f}" if k in row else "" for k in ("bias", "mass")}
+            shown = {k: f"{row[k]:.2f}" if k in row else "" for k in ("bias", "mass", "nats")}
             widths = f"{row['narrowest']:.2f} - {row['widest']:.2f}" if "narrowest" in row else ""
             missed = misses(CASES[cell].bounds, row)
             verdict = row.get("error") or (", ".join(missed) if missed else "met")
             lines.append(
                 f"{cell + ' /' + str(row['number']):34s} {row.get('runs', ''):>6} {row['cpu']:6.1f} "
-                f"{shown['bias']:>6s} {widths:>12s} {shown['mass']:>5s} {verdict}"
+                f"{shown['bias']:>6s} {widths:>12s} {shown['mass']:>5s} {shown['nats']:>5s} {verdict}"
             )
     return "\n".join(lines)
 
