@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import legder, legval
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from prbayes._validate import IN_CACHE, Floats
 
@@ -151,9 +151,11 @@ class Kriging:
 
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances at points, (k, d) -> (k,)."""
+        from scipy.linalg import solve_triangular
+
         system, kernel = self._system, KERNELS[self.kernel]
-        inverse = system.solved(self.nugget)
-        assert inverse is not None  # since the fit has solved the same system
+        factor = system.factor(self.nugget)
+        assert factor is not None  # since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
         for rows, _, square in self._distances(z):
             kernels = kernel(square)[0]  # (n, k)
@@ -162,24 +164,23 @@ class Kriging:
             trend = system.basis @ np.linalg.solve(system.root.T, self.polynomials(z[rows]))
             rest = kernels - system.kernels @ trend
             errors[rows] = at_zero - (trend * (kernels + rest)).sum(axis=0)
-            errors[rows] -= (rest * (inverse @ rest)).sum(axis=0)
+            # By the factor, as the digits of the inverse do not suffice for the difference.
+            solved = solve_triangular(factor, system.contrasts(rest), lower=True)
+            errors[rows] -= (solved**2).sum(axis=0)
         return np.maximum(errors, 0) * self.scale
 
     def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
-        """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...).
-
-        A surface without runs is the one through their left-out predictions in their place.
-        """
-        system, surfaces = self._system, []
-        inverse = system.solved(self.nugget)
-        assert inverse is not None  # since the fit has solved the same system
+        """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...)."""
+        surfaces = []
         for mask in masks[:, self.rows]:
-            y = self.y.copy()
-            y[mask] -= np.linalg.solve(inverse[np.ix_(mask, mask)], (inverse @ y)[mask])
-            weights = inverse @ system.contrasts(y)
-            weights[mask] = 0
-            coefficients = system.trend(y, weights)
-            surfaces.append(replace(self, weights=weights, coefficients=coefficients))
+            part = replace(self, z=self.z[~mask], y=self.y[~mask], rows=self.rows[~mask])
+            system = part._system
+            factor = system.factor(self.nugget)
+            if factor is None:
+                raise np.linalg.LinAlgError("interpolation: the remaining runs are singular")
+            weights, _ = system.weights(factor, part.y, self.nugget)
+            coefficients = system.trend(part.y, weights)
+            surfaces.append(replace(part, weights=weights, coefficients=coefficients))
         return surfaces
 
     @property
@@ -322,11 +323,6 @@ class System:
         projected -= half.T
         return cls(kernels, basis, root, projected, sigma, float(np.abs(kernels).max()))
 
-    def solved(self, nugget: float) -> Floats | None:
-        """Return Q, (n, n); None if the matrix is singular to rounding."""
-        factor = self.factor(nugget)
-        return None if factor is None else self.inverse(factor, nugget)
-
     def factor(self, nugget: float) -> Floats | None:
         """Return the lower factor of the matrix with a nugget; None if it is singular."""
         matrix = self.projected.copy()
@@ -344,6 +340,17 @@ class System:
     def contrasts(self, y: Floats) -> Floats:
         """Return P y, (n,)."""
         return np.asarray(y - self.basis @ (self.basis.T @ y))
+
+    def weights(self, factor: Floats, y: Floats, nugget: float) -> tuple[Floats, Floats]:
+        """Return the weights of outputs, (n,), and the last step of their refinement, (n,)."""
+        step = weights = np.zeros(len(y))
+        contrasts = self.contrasts(y)
+        # Two steps of iterative refinement: close runs make the matrix badly conditioned.
+        for _ in range(3):
+            rest = contrasts - self.kernels @ weights - nugget * self.unit * weights
+            step = self.contrasts(dpotrs(factor, self.contrasts(rest), lower=True)[0])
+            weights = weights + step
+        return weights, step
 
     def trend(self, y: Floats, weights: Floats) -> Floats:
         """Return the coefficients of the polynomials, (p,)."""
@@ -412,20 +419,15 @@ def fit_kriging(
             continue
         system = System.of(matrix, *np.linalg.qr(terms.T))
         for nugget in nuggets:
-            inverse = system.solved(nugget)
-            if inverse is None:
+            factor = system.factor(nugget)
+            if factor is None:
                 continue
-            contrasts = system.contrasts(outputs)
-            w = inverse @ contrasts
-            # Two steps of iterative refinement: close runs make the matrix badly conditioned.
-            for _ in range(2):
-                rest = system.contrasts(contrasts - matrix @ w - nugget * system.unit * w)
-                w += system.contrasts(inverse @ rest)
-            precisions = np.diag(inverse)
+            w, step = system.weights(factor, outputs, nugget)
+            precisions = np.diag(system.inverse(factor, nugget))
             left_out = w / precisions
             # Left-out errors are too small where the matrix is singular to rounding, and large
             # weights have values that are rough by rounding, which roots need to be found.
-            unsolved = np.abs(inverse @ rest / precisions).max()
+            unsolved = np.abs(step / precisions).max()
             rounding = np.finfo(float).eps * system.unit * np.linalg.norm(w)
             error = float(np.sqrt(weights @ left_out**2) + unsolved + 100 * rounding)
             if error < 0.9 * least:

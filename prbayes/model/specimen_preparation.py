@@ -321,7 +321,7 @@ class Populations:
     ) -> Floats:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
-        With `smoothing`, a covariance (d, d), populations are normal with the moments of the
+        With `smoothing`, a covariance of the coordinates without conditions, populations are normal with the moments of the
         coordinates z, and wider by it: the log-likelihood is then smooth.
         """
         n, count, d = z.shape
@@ -330,6 +330,7 @@ class Populations:
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = variables_at(self.hyperparameters, thetas)
+        free = ~likelihood.coordinates.is_condition
         contexts = likelihood.by_group if smoothing is None else likelihood.by_context
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
@@ -341,7 +342,8 @@ class Populations:
             for first in range(0, len(thetas), step):
                 block = slice(first, first + step)
                 at_block = [parent[block] for parent in parents]
-                logs = self._normal_log_density(at_block, z[rows].reshape(-1, d), smoothing)
+                at_points = z[rows].reshape(-1, d)[:, free]
+                logs = self._normal_log_density(at_block, at_points, smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
                 result[block, rows] = log_sum_exp(logs + weights[rows])
@@ -361,7 +363,9 @@ class Populations:
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
         sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
-        sample = self.likelihood.coordinates.of(sampler(parents, specimens, rng)[0], 2)
+        coordinates = self.likelihood.coordinates
+        sample = coordinates.of(sampler(parents, specimens, rng)[0], 2)
+        sample = sample[..., ~coordinates.is_condition]
         # Populations far from the prior may have inputs whose squares overflow.
         is_finite = (np.abs(sample) < 1e100).all(axis=(1, 2))
         sample[~is_finite] = 0.0

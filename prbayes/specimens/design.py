@@ -23,8 +23,10 @@ from prbayes.specimens.points import (
     Draws,
     SpecimenData,
     SpecimenPoints,
+    at_scale,
     draw_points,
     fit_proposals,
+    likely_scale,
     likely_weights,
     normal_of,
     reliable_draws,
@@ -86,12 +88,17 @@ class Likely:
         # Twice as wide: the population of the last round may have been too narrow.
         wide = Normal(population.mean, 2.0 * population.root)
         proposals = fit_proposals(data, emulation, wide)
-        if proposals.is_open:
-            draws, points, proposals = reliable_draws(data, proposals, 64, seed, enough=128)
+        count = 8 * proposals.modes.table.shape[1]
+        points = draw_points(data, proposals, count, seed)
+        scale = likely_scale(data, points, emulation.error)
+        if proposals.is_open(scale):
+            count = max(64, count)
+            draws, points, proposals = reliable_draws(
+                data, proposals, count, seed, scale, enough=2 * count
+            )
             population = normal_of(draws.specimens()[:, data.free])
         else:
-            count = 8 * proposals.modes.table.shape[1]
-            points = draw_points(data, proposals, count, seed)
+            points = at_scale(data, points, emulation.error, scale)
             has_point = np.isfinite(points.log_a).any(axis=1)
             z = points.z[has_point][..., data.free]
             population = Normal(*fit_normal(z, points.log_a[has_point]))
@@ -198,14 +205,15 @@ def error_and_bias(
     residuals = data.residuals(measured, likely.population)
     a = residuals.whitened(z)
     _, slopes = residuals.errors(specimens, a)
-    sd = residuals.sd[specimens]
+    sd = data.readings.comparison_sd(error)[specimens]
+    sd = np.where(data.is_read[specimens], sd, np.inf)
     # Shift of the inputs of a specimen that the error of the emulator causes.
     hessian = np.einsum("kmd,kme->kde", slopes, slopes) + np.eye(a.shape[1])
     gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
     shift = -np.einsum("kdm,km->kd", gain, misfit / sd)
     bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
     # m readings identify m of d directions; the posterior is wider than the formula assumes.
-    of_each = np.isfinite(data.comparison_sd(error)).sum(axis=1).mean()
+    of_each = data.is_read.sum(axis=1).mean()
     bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
     # The comparison allows the error at each specimen; what the runs have overestimated of it is
     # missing in the population's variance.

@@ -17,11 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import normal_log_density, normalised_weights
+from prbayes.propagation.population_density import (
+    fit_normal,
+    normal_log_density,
+    normalised_weights,
+)
 from prbayes.specimens.emulation import Emulation, half_difference
 from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
 
@@ -139,22 +144,24 @@ class SpecimenData:
         order = np.argsort(np.abs((z - middle) / width).max(axis=1), kind="stable")
         return self.prior[order[: int(0.95 * len(order))]]
 
-    def comparison_sd(self, emulator_error: Floats) -> Floats:
-        """Return standard deviations of the comparison, (N, m); infinite without a reading.
-
-        Conditions are known: their columns are no readings.
-        """
-        sd = self.readings.comparison_sd(emulator_error)
+    @property
+    def is_read(self) -> NDArray[np.bool_]:
+        """Which outputs of each specimen were read, (N, m); conditions are known instead."""
+        is_read = self.readings.is_measured
         n_known = self.known.shape[1] - len(self.free)
         if n_known:
-            sd[:, -n_known:] = np.inf
-        return sd
+            is_read[:, -n_known:] = False
+        return is_read
 
     def residuals(self, emulation: Emulation, population: Normal) -> Residuals:
         """Return the residuals of an emulator's outputs."""
-        target = np.where(self.readings.is_measured, self.readings.values, 0.0)
-        sd = self.comparison_sd(emulation.error)
-        return Residuals(emulation, target, sd, population, self.known)
+        readings, is_read = self.readings, self.is_read
+        relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
+        error = np.where(readings.is_relative, 0.0, readings.error)
+        sd = np.sqrt(emulation.error**2 + error**2 + readings.step**2 / 12)
+        target = np.where(is_read, readings.values, 0.0)
+        sd = np.where(is_read, sd, np.inf)
+        return Residuals(emulation, target, sd, relative, population, self.known)
 
 
 def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:
@@ -167,7 +174,7 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     # Candidates are not chosen by an output that a reading error dominates.
     error = np.median(data.readings.error_sd(residuals.target), axis=0)
     unit = np.hypot(data.readings.spread(), 10 * error)
-    unit = np.where(np.isinf(residuals.sd), np.inf, unit)
+    unit = np.where(data.is_read, unit, np.inf)
     starts = _starts(data, emulation, residuals, unit)
     parts = []
     for scale in sorted(data.scales, reverse=True):
@@ -247,23 +254,49 @@ def specimen_points(
     """
     options = data.options
     proposals = fit_proposals(data, emulation, population)
-    if proposals.is_open:
-        count = 32 * options.points
-        for refit in range(3):
-            draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit)
-            count = points.log_a.shape[1]
-            population = normal_of(draws.specimens()[:, data.free])
-            inflated = Normal(population.mean, 1.15 * population.root)
-            proposals = fit_proposals(data, emulation, inflated)
-        points = draw_points(data, proposals, count, data.seed)
-        weights = likely_weights(data, points, population)
-        mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
-        proposals = proposals.with_shares(mass)
-        return *agreeing_points(data, proposals, max(options.points, count // 2), draws), draws
     count = options.points * proposals.modes.table.shape[1]
     points = draw_points(data, proposals, 2 * count, data.seed)
-    draws = data.posterior(points.z, points.log_a, None)
-    return *agreeing_points(data, proposals, count, draws), draws
+    scale = likely_scale(data, points, emulation.error)
+    if not proposals.is_open(scale):
+        points = at_scale(data, points, emulation.error, scale)
+        draws = data.posterior(points.z, points.log_a, None)
+        return *agreeing_points(data, proposals, count, draws), draws
+    count = max(2 * count, 32 * options.points)
+    for refit in range(3):
+        draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit, scale)
+        count = points.log_a.shape[1]
+        population = normal_of(draws.specimens()[:, data.free])
+        inflated = Normal(population.mean, 1.15 * population.root)
+        proposals = fit_proposals(data, emulation, inflated)
+    points = draw_points(data, proposals, count, data.seed)
+    points = at_scale(data, points, emulation.error, scale)
+    weights = likely_weights(data, points, population)
+    mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
+    if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
+        proposals = proposals.with_shares(mass)
+    return *agreeing_points(data, proposals, count // 2, draws), draws
+
+
+def at_scale(
+    data: SpecimenData, points: SpecimenPoints, error: Floats, scale: float
+) -> SpecimenPoints:
+    """Return points with weights for readings whose errors are larger by a factor."""
+    if scale == 1.0:
+        return points
+    log_a = data.readings.scaled(scale).log_density(points.outputs, error) - points.log_proposal
+    return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
+
+
+def likely_scale(data: SpecimenData, points: SpecimenPoints, error: Floats) -> float:
+    """Return the factor of the readings' errors that a fitted normal population makes likeliest."""
+    totals = []
+    for scale in data.scales if len(data.scales) > 1 else ():
+        log_a = at_scale(data, points, error, scale).log_a
+        rows = np.isfinite(log_a).any(axis=1)
+        z = points.z[rows][..., data.free]
+        logs = log_a[rows] + normal_log_density(z, *fit_normal(z, log_a[rows]))
+        totals.append(log_sum_exp(logs).sum() if rows.all() else -np.inf)
+    return data.scales[int(np.argmax(totals))] if totals else 1.0
 
 
 def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Normal) -> Floats:
@@ -280,11 +313,11 @@ def agreeing_points(
     """Return points whose halves agree at draws, doubled from ``count`` in each half."""
     options = data.options
     # Along open inputs the error falls more slowly with the number of points.
-    largest = options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open else 1)
+    largest = options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open() else 1)
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
-        difference = _half_difference(data, proposals, halves, draws)
+        difference = _half_difference(data, proposals, halves, draws, data.scales)
         if difference <= largest:
             return replace(joined(*halves), difference=difference), proposals
         if 4 * count > most:
@@ -293,20 +326,17 @@ def agreeing_points(
 
 
 def _half_difference(
-    data: SpecimenData, proposals: Proposals, halves: Sequence[SpecimenPoints], draws: Draws
+    data: SpecimenData,
+    proposals: Proposals,
+    halves: Sequence[SpecimenPoints],
+    draws: Draws,
+    scales: Sequence[float],
 ) -> float:
-    """Return the Monte Carlo error over draws, and over the scales of an unknown error."""
-    logs = []
+    """Return the Monte Carlo error over draws, and over scales of an unknown error."""
+    error, logs = proposals.residuals.response.error, []
     for half in halves:
-        by_scale = []
-        for scale in data.scales:
-            log_a = half.log_a
-            if scale != 1.0:
-                readings = data.readings.scaled(scale)
-                error = proposals.residuals.response.error
-                log_a = readings.log_density(half.outputs, error) - half.log_proposal
-            by_scale.append(draws.log_likelihoods(half.z, log_a))
-        logs.append(np.concatenate(by_scale))
+        by_scale = [at_scale(data, half, error, scale) for scale in scales]
+        logs.append(np.concatenate([draws.log_likelihoods(p.z, p.log_a) for p in by_scale]))
     a, b = logs
     if data.gross_errors:
         typical = typical_specimens(proposals.modes, len(data.readings))
@@ -335,7 +365,12 @@ def typical_specimens(
 
 
 def reliable_draws(
-    data: SpecimenData, proposals: Proposals, count: int, seed: int, enough: int | None = None
+    data: SpecimenData,
+    proposals: Proposals,
+    count: int,
+    seed: int,
+    scale: float = 1.0,
+    enough: int | None = None,
 ) -> tuple[Draws, SpecimenPoints, Proposals]:
     """Return draws at which both halves of at least ``count`` points agree, and these points.
 
@@ -347,10 +382,10 @@ def reliable_draws(
     narrows = False
     while True:
         halves = [draw_points(data, proposals, count // 2, seed + h) for h in (0, 1000)]
-        points = joined(*halves)
+        points = at_scale(data, joined(*halves), proposals.residuals.response.error, scale)
         if not narrows:
             draws = data.posterior(points.z, points.log_a, None)
-            difference = _half_difference(data, proposals, halves, draws)
+            difference = _half_difference(data, proposals, halves, draws, (scale,))
             limit = per_hyperparameter(draws)
             if difference <= limit or count == enough:
                 return draws, points, proposals
@@ -359,9 +394,7 @@ def reliable_draws(
         previous = proposals.residuals.population
         covariance = previous.root @ previous.root.T
         smoothing = count ** (-2 / (len(covariance) + 4)) * covariance
-        whole = np.zeros((data.known.shape[1],) * 2)
-        whole[np.ix_(data.free, data.free)] = smoothing
-        specimens = data.posterior(points.z, points.log_a, whole).specimens()
+        specimens = data.posterior(points.z, points.log_a, smoothing).specimens()
         narrow = normal_of(specimens[:, data.free])
         root = np.linalg.cholesky(narrow.root @ narrow.root.T + smoothing)
         narrows = bool(np.diag(root).prod() < np.diag(previous.root).prod() / 2)

@@ -65,6 +65,7 @@ class Residuals:
     response: Response
     target: Floats  # (N, m): readings, any number where there is none
     sd: Floats  # (N, m): standard deviation of the comparison; infinite where there is no reading
+    relative: Floats  # (N, m): further error as a share of the output
     population: Normal  # of the reference, in coordinates z
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
 
@@ -95,10 +96,14 @@ class Residuals:
         for block in _blocks(count, m * self.known.shape[1]):
             i = specimen[block]
             values, jacobian = self.response(self.coordinates(i, a[block]))
-            sd = self.sd[i]
-            e[block] = np.where(np.isinf(sd), 0.0, (self.target[i] - values) / sd)
-            slope = (jacobian[:, :, self.free] @ self.population.root) / sd[:, :, None]
-            slopes[block] = np.where(np.isinf(sd)[:, :, None], 0.0, slope)
+            relative, is_read = self.relative[i], np.isfinite(self.sd[i])
+            variance = self.sd[i] ** 2 + (relative * values) ** 2
+            residual, sd = self.target[i] - values, np.sqrt(variance)
+            # The error of a relative reading changes with the output.
+            by_output = (1 + residual * relative**2 * values / variance) / sd
+            slope = jacobian[:, :, self.free] @ self.population.root
+            e[block] = np.where(is_read, residual / sd, 0.0)
+            slopes[block] = np.where(is_read[:, :, None], by_output[:, :, None] * slope, 0.0)
         return e, slopes
 
 
@@ -160,7 +165,9 @@ def find_modes(
     """
     n, count, d = starts.shape
     specimen = np.repeat(np.arange(n), count)
-    exact = replace(residuals, sd=scale * residuals.sd)
+    exact = replace(
+        residuals, sd=scale * residuals.sd, relative=scale * residuals.relative
+    )
     # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
     # the valley's lowest point with a larger error, then the readings themselves.
     soft = replace(exact, sd=np.maximum(exact.sd, 0.03 * _typical_change(residuals, starts)))
@@ -216,8 +223,8 @@ def _minimised(
         a[rows], e[rows], slopes[rows] = trial[better], new_e[better], new_slopes[better]
         value[rows] = new_value[better]
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
-        # A gain of a thousandth nat is none; a rejected step that is this short is rounding.
-        unfinished = (gain > 1e-3) & (length > 1e-11) & (damping[active] < 1e11)
+        # A gain of 1e-6 nats is none; a rejected step that is this short is rounding.
+        unfinished = (gain > 1e-6) & (length > 1e-11) & (damping[active] < 1e11)
         active = active[unfinished]
     return a, value, e, slopes
 
@@ -242,7 +249,7 @@ def _distinct(
         along = np.einsum("nkmd,nkd->nkm", slopes[better], difference)
         square = (along**2).sum(axis=2) + precision * (difference**2).sum(axis=2)
         is_near = np.abs(difference).max(axis=2) < 1e-5
-        is_same = is_near | (square < 1.0)
+        is_same = is_near | (square < 1e-4)
         is_mode[:, k] &= ~(is_same & is_mode[:, :k]).any(axis=1)
     return np.asarray(table[is_mode])
 
@@ -310,7 +317,7 @@ class Proposals:
                     continue
                 value, jacobian = sorted_.mapped(at, sorted_.modes.a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
-                is_in_bulk = (value**2).mean(axis=1) < 2.0
+                is_in_bulk = (value**2).sum(axis=1) < 1.0
                 is_in_bulk &= (sign == sorted_.orientation[at]) & (log_det > own_log_det[at] - 1.0)
                 at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
                 end, _, _, converged = sorted_.solved(at, value)
@@ -318,18 +325,20 @@ class Proposals:
                 kept[rows[converged & is_reached]] = False
         return sorted_.rows(np.flatnonzero(kept))
 
-    @property
-    def is_open(self) -> bool:
-        """Whether readings leave inputs of a tenth of the specimens open.
+    def is_open(self, scale: float = 1.0) -> bool:
+        """Return whether readings leave inputs of a tenth of the specimens open.
 
-        Along an open direction their precision is less than a hundred times the population's.
+        Along an open direction their precision is less than four times the population's. With a
+        larger one the reference population has little influence. ``scale`` is the likely factor of
+        the readings' errors.
         """
         _, m, d = self.modes.slopes.shape
         if m < d:
             return True
-        slopes = self.modes.slopes / self.modes.scale[:, None, None]
+        rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
+        slopes = self.modes.slopes[rows] / scale
         least = np.linalg.svd(slopes, compute_uv=False)[:, -1] ** 2
-        return bool(np.quantile(least, 0.1) < 100.0)
+        return bool(np.quantile(least, 0.1) < 4.0)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
@@ -353,7 +362,7 @@ class Proposals:
         a = self.modes.a[mode].copy()
         value, jacobian = self.mapped(mode, a)
         fraction = np.ones(len(a))
-        converged = np.zeros(len(a), dtype=bool)
+        converged, last = np.zeros(len(a), dtype=bool), np.full(len(a), np.inf)
         active = np.arange(len(a))
         for _ in range(25):
             step = _solutions(jacobian[active], xi[active] - value[active])
@@ -370,8 +379,12 @@ class Proposals:
             a[to], value[to] = trial[accepted], new_value[accepted]
             jacobian[to] = new_jacobian[accepted]
             fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
-            converged[active] = np.abs(xi[active] - value[active]).max(axis=1) < 0.01
-            active = active[~converged[active]]
+            distance = np.abs(xi[active] - value[active]).max(axis=1)
+            converged[active] = distance < 0.01
+            # Rounding of the emulator may end the decrease.
+            unfinished = (distance > 1e-6) & ~((distance < 0.01) & (distance > last[active] / 2))
+            last[active] = distance
+            active = active[unfinished]
         log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
         return a, value, log_det, converged
 
@@ -436,6 +449,8 @@ class Proposals:
         """
         modes = self.modes
         table = modes.table[modes.specimen[mode]]
+        # A specimen with one mode at each scale of its errors has one sheet of points.
+        size = np.bincount(modes.specimen)[modes.specimen] / len(np.unique(modes.scale))
         terms = [own + np.log(counts[mode])]
         for slot in range(table.shape[1]):
             at = table[:, slot]
@@ -448,8 +463,11 @@ class Proposals:
                 density = log_det - (value**2).sum(axis=1) / 2 + np.log(counts[at])
                 matters = (sign == self.orientation[at]) & (density > terms[0][rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
-                end, _, _, converged = self.solved(at, value[matters])
-                is_reached = converged & (np.abs(end - a[rows]).max(axis=1, initial=0) < 1e-3)
+                is_reached = size[at] <= 1
+                check = np.flatnonzero(~is_reached)
+                end, _, _, converged = self.solved(at[check], value[matters][check])
+                distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
+                is_reached[check] = converged & (distance < 1e-3)
                 term[rows[is_reached]] = density[is_reached]
             terms.append(term)
         return log_sum_exp(np.stack(terms, axis=1))
