@@ -46,7 +46,8 @@ def residuals_of(
 ) -> Residuals:
     nothing = np.full((len(y), len(reference.mean)), np.nan)
     sd = np.broadcast_to(np.asarray(sd, dtype=float), y.shape)
-    return Residuals(response, y, sd, reference, nothing if known is None else known)
+    known = nothing if known is None else known
+    return Residuals(response, y, sd, np.zeros_like(y), reference, known)
 
 
 def proposals_of(residuals: Residuals, scales: tuple[float, ...] = (1.0,)) -> Proposals:
@@ -65,6 +66,7 @@ def log_likelihoods(
     n, k, d = z.shape
     values = residuals.response(z.reshape(-1, d))[0].reshape(n, k, -1)
     sd = scale * residuals.sd[:, None]
+    sd = np.hypot(sd, scale * residuals.relative[:, None] * values)
     log_y = norm(0, sd).logpdf(residuals.target[:, None] - values)
     log_y = np.where(np.isinf(sd), 0.0, log_y).sum(axis=2)
     free = z[..., residuals.free].reshape(n * k, -1)
@@ -150,6 +152,7 @@ def test_one_point_is_exact_of_a_linear_response_and_the_reference(
 # Standard errors of log L with 1024 points: largest root mean square error of a specimen, 8 seeds.
 LINEAR_ERROR = 9e-4
 KNOWN_ERROR, PARTIAL_ERROR, SCALE_ERROR = 4e-3, 8e-4, 4e-3
+RELATIVE_ERROR = 1e-3
 UNEVEN_ERROR, TURNING_ERROR = 3e-3, 4e-3  # the latter of 8192 points
 CURVED_ERRORS = {"radius": 4.8e-3, "ring": 4.3e-3, "parabola": 2.0e-3, "cubic": 2e-5}
 
@@ -181,7 +184,7 @@ def test_both_sides_of_a_turning_point(low: float, high: float) -> None:
     assert np.abs(error).max() < 5 * TURNING_ERROR
 
 
-@pytest.mark.parametrize("name", ["parabola", "cubic"])
+@pytest.mark.parametrize("name", ["ring", "parabola", "cubic"])
 def test_modes_in_the_bulk_of_others_are_not_needed(name: str) -> None:
     p = curved_problem(name)
     # Two proposals at each mode: the copies go.
@@ -260,6 +263,18 @@ def test_points_serve_all_scales_of_an_unknown_error(scale: float) -> None:
     exact = multivariate_normal(a @ p.population.mean, cov).logpdf(p.y)
     error = log_likelihoods(proposals, p.population, 1024, scale=scale) - exact
     assert np.abs(error).max() < 5 * SCALE_ERROR
+
+
+def test_relative_errors_are_shares_of_the_output() -> None:
+    """y = exp(a) (1 + .3 error), with readings that are improbable for every output."""
+    y, share = np.array([0.3, 0.5, 1.0, 3.0, -0.05])[:, None], 0.3
+    grid = np.linspace(-8, 8, 40_001)
+    density = norm(0.2, 0.7).pdf(grid) * norm(np.exp(grid), share * np.exp(grid)).pdf(y)
+    exact = np.log(density.sum(axis=1) * (grid[1] - grid[0]))
+    residuals = residuals_of(differentiated(np.exp), y, 1e-6, independent([0.0], [1.0]))
+    relative = replace(residuals, relative=np.full_like(y, share))
+    error = log_likelihoods(proposals_of(relative), independent([0.2], [0.7]), 1024) - exact
+    assert np.abs(error).max() < 5 * RELATIVE_ERROR
 
 
 def test_inputs_without_a_response_are_no_points() -> None:
@@ -346,6 +361,6 @@ def test_modes_within_the_gap_are_kept(sd: float, count: int) -> None:
 def test_inputs_are_open_where_readings_say_less_than_the_population() -> None:
     reference = independent([0.0, 0.0], [1.0, 1.0])
     two, one = np.eye(2), np.eye(2)[:1]
-    for a, sd, expected in ((two, 0.01, False), (two, [0.01, 0.2], True), (one, 0.01, True)):
+    for a, sd, expected in ((two, 0.01, False), (two, [0.01, 0.7], True), (one, 0.01, True)):
         y = np.zeros((3, len(a)))
-        assert proposals_of(residuals_of(linear(a), y, sd, reference)).is_open is expected
+        assert proposals_of(residuals_of(linear(a), y, sd, reference)).is_open() is expected
