@@ -144,7 +144,7 @@ def test_fewer_readings_than_inputs_need_few_runs() -> None:
     # Points are along the inputs that have the reading.
     away = np.abs(underdetermined(points.z.reshape(-1, 2)) - points.outputs.reshape(-1, 1))
     assert np.median(away) < 0.01
-    assert points.z.std(axis=1).min() > 0.05
+    assert (points.z.std(axis=1).min(axis=0) > [0.03, 0.07]).all()
 
 
 @pytest.mark.parametrize(("mean", "sd"), [(0.3, 0.02), (1.2, 0.1)])
