@@ -6,6 +6,7 @@ Coordinates are unconstrained: logarithms of positive hyperparameters, logits of
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,9 @@ def log_posterior(
     return function
 
 
-def on_grid(log_density: LogDensity, low: Any, high: Any, refinements: int = 1, points: int = 61):
+def on_grid(
+    log_density: LogDensity, low: Any, high: Any, refinements: int = 1, points: int = 61
+) -> tuple[Any, Any, Any]:
     """Return cells' centres (S, q), weights (S,), and the weights as an array of the whole grid.
 
     Cells within 25 nats of the highest, and their neighbours, are split in three in each direction.
@@ -89,10 +92,11 @@ def on_grid(log_density: LogDensity, low: Any, high: Any, refinements: int = 1, 
     return u, weights, whole
 
 
-def modes(u: Any, weights: Any, whole: Any, least: float = 0.01) -> list[dict[str, Any]]:
+def modes(u: Any, weights: Any, whole: Any, least: float = 1e-4) -> list[dict[str, Any]]:
     """Return mass, mean and standard deviation of each mode of a grid, in the coordinates.
 
-    A cell belongs to the local maximum that steepest ascent over neighbours leads to.
+    A cell belongs to the local maximum that steepest ascent over neighbours leads to. Modes whose means
+    are within two standard deviations of their difference are one.
     """
     shape, size = whole.shape, whole.size
     order = np.arange(size).reshape(shape)
@@ -107,24 +111,35 @@ def modes(u: Any, weights: Any, whole: Any, least: float = 0.01) -> list[dict[st
         target = target[target]
     label = target[np.flatnonzero(whole.ravel() > 0)]
     inside = weights > 0
-    result = []
-    for peak in np.unique(label):
-        w, x = weights[inside][label == peak], u[inside][label == peak]
-        if w.sum() > least:
-            mean = w @ x / w.sum()
-            sd = np.sqrt(w @ (x - mean) ** 2 / w.sum())
-            result.append({"mass": float(w.sum()), "mean": mean.tolist(), "sd": sd.tolist()})
-    return result
+    u, weights = u[inside], weights[inside]
+
+    def described(peak: Any) -> tuple[float, Any, Any]:
+        w, x = weights[label == peak], u[label == peak]
+        mean = w @ x / w.sum()
+        return float(w.sum()), mean, np.sqrt(w @ (x - mean) ** 2 / w.sum())
+
+    parts = {peak: described(peak) for peak in np.unique(label)}
+    parts = {peak: part for peak, part in parts.items() if part[0] > least}
+    while close := [
+        (a, b)
+        for a, b in combinations(parts, 2)
+        if (np.abs(parts[a][1] - parts[b][1]) < 2 * np.hypot(parts[a][2], parts[b][2])).all()
+    ]:
+        a, b = close[0]
+        label[label == b] = a
+        parts[a] = described(a)
+        del parts[b]
+    return [{"mass": w, "mean": m.tolist(), "sd": s.tolist()} for w, m, s in parts.values()]
 
 
-def masses(found: list[dict[str, Any]], u: Any, weights: Any) -> Any:
-    """Return the mass of weighted points at each mode, by normal classification."""
+def classified(found: list[dict[str, Any]], u: Any) -> Any:
+    """Return the number of the mode of each point (S,), by normal classification."""
     logs = [
         np.log(mode["mass"])
         - (np.log(mode["sd"]) + 0.5 * ((u - mode["mean"]) / np.array(mode["sd"])) ** 2).sum(axis=1)
         for mode in found
     ]
-    return np.bincount(np.argmax(logs, axis=0), weights, len(found))
+    return np.argmax(logs, axis=0)
 
 
 def importance(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pymc as pm
 
 from benchmarks.scoreboard.problem import Draws, Problem
@@ -13,6 +14,7 @@ _PRIORS: dict[str, Any] = {
     "halfnorm": lambda name, _, scale: pm.HalfNormal(name, scale),
     "beta": lambda name, a, b: pm.Beta(name, a, b),
     "uniform": lambda name, low, width: pm.Uniform(name, low, low + width),
+    "lognorm": lambda name, s, _, scale: pm.LogNormal(name, np.log(scale), s),
     "truncnorm": lambda name, low, _, mean, sd: pm.TruncatedNormal(
         name, mean, sd, lower=mean + low * sd
     ),

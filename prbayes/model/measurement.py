@@ -108,7 +108,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
-    """Readings of S specimens in M outputs: those of all simulators, then exact conditions."""
+    """Readings of S specimens in the M outputs of all simulators."""
 
     readings: Readings  # repeated readings of an output by their weighted mean, with its error
     scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
@@ -119,6 +119,7 @@ class StackedReadings:
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
     conditions: Floats | None  # (S, C)
+    coordinates: Floats | None  # (S, C): those of the conditions
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
@@ -126,7 +127,7 @@ class StackedReadings:
         first = measurements[0]
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
-        conditions = None
+        conditions = coordinates = None
         variables = [first.inputs.aleatory[place] for place in first.inputs.conditions]
         if variables:
             conditions = np.empty((size, len(variables)))
@@ -136,8 +137,6 @@ class StackedReadings:
                 kind = f"values of {variable.name}"
                 conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)
                 coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
-            zero = np.zeros(conditions.shape)
-            parts.append((Readings.exact(coordinates), zero, Repeats(zero, zero, zero)))
         readings, scales, repeats = zip(*parts, strict=True)
         groups = None
         if first.groups is not None:
@@ -162,6 +161,7 @@ class StackedReadings:
             covariates,
             log_gross,
             conditions,
+            coordinates,
         )
 
 

@@ -155,8 +155,6 @@ class Runs:
         measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
         parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
-        # Conditions are outputs that were read exactly.
-        parts.append(z[:, likelihood.coordinates.is_condition])
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
@@ -201,11 +199,10 @@ def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 2.5) -> tuple[f
 def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     """Return the specimens, what is known of them, and the populations of the model."""
     populations = Populations(likelihood)
-    coordinates, conditions = likelihood.coordinates, likelihood.stacked.conditions
+    coordinates, conditions = likelihood.coordinates, likelihood.stacked.coordinates
     known = np.full((len(likelihood.readings), coordinates.size), np.nan)
     if conditions is not None:
-        n_known = conditions.shape[1]
-        known[:, coordinates.is_condition] = likelihood.readings.values[:, -n_known:]
+        known[:, coordinates.is_condition] = conditions
     return SpecimenData(
         likelihood.readings,
         known,

@@ -35,7 +35,6 @@ class OfTables:
 
     coordinates: Coordinates
     responses: tuple[Responses, ...]
-    of_conditions: float  # one for values of conditions, zero for their errors
 
     @classmethod
     def of(cls, likelihood: SpecimenLikelihood, function: Callable[..., Any]) -> OfTables:
@@ -44,15 +43,13 @@ class OfTables:
         for m in likelihood.measurements:
             of_table, inputs = partial(function, _table(m)), m.responses.inputs
             responses.append(Responses(m.name, of_table, inputs, outputs=m.responses.outputs))
-        is_error = function is left_out_nearby
-        return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
+        return cls(likelihood.coordinates, tuple(responses))
 
     def __call__(self, z: Floats) -> Floats:
         """Return values by output; no run is counted."""
         inputs = self.coordinates.inputs(z)
         with unlimited():
             parts = [response(inputs, []).reshape(len(z), -1) for response in self.responses]
-        parts.append(self.of_conditions * z[:, self.coordinates.is_condition])
         return np.concatenate(parts, axis=1)
 
 

@@ -206,14 +206,13 @@ def error_and_bias(
     a = residuals.whitened(z)
     _, slopes = residuals.errors(specimens, a)
     sd = data.readings.comparison_sd(error)[specimens]
-    sd = np.where(data.is_read[specimens], sd, np.inf)
     # Shift of the inputs of a specimen that the error of the emulator causes.
     hessian = np.einsum("kmd,kme->kde", slopes, slopes) + np.eye(a.shape[1])
     gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
     shift = -np.einsum("kdm,km->kd", gain, misfit / sd)
     bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
     # m readings identify m of d directions; the posterior is wider than the formula assumes.
-    of_each = data.is_read.sum(axis=1).mean()
+    of_each = data.readings.is_measured.sum(axis=1).mean()
     bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
     # The comparison allows the error at each specimen; what the runs have overestimated of it is
     # missing in the population's variance.

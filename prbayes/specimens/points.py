@@ -144,24 +144,16 @@ class SpecimenData:
         order = np.argsort(np.abs((z - middle) / width).max(axis=1), kind="stable")
         return self.prior[order[: int(0.95 * len(order))]]
 
-    @property
-    def is_read(self) -> NDArray[np.bool_]:
-        """Which outputs of each specimen were read, (N, m); conditions are known instead."""
-        is_read = self.readings.is_measured
-        n_known = self.known.shape[1] - len(self.free)
-        if n_known:
-            is_read[:, -n_known:] = False
-        return is_read
-
     def residuals(self, emulation: Emulation, population: Normal) -> Residuals:
         """Return the residuals of an emulator's outputs."""
-        readings, is_read = self.readings, self.is_read
+        readings, is_read = self.readings, self.readings.is_measured
         relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
         error = np.where(readings.is_relative, 0.0, readings.error)
-        sd = np.sqrt(emulation.error**2 + error**2 + readings.step**2 / 12)
+        error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
         target = np.where(is_read, readings.values, 0.0)
-        sd = np.where(is_read, sd, np.inf)
-        return Residuals(emulation, target, sd, relative, population, self.known)
+        return Residuals(
+            emulation, target, emulation.error, error, relative, population, self.known
+        )
 
 
 def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:
@@ -174,7 +166,7 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     # Candidates are not chosen by an output that a reading error dominates.
     error = np.median(data.readings.error_sd(residuals.target), axis=0)
     unit = np.hypot(data.readings.spread(), 10 * error)
-    unit = np.where(data.is_read, unit, np.inf)
+    unit = np.where(data.readings.is_measured, unit, np.inf)
     starts = _starts(data, emulation, residuals, unit)
     parts = []
     for scale in sorted(data.scales, reverse=True):
@@ -233,10 +225,6 @@ def draw_points(
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
     outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
-    n_known = d - len(data.free)
-    if n_known:  # a condition is read exactly: its density is a constant
-        constant = -np.log(emulation.error[-n_known:]) - 0.5 * np.log(2 * np.pi)
-        log_proposal = log_proposal + constant.sum()
     log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
@@ -333,7 +321,7 @@ def _half_difference(
     scales: Sequence[float],
 ) -> float:
     """Return the Monte Carlo error over draws, and over scales of an unknown error."""
-    error, logs = proposals.residuals.response.error, []
+    error, logs = proposals.residuals.emulator_error, []
     for half in halves:
         by_scale = [at_scale(data, half, error, scale) for scale in scales]
         logs.append(np.concatenate([draws.log_likelihoods(p.z, p.log_a) for p in by_scale]))
@@ -382,7 +370,7 @@ def reliable_draws(
     narrows = False
     while True:
         halves = [draw_points(data, proposals, count // 2, seed + h) for h in (0, 1000)]
-        points = at_scale(data, joined(*halves), proposals.residuals.response.error, scale)
+        points = at_scale(data, joined(*halves), proposals.residuals.emulator_error, scale)
         if not narrows:
             draws = data.posterior(points.z, points.log_a, None)
             difference = _half_difference(data, proposals, halves, draws, (scale,))

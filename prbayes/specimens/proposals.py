@@ -64,8 +64,9 @@ class Residuals:
 
     response: Response
     target: Floats  # (N, m): readings, any number where there is none
-    sd: Floats  # (N, m): standard deviation of the comparison; infinite where there is no reading
-    relative: Floats  # (N, m): further error as a share of the output
+    emulator_error: Floats  # (m,): standard deviation of the emulator's error
+    error: Floats  # (N, m): standard deviation of the reading; infinite where there is none
+    relative: Floats  # (N, m): further error of the reading as a share of the output
     population: Normal  # of the reference, in coordinates z
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
 
@@ -86,21 +87,26 @@ class Residuals:
         return np.asarray(centred @ np.linalg.inv(self.population.root).T)
 
     @np.errstate(all="ignore")
-    def errors(self, specimen: Indices, a: Floats) -> tuple[Floats, Floats]:
+    def errors(
+        self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
+    ) -> tuple[Floats, Floats]:
         """Return standardised errors e, (k, m), and G = -de/da, (k, m, free).
 
-        NaN without a response.
+        ``scale`` is a factor of the readings' errors, a number or (k,). NaN without a response.
         """
         count, m = len(a), self.target.shape[1]
+        factors = np.broadcast_to(np.square(scale), (count,))[:, None]
         e, slopes = np.empty((count, m)), np.empty((count, m, a.shape[1]))
         for block in _blocks(count, m * self.known.shape[1]):
             i = specimen[block]
             values, jacobian = self.response(self.coordinates(i, a[block]))
-            relative, is_read = self.relative[i], np.isfinite(self.sd[i])
-            variance = self.sd[i] ** 2 + (relative * values) ** 2
+            is_read, factor = np.isfinite(self.error[i]), factors[block]
+            relative = factor * self.relative[i] ** 2
+            variance = self.emulator_error**2 + factor * self.error[i] ** 2
+            variance = variance + relative * values**2
             residual, sd = self.target[i] - values, np.sqrt(variance)
             # The error of a relative reading changes with the output.
-            by_output = (1 + residual * relative**2 * values / variance) / sd
+            by_output = (1 + residual * relative * values / variance) / sd
             slope = jacobian[:, :, self.free] @ self.population.root
             e[block] = np.where(is_read, residual / sd, 0.0)
             slopes[block] = np.where(is_read[:, :, None], by_output[:, :, None] * slope, 0.0)
@@ -123,7 +129,7 @@ class Modes:
     misfit: Floats  # (R,): half the squared standardised errors, in nats
     errors: Floats  # (R, m)
     slopes: Floats  # (R, m, free): G
-    scale: Floats  # (R,): factor of the standard deviations of the comparison
+    scale: Floats  # (R,): factor of the readings' errors
 
     @classmethod
     def joined(cls, parts: Sequence[Modes]) -> Modes:
@@ -157,7 +163,7 @@ def find_modes(
     """Find the modes of each specimen by Levenberg-Marquardt [1]_ from starts, (N, S, free).
 
     The population is wide: it has this precision, relative to the reference. A mode within ``gap``
-    nats of the specimen's best is kept. ``scale`` is a factor of the standard deviations.
+    nats of the specimen's best is kept. ``scale`` is a factor of the readings' errors.
 
     References
     ----------
@@ -165,14 +171,12 @@ def find_modes(
     """
     n, count, d = starts.shape
     specimen = np.repeat(np.arange(n), count)
-    exact = replace(
-        residuals, sd=scale * residuals.sd, relative=scale * residuals.relative
-    )
     # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
     # the valley's lowest point with a larger error, then the readings themselves.
-    soft = replace(exact, sd=np.maximum(exact.sd, 0.03 * _typical_change(residuals, starts)))
-    a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40)[0]
-    a, value, e, slopes = _minimised(exact, specimen, a, precision, 20)
+    change = 0.03 * _typical_change(residuals, starts)
+    soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
+    a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
+    a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
     rows = _distinct(specimen, a, value, slopes, precision, gap)
     rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
     misfit = (e[rows] ** 2).sum(axis=1) / 2
@@ -190,11 +194,16 @@ def _typical_change(residuals: Residuals, starts: Floats) -> Floats:
 
 
 def _minimised(
-    residuals: Residuals, specimen: Indices, a: Floats, precision: float, iterations: int
+    residuals: Residuals,
+    specimen: Indices,
+    a: Floats,
+    precision: float,
+    iterations: int,
+    scale: float,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return local minima of half the squared residuals, their values, errors and slopes."""
     a, d = a.copy(), a.shape[1]
-    e, slopes = residuals.errors(specimen, a)
+    e, slopes = residuals.errors(specimen, a, scale)
 
     def objective(a: Floats, e: Floats) -> Floats:
         value = (e**2).sum(axis=1) / 2 + precision * (a**2).sum(axis=1) / 2
@@ -215,7 +224,7 @@ def _minimised(
         length = np.sqrt((step**2).sum(axis=1))
         step /= np.maximum(length, 1.0)[:, None]
         trial = a[active] + step
-        new_e, new_slopes = residuals.errors(specimen[active], trial)
+        new_e, new_slopes = residuals.errors(specimen[active], trial, scale)
         new_value = objective(trial, new_e)
         better = new_value < value[active]
         gain = np.where(better, value[active] - new_value, np.inf)
@@ -336,15 +345,13 @@ class Proposals:
         if m < d:
             return True
         rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
-        slopes = self.modes.slopes[rows] / scale
-        least = np.linalg.svd(slopes, compute_uv=False)[:, -1] ** 2
+        least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
         return bool(np.quantile(least, 0.1) < 4.0)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
-        e, slopes = self.residuals.errors(self.modes.specimen[mode], a)
-        scale = self.modes.scale[mode]
-        e, slopes = e / scale[:, None], slopes / scale[:, None, None]
+        modes = self.modes
+        e, slopes = self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
         return xi, inputs + readings @ slopes
