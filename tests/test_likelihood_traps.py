@@ -361,7 +361,7 @@ def test_errors_come_before_further_runs() -> None:
                 model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
             )
         )
-    assert sum(runs) <= 64 + 3  # three single ones: specimens by themselves have the same response
+    assert sum(runs) <= 10 + 3  # three single ones: specimens by themselves have the same response
 
 
 def shift(

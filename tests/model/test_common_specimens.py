@@ -202,7 +202,7 @@ def test_errors_of_both_simulators_may_be_variables() -> None:
         prb.Simulator("a", up, x, observed=Y[A, 0], specimens=A, metric=metric(error=e))
         b = metric(error=0.2)
         prb.Simulator("b", down, x, 3.0, observed=Y[B, 1], specimens=B, metric=b)
-    ours = log_density(fine(model, 32), "b")
+    ours = log_density(fine(model, 128), "b")
     assert_without_a_graph(model, "b", ours)
     for error in (0.25, 0.4):
         assert_close(
