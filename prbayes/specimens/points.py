@@ -171,9 +171,10 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     parts = []
     for scale in sorted(data.scales, reverse=True):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
-        parts.append(modes)
-        starts = _as_starts(modes, starts)
-    return Proposals.at_modes(residuals, Modes.joined(parts)).without_covered()
+        proposals = Proposals.at_modes(residuals, modes).without_covered()
+        parts.append(proposals.covering(starts, scale).modes)
+        starts = _as_starts(parts[-1], starts)
+    return Proposals.at_modes(residuals, Modes.joined(parts))
 
 
 def _starts(
@@ -261,7 +262,9 @@ def specimen_points(
             break
     points = draw_points(data, proposals, count, data.seed)
     points = at_scale(data, points, emulation.error, scale)
-    weights = likely_weights(data, points, population)
+    # A branch that only a wide population reaches has its points, too.
+    wide = Normal(population.mean, 2.5 * population.root)
+    weights = sum(likely_weights(data, points, normal) for normal in (population, wide))
     mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
     if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
         proposals = proposals.with_shares(mass)

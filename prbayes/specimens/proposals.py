@@ -440,7 +440,8 @@ class Proposals:
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
         own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
-        log_q[rows] = self._log_mixture(mode[rows], a[rows], own, counts)
+        drawn = mode[rows], own
+        log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], counts, drawn)
         log_q[rows] -= d / 2 * np.log(2 * np.pi)
         log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
         a[~converged] = 0.0
@@ -452,28 +453,43 @@ class Proposals:
         by_specimen[specimen, slot], owner[specimen, slot] = log_q, mode
         return z, by_specimen, owner
 
-    def _log_mixture(self, mode: Indices, a: Floats, own: Floats, counts: Indices) -> Floats:
-        """Return the log of the sum of the densities of all modes that reach the points.
+    def log_mixture(
+        self,
+        specimen: Indices,
+        a: Floats,
+        weights: Floats,
+        drawn: tuple[Indices, Floats] | None = None,
+    ) -> Floats:
+        """Return logs of weighted sums of the densities of all modes that reach points, (k,).
 
-        Densities are weighted by the modes' numbers of points.
+        ``weights`` are of the modes, (R,). ``drawn`` has the mode that drew each point and the log
+        of its density there, up to a constant, both (k,).
         """
         modes = self.modes
-        table = modes.table[modes.specimen[mode]]
         # A specimen with one mode at each scale of its errors has one sheet of points.
         size = np.bincount(modes.specimen)[modes.specimen] / len(np.unique(modes.scale))
-        terms = [own + np.log(counts[mode])]
+        table = modes.table[specimen]
+        with np.errstate(divide="ignore"):
+            logs = np.log(weights)
+        largest = np.full(len(a), -np.inf)
+        terms = []
+        if drawn is not None:
+            terms = [drawn[1] + logs[drawn[0]]]
+            largest = terms[0]
         for slot in range(table.shape[1]):
             at = table[:, slot]
-            rows = np.flatnonzero((at >= 0) & (at != mode) & (counts[at] > 0))
+            rows = np.flatnonzero((at >= 0) & (weights[at] > 0))
+            if drawn is not None:
+                rows = rows[at[rows] != drawn[0][rows]]
             term = np.full(len(a), -np.inf)
             if rows.size:
                 at = at[rows]
                 value, jacobian = self.mapped(at, a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
-                density = log_det - (value**2).sum(axis=1) / 2 + np.log(counts[at])
-                matters = (sign == self.orientation[at]) & (density > terms[0][rows] - 10)
+                density = log_det - (value**2).sum(axis=1) / 2 + logs[at]
+                matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
-                is_reached = size[at] <= 1
+                is_reached = (size[at] <= 1) & (drawn is not None)
                 check = np.flatnonzero(~is_reached)
                 end, _, _, converged = self.solved(at[check], value[matters][check])
                 distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
@@ -481,6 +497,44 @@ class Proposals:
                 term[rows[is_reached]] = density[is_reached]
             terms.append(term)
         return log_sum_exp(np.stack(terms, axis=1))
+
+    def covering(self, starts: Floats, scale: float, most: int = 4) -> Proposals:
+        """Return proposals with further ones where the fibre of a specimen is not covered.
+
+        A proposal ends at folds. Points at which the readings are met, nearest to starts
+        (N, S, free), are not covered if their importance under a wide population is more than
+        three times that of the modes; the most important one gets a proposal.
+        """
+        residuals, result = self.residuals, self
+        n, count, d = starts.shape
+        specimen = np.repeat(np.arange(n), count)
+        a, _, e, slopes = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)
+        misfit = (e**2).sum(axis=1) / 2
+        least = np.full(n, np.inf)
+        np.minimum.at(least, self.modes.specimen, self.modes.misfit)
+        rows = np.flatnonzero(misfit <= least[specimen] + 10.0)
+        points = Modes(
+            specimen[rows], a[rows], misfit[rows], e[rows], slopes[rows], np.full(len(rows), scale)
+        )
+
+        def importance(modes: Modes) -> Floats:
+            log_q = result.log_mixture(modes.specimen, modes.a, result.share)
+            return np.asarray(-0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q)
+
+        for _ in range(most):
+            usual = np.full(n, -np.inf)
+            of_modes = importance(result.modes)
+            np.maximum.at(usual, result.modes.specimen, np.where(np.isfinite(of_modes), of_modes, -np.inf))
+            excess = importance(points) - usual[points.specimen]
+            excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
+            order = np.lexsort((-excess, points.specimen))
+            first = order[np.unique(points.specimen[order], return_index=True)[1]]
+            added = first[excess[first] > np.log(3.0)]
+            if not added.size:
+                break
+            modes = Modes.joined([result.modes, points.rows(added)])
+            result = Proposals.at_modes(residuals, modes)
+        return result
 
 
 @np.errstate(all="ignore")
