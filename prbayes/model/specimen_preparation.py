@@ -181,7 +181,7 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
     return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
 
-def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 2.5) -> tuple[float, ...]:
+def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
     """Return factors of the readings' errors that span the central 98 % of an unknown error's prior."""
     ends = []
     for m in likelihood.measurements:
@@ -449,8 +449,8 @@ class PopulationDraws:
     thetas: Floats
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        """Return log p(y_i | theta) at the draws, (S, N)."""
-        return self.populations.log_likelihoods(self.thetas, z, log_a)
+        """Return log p(y_i | theta) at a quarter of the draws, (S, N)."""
+        return self.populations.log_likelihoods(self.thetas[::4], z, log_a)
 
     def log_share(self, share: ResponseShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""

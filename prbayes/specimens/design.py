@@ -29,7 +29,6 @@ from prbayes.specimens.points import (
     likely_scale,
     likely_weights,
     normal_of,
-    reliable_draws,
     specimen_points,
 )
 from prbayes.specimens.proposals import Normal, Proposals
@@ -88,20 +87,15 @@ class Likely:
         # Twice as wide: the population of the last round may have been too narrow.
         wide = Normal(population.mean, 2.0 * population.root)
         proposals = fit_proposals(data, emulation, wide)
-        count = 8 * proposals.modes.table.shape[1]
+        count = max(8 * proposals.modes.table.shape[1], 64 if proposals.is_open() else 0)
         points = draw_points(data, proposals, count, seed)
         scale = likely_scale(data, points, emulation.error)
-        if proposals.is_open(scale):
-            count = max(64, count)
-            draws, points, proposals = reliable_draws(
-                data, proposals, count, seed, scale, enough=2 * count
-            )
-            population = normal_of(draws.specimens()[:, data.free])
-        else:
-            points = at_scale(data, points, emulation.error, scale)
-            has_point = np.isfinite(points.log_a).any(axis=1)
-            z = points.z[has_point][..., data.free]
-            population = Normal(*fit_normal(z, points.log_a[has_point]))
+        points = at_scale(data, points, emulation.error, scale)
+        has_point = np.isfinite(points.log_a).any(axis=1)
+        z = points.z[has_point][..., data.free]
+        # A few steps of EM: along inputs that the readings leave open a fit would collapse.
+        start = None if not proposals.is_open(scale) else population
+        population = Normal(*fit_normal(z, points.log_a[has_point], start))
         return cls(proposals, points, population, likely_weights(data, points, population))
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:
@@ -125,11 +119,14 @@ def emulate(
     population = normal_of(data.inner[:, data.free])
     most = data.options.max_runs or most_runs(data.known.shape[1])
     rng = np.random.default_rng([data.seed, 1])
-    batches = 0
+    # An emulator of other data needs one batch, which measures its error at these.
+    batches, enough = 0, 2 if previous is None else 1
+    if previous is not None:
+        emulation = replace(emulation, bias=np.inf)
     while True:
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
-        if emulation.bias <= data.options.bias and batches >= 2:
+        if emulation.bias <= data.options.bias and batches >= enough:
             points, proposals, draws = specimen_points(data, emulation, wider(population))
             emulation, passed = audited(run, data, emulation, proposals, points, draws, rng)
             if passed:
@@ -137,7 +134,8 @@ def emulate(
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
             require_accurate(data, emulation)
-        emulation = extended(run, data, emulation, likely, rng)
+        count = max(data.options.sampled + 2, len(emulation.z) // 2 if previous is None else 0)
+        emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
 
 
@@ -151,10 +149,10 @@ def extended(
     data: SpecimenData,
     emulation: Emulation,
     likely: Likely,
+    count: int,
     rng: np.random.Generator,
 ) -> Emulation:
-    """Return the emulation with a batch of runs, at most half of those so far."""
-    count = max(data.options.sampled + 2, len(emulation.z) // 2)
+    """Return the emulation with a batch of ``count`` runs."""
     n_explored = max(2, count // 8)
     n_sampled = max(data.options.sampled, (count - n_explored) // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
@@ -181,7 +179,15 @@ def joined(
     misfit = outputs[: len(sampled)] - emulation.surface.values(sampled)
     error, bias = error_and_bias(data, emulation, likely, sampled, specimens, misfit)
     z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
-    surface, _, _ = fit_surface(z, y, data.readings, data.name, emulation.surface)
+    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface)
+    # The misfit is that of the emulator without these runs. Left-out errors at them show what
+    # they have improved.
+    at_sampled = left_out[len(emulation.z) :][: len(sampled)]
+    at_sampled = at_sampled[np.isfinite(at_sampled).all(axis=1)]
+    if np.isfinite(bias) and len(at_sampled):
+        improved = 2 * np.sqrt((at_sampled**2).mean(axis=0))
+        floor = data.options.floor * data.readings.spread()
+        error = np.maximum(np.minimum(error, improved), floor)
     return Emulation(z, y, surface, error, bias)
 
 

@@ -248,21 +248,24 @@ def specimen_points(
     if not proposals.is_open(scale):
         points = at_scale(data, points, emulation.error, scale)
         draws = data.posterior(points.z, points.log_a, None)
-        return *agreeing_points(data, proposals, count, draws), draws
+        return *agreeing_points(data, proposals, count, draws, scale), draws
     count = max(2 * count, 32 * options.points)
     for refit in range(3):
         draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit, scale)
         count = points.log_a.shape[1]
-        population = normal_of(draws.specimens()[:, data.free])
+        previous, population = population, normal_of(draws.specimens()[:, data.free])
         inflated = Normal(population.mean, 1.15 * population.root)
         proposals = fit_proposals(data, emulation, inflated)
+        change = np.linalg.solve(previous.root, population.root)
+        if np.abs(change - np.eye(len(change))).max() < 0.2:
+            break
     points = draw_points(data, proposals, count, data.seed)
     points = at_scale(data, points, emulation.error, scale)
     weights = likely_weights(data, points, population)
     mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
     if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
         proposals = proposals.with_shares(mass)
-    return *agreeing_points(data, proposals, count // 2, draws), draws
+    return *agreeing_points(data, proposals, count // 2, draws, scale), draws
 
 
 def at_scale(
@@ -296,17 +299,25 @@ def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Norma
 
 
 def agreeing_points(
-    data: SpecimenData, proposals: Proposals, count: int, draws: Draws
+    data: SpecimenData, proposals: Proposals, count: int, draws: Draws, scale: float = 1.0
 ) -> tuple[SpecimenPoints, Proposals]:
-    """Return points whose halves agree at draws, doubled from ``count`` in each half."""
+    """Return points whose halves agree at draws, doubled from ``count`` in each half.
+
+    ``scale`` is the likely factor of an unknown error; over all factors the limit is wider.
+    """
     options = data.options
+    over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
     # Along open inputs the error falls more slowly with the number of points.
-    largest = options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open() else 1)
+    largest = options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open(scale) else 1)
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
-        difference = _half_difference(data, proposals, halves, draws, data.scales)
-        if difference <= largest:
+        difference = _half_difference(data, proposals, halves, draws, (scale,))
+        if difference <= largest and (
+            len(data.scales) == 1
+            or count >= 512
+            or _half_difference(data, proposals, halves, draws, data.scales) <= over_scales
+        ):
             return replace(joined(*halves), difference=difference), proposals
         if 4 * count > most:
             raise _monte_carlo_error(data.name, 2 * count, difference, largest)
@@ -358,14 +369,12 @@ def reliable_draws(
     count: int,
     seed: int,
     scale: float = 1.0,
-    enough: int | None = None,
 ) -> tuple[Draws, SpecimenPoints, Proposals]:
     """Return draws at which both halves of at least ``count`` points agree, and these points.
 
     Where points lie farther apart than populations are wide, the likely populations are those
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
-    narrow the reference population, until it narrows no more; then points are doubled. With
-    ``enough`` points the draws are returned in any case, otherwise a DesignError is raised.
+    narrow the reference population, until it narrows no more; then points are doubled.
     """
     narrows = False
     while True:
@@ -375,7 +384,7 @@ def reliable_draws(
             draws = data.posterior(points.z, points.log_a, None)
             difference = _half_difference(data, proposals, halves, draws, (scale,))
             limit = per_hyperparameter(draws)
-            if difference <= limit or count == enough:
+            if difference <= limit:
                 return draws, points, proposals
             if 2 * count > data.options.most_points:
                 raise _monte_carlo_error(data.name, count, difference, limit)

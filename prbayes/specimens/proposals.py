@@ -281,6 +281,7 @@ class Proposals:
     inputs: Floats  # (R, free, free): D V'
     readings: Floats  # (R, free, m): D S U'
     orientation: Floats  # (R,): sign of the map's determinant at the mode
+    log_det: Floats  # (R,): log of its size
     share: Floats  # (R,): mixing weight among the modes of the specimen
 
     @classmethod
@@ -298,24 +299,24 @@ class Proposals:
         readings[:, :rank] = (scale * inverse)[:, :rank, None] * of_left
         orientation = np.sign(np.linalg.det(vt))
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
-        return cls(residuals, modes, inverse[:, :, None] * vt, readings, orientation, share)
+        log_det = -np.log(inverse).sum(axis=1)
+        maps = inverse[:, :, None] * vt, readings, orientation, log_det
+        return cls(residuals, modes, *maps, share)
 
     def rows(self, index: Indices) -> Proposals:
         """Return the proposals of selected modes, with equal mixing weights."""
-        arrays = self.inputs[index], self.readings[index], self.orientation[index]
+        maps = self.inputs, self.readings, self.orientation, self.log_det
         modes = self.modes.rows(index)
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
-        return Proposals(self.residuals, modes, *arrays, share)
+        return Proposals(self.residuals, modes, *(values[index] for values in maps), share)
 
     def without_covered(self) -> Proposals:
         """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
         modes = self.modes
-        order = np.lexsort((modes.misfit, modes.specimen))
+        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
         sorted_ = self.rows(order)
         table = sorted_.modes.table
         kept = np.ones(len(order), dtype=bool)
-        _, own = sorted_.mapped(np.arange(len(order)), sorted_.modes.a)
-        own_log_det = np.linalg.slogdet(own)[1]
         for k in range(1, table.shape[1]):
             for better in range(k):
                 pairs = table[:, k] >= 0
@@ -327,7 +328,7 @@ class Proposals:
                 value, jacobian = sorted_.mapped(at, sorted_.modes.a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
                 is_in_bulk = (value**2).sum(axis=1) < 1.0
-                is_in_bulk &= (sign == sorted_.orientation[at]) & (log_det > own_log_det[at] - 1.0)
+                is_in_bulk &= (sign == sorted_.orientation[at]) & (log_det > sorted_.log_det[at] - 1.0)
                 at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
                 end, _, _, converged = sorted_.solved(at, value)
                 is_reached = np.abs(end - sorted_.modes.a[rows]).max(axis=1, initial=0) < 1e-2
@@ -387,11 +388,13 @@ class Proposals:
             jacobian[to] = new_jacobian[accepted]
             fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
             distance = np.abs(xi[active] - value[active]).max(axis=1)
-            converged[active] = distance < 0.01
-            # Rounding of the emulator may end the decrease.
-            unfinished = (distance > 1e-6) & ~((distance < 0.01) & (distance > last[active] / 2))
+            # Rounding of the emulator may end the decrease. At a fold, where the determinant
+            # vanishes, a small distance may be one to values that no inputs have.
+            is_regular = np.linalg.slogdet(jacobian[active])[1] > self.log_det[mode[active]] - 1.0
+            is_last = (distance < 0.01) & (distance > last[active] / 2) & is_regular
+            converged[active] = (distance < 1e-6) | is_last
             last[active] = distance
-            active = active[unfinished]
+            active = active[~converged[active]]
         log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
         return a, value, log_det, converged
 
