@@ -130,9 +130,11 @@ def test_smooth_responses_need_few_runs(function: Callable[[Floats], Floats], x:
     is_point = np.isfinite(points.log_a)
     away = np.abs(points.outputs - function(x)[:, None]) / emulation.error
     assert np.quantile(away[is_point], 0.9) < 5
-    # The emulator's error there, whose standard deviation is half of the stated one
+    # Twice the emulator's error at the specimens' inputs is stated; it is small at mirror inputs.
     misfit = np.abs(function(points.z[is_point]) - points.outputs[is_point])
-    assert np.sqrt((misfit**2).mean(axis=0)) == pytest.approx(0, abs=1.5 * emulation.error.max())
+    assert (misfit.max(axis=0) < 0.01 * function(x).std(axis=0)).all()
+    at_inputs = function(x) - emulation.values(x)
+    assert (np.sqrt((at_inputs**2).mean(axis=0)) < 2 * emulation.error).all()
 
 
 def test_fewer_readings_than_inputs_need_few_runs() -> None:

@@ -47,7 +47,7 @@ def residuals_of(
     nothing = np.full((len(y), len(reference.mean)), np.nan)
     sd = np.broadcast_to(np.asarray(sd, dtype=float), y.shape)
     known = nothing if known is None else known
-    return Residuals(response, y, sd, np.zeros_like(y), reference, known)
+    return Residuals(response, y, np.zeros(y.shape[1]), sd, np.zeros_like(y), reference, known)
 
 
 def proposals_of(residuals: Residuals, scales: tuple[float, ...] = (1.0,)) -> Proposals:
@@ -65,7 +65,7 @@ def log_likelihoods(
     z, log_q, _ = proposals.draw(count, seed)
     n, k, d = z.shape
     values = residuals.response(z.reshape(-1, d))[0].reshape(n, k, -1)
-    sd = scale * residuals.sd[:, None]
+    sd = scale * residuals.error[:, None]
     sd = np.hypot(sd, scale * residuals.relative[:, None] * values)
     log_y = norm(0, sd).logpdf(residuals.target[:, None] - values)
     log_y = np.where(np.isinf(sd), 0.0, log_y).sum(axis=2)
