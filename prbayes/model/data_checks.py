@@ -465,8 +465,8 @@ def data_findings(
 def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
-    Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
+    Far is more than three widths of the range of the runs, outputs (n, m), over the populations of
+    the prior. An output that is constant, as at time zero, is one of the error of its readings.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
@@ -492,7 +492,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
                 "least one; leave the output out, or check the limits"
             )
         beyond = np.maximum(values - high[j], low[j] - values)
-        if values.size and (beyond > width).all():
+        if values.size and (beyond > 3 * width).all():
             raise DesignError(
                 f"{name}: got readings from {values.min():.4g} to {values.max():.4g}, but "
                 f"{low[j]:.4g} to {high[j]:.4g} for {output} at {len(finite)} runs over the range "

@@ -41,7 +41,13 @@ from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
 from prbayes.specimens.design import emulate, first_runs, most_runs
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
-from prbayes.specimens.points import SpecimenData, SpecimenPoints, normal_of, specimen_points
+from prbayes.specimens.points import (
+    SpecimenData,
+    SpecimenPoints,
+    draw_points,
+    normal_of,
+    specimen_points,
+)
 from prbayes.specimens.proposals import Proposals
 from prbayes.specimens.response_share import ResponseShare, response_share
 
@@ -67,6 +73,21 @@ def prepared(likelihood: SpecimenLikelihood) -> Preparation:
         likelihood.cache["preparation"] = _prepare(likelihood)
     preparation: Preparation = likelihood.cache["preparation"]
     return preparation
+
+
+def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> SpecimenLikelihood:
+    """Return the likelihood with at least so many points of each specimen; no run is needed.
+
+    The log-likelihood of a population needs fewer points than the inputs of a specimen.
+    """
+    preparation = prepared(likelihood)
+    if preparation.points.log_a.shape[1] >= count:
+        return likelihood
+    data = specimen_data(likelihood)
+    points = draw_points(data, preparation.proposals, count, data.seed + 1)
+    result = replace(likelihood)
+    result.cache["preparation"] = replace(preparation, points=points)
+    return result
 
 
 def is_prepared(likelihood: SpecimenLikelihood) -> bool:
@@ -182,7 +203,7 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 
 def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
-    """Return factors of the readings' errors that span the central 98 % of an unknown error's prior."""
+    """Return factors of the readings' errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
         if "error" in m.extras:
@@ -215,9 +236,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     )
 
 
-def _emulate(
-    runs: Runs, data: SpecimenData, emulation: Emulation | None
-) -> Preparation:
+def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Return the emulator, the points and findings of both."""
     likelihood = runs.likelihood
     if likelihood.has_table:
@@ -318,8 +337,8 @@ class Populations:
     ) -> Floats:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
-        With `smoothing`, a covariance of the coordinates without conditions, populations are normal with the moments of the
-        coordinates z, and wider by it: the log-likelihood is then smooth.
+        With `smoothing`, a covariance of the coordinates without conditions, populations are normal
+        with the moments of the coordinates z, and wider by it: the log-likelihood is then smooth.
         """
         n, count, d = z.shape
         likelihood = self.likelihood
@@ -399,7 +418,12 @@ class Populations:
         d = names.size
 
         def log_likelihood(thetas: Floats) -> Floats:
-            total = self.log_likelihoods(thetas, z, log_a, smoothing).sum(axis=1)
+            logs = self.log_likelihoods(thetas, z, log_a, smoothing)
+            if self.likelihood.measurements[0].gross_errors is not False:
+                # A share of specimens that leaves outliers without influence on the population.
+                log_gross = np.log(0.1) + self.likelihood.stacked.log_gross
+                logs = np.logaddexp(np.log(0.9) + logs, log_gross)
+            total = logs.sum(axis=1)
             return total if share is None else total - self.log_share(thetas, share)
 
         thetas = names.prior_points(2048, seed)

@@ -30,6 +30,7 @@ from prbayes.specimens.points import (
     likely_weights,
     normal_of,
     specimen_points,
+    typical_specimens,
 )
 from prbayes.specimens.proposals import Normal, Proposals
 
@@ -64,7 +65,9 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
         z[:, column] = values
     y = run(z)
     while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
-        more = data.inner[np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)]
+        more = data.inner[
+            np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)
+        ]
         z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
     surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
     rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
@@ -92,19 +95,29 @@ class Likely:
         scale = likely_scale(data, points, emulation.error)
         points = at_scale(data, points, emulation.error, scale)
         has_point = np.isfinite(points.log_a).any(axis=1)
+        if data.gross_errors:
+            has_point &= typical_specimens(proposals.modes, len(has_point))
         z = points.z[has_point][..., data.free]
         # A few steps of EM: along inputs that the readings leave open a fit would collapse.
         start = None if not proposals.is_open(scale) else population
         population = Normal(*fit_normal(z, points.log_a[has_point], start))
         return cls(proposals, points, population, likely_weights(data, points, population))
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:
+    def sample(
+        self, count: int, rng: np.random.Generator, weights: Floats | None = None
+    ) -> tuple[Floats, NDArray[np.intp]]:
         """Return likely inputs, (count, d), and their specimens; different specimens first."""
-        n = len(self.weights)
+        weights = self.weights if weights is None else weights
+        n = len(weights)
         specimens = np.concatenate([rng.permutation(n) for _ in range(-(-count // n))])[:count]
-        totals = np.cumsum(self.weights[specimens], axis=1)
+        totals = np.cumsum(weights[specimens], axis=1)
         places = (totals < rng.random((count, 1)) * totals[:, -1:]).sum(axis=1)
         return self.points.z[specimens, places], specimens
+
+    def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
+        """Return inputs, (count, d), that are likely under a population twice as wide as the fit."""
+        wide = Normal(self.population.mean, 2.0 * self.population.root)
+        return self.sample(count, rng, likely_weights(data, self.points, wide))[0]
 
 
 def emulate(
@@ -153,15 +166,19 @@ def extended(
     rng: np.random.Generator,
 ) -> Emulation:
     """Return the emulation with a batch of ``count`` runs."""
+    n_possible = max(2, count // 4)
     n_explored = max(2, count // 8)
-    n_sampled = max(data.options.sampled, (count - n_explored) // 2)
+    n_sampled = max(data.options.sampled, (count - n_explored - n_possible) // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
+    possible = likely.possible(data, n_possible, rng)
     around, _ = likely.sample(8 * count, rng)
     sd = np.sqrt((likely.population.root**2).sum(axis=1))
     around[:, data.free] += 0.4 * sd * rng.standard_normal((len(around), len(sd)))
-    far = _farthest(data, np.concatenate([emulation.z, sampled]), around, count - n_sampled - n_explored, sd)
-    explored = _explored(data, emulation, np.concatenate([emulation.z, sampled, far]), n_explored, rng)
-    return joined(run, data, emulation, likely, sampled, specimens, np.concatenate([far, explored]))
+    runs = np.concatenate([emulation.z, sampled, possible])
+    far = _farthest(data, runs, around, count - n_sampled - n_possible - n_explored, sd)
+    explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
+    others = np.concatenate([far, explored])
+    return joined(run, data, emulation, likely, sampled, specimens, possible, others)
 
 
 def joined(
@@ -171,15 +188,26 @@ def joined(
     likely: Likely,
     sampled: Floats,
     specimens: NDArray[np.intp],
+    possible: Floats,
     others: Floats,
 ) -> Emulation:
-    """Return the emulation with runs at fresh points; the sampled ones give its error and bias."""
-    fresh = np.concatenate([sampled, others])
+    """Return the emulation with runs at fresh points.
+
+    The sampled points give its error and bias. At those that are possible under a wide population
+    a coarser error is allowed.
+    """
+    fresh = np.concatenate([sampled, possible, others])
     outputs = run(fresh)
-    misfit = outputs[: len(sampled)] - emulation.surface.values(sampled)
-    error, bias = error_and_bias(data, emulation, likely, sampled, specimens, misfit)
+    count = len(sampled) + len(possible)
+    misfit = outputs[:count] - emulation.surface.values(fresh[:count])
+    at_possible = misfit[len(sampled) :]
+    error, bias = error_and_bias(
+        data, emulation, likely, sampled, specimens, misfit[: len(sampled)]
+    )
+    bias = max(bias, _bias_of_possible(data, at_possible))
     z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
-    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface)
+    rows = _near_population(data, z, likely.population)
+    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
     # The misfit is that of the emulator without these runs. Left-out errors at them show what
     # they have improved.
     at_sampled = left_out[len(emulation.z) :][: len(sampled)]
@@ -189,6 +217,20 @@ def joined(
         floor = data.options.floor * data.readings.spread()
         error = np.maximum(np.minimum(error, improved), floor)
     return Emulation(z, y, surface, error, bias)
+
+
+def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
+    """Return misfits (n, m) at possible inputs as a bias that is too large above ``largest``.
+
+    The limit is in units of the data's spread and the readings' errors.
+    """
+    readings = data.readings
+    error = np.median(readings.error_sd(np.nan_to_num(readings.values)), axis=0)
+    scaled = misfit / np.hypot(readings.spread(), error)
+    scaled = np.clip(scaled[np.isfinite(scaled).all(axis=1)], -3.0, 3.0)
+    if not len(scaled):
+        return 0.0
+    return float(data.options.bias / largest * np.sqrt((scaled**2).mean(axis=0).max()))
 
 
 def error_and_bias(
@@ -227,6 +269,20 @@ def error_and_bias(
     return error, float(max(bias, narrowing))
 
 
+def _near_population(
+    data: SpecimenData, z: Floats, population: Normal, far: float = 6.0
+) -> NDArray[np.bool_]:
+    """Return which runs are near a population, (n,), at least twice those of the first batch.
+
+    A response that oscillates in the tails of a vague prior needs short lengths there alone.
+    """
+    a = np.linalg.solve(population.root, (z[:, data.free] - population.mean).T)
+    distance = (a**2).sum(axis=0)
+    least = 2 * first_runs(z.shape[1])
+    limit = max(far**2, float(np.sort(distance)[min(least, len(z)) - 1]))
+    return np.asarray(distance <= limit)
+
+
 def _farthest(
     data: SpecimenData, runs: Floats, candidates: Floats, count: int, sd: Floats
 ) -> Floats:
@@ -249,9 +305,11 @@ def _explored(
     known = ~np.isnan(data.known[0])
     z[:, known] = data.known[rng.integers(0, len(data.known), len(z))][:, known]
     readings, spread = data.readings, data.readings.spread()
-    low = np.nanmin(readings.values, axis=0) - 2 * spread
-    high = np.nanmax(readings.values, axis=0) + 2 * spread
-    values = emulation.values(z)
+    # What the emulator says of a place without runs may be wrong: its own deviation counts.
+    deviation = spread + 3 * np.sqrt(emulation.surface.variance(z))
+    values = emulation.surface.values(z)
+    low = np.nanmin(readings.values, axis=0) - deviation
+    high = np.nanmax(readings.values, axis=0) + deviation
     is_possible = ((values >= low) & (values <= high)).all(axis=1)
     if is_possible.sum() >= count:
         z = z[is_possible]
@@ -279,16 +337,26 @@ def audited(
     sd = np.sqrt((population.root**2).sum(axis=1))
     scale = np.ones(emulation.z.shape[1])
     scale[data.free] = sd
-    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in np.concatenate([emulation.z, sampled])], axis=0)
+    runs = np.concatenate([emulation.z, sampled])
+    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
     rows = farthest_rows(candidates / scale, data.options.sampled // 2, squares)
-    z, specimens = np.concatenate([sampled, candidates[rows]]), np.concatenate([specimens, owners[rows]])
+    z, specimens = (
+        np.concatenate([sampled, candidates[rows]]),
+        np.concatenate([specimens, owners[rows]]),
+    )
+    possible = likely.possible(data, data.options.sampled // 4, rng)
+    n_audited = len(z)
+    z = np.concatenate([z, possible])
     y = run(z)
     misfit = y - emulation.surface.values(z)
-    error, bias = error_and_bias(data, emulation, likely, z, specimens, misfit)
+    at_audited = z[:n_audited], specimens, misfit[:n_audited]
+    error, bias = error_and_bias(data, emulation, likely, *at_audited)
+    bias = max(bias, _bias_of_possible(data, misfit[n_audited:]))
     all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, y])
     if bias <= 1.5 * data.options.bias:
         return replace(emulation, z=all_z, y=all_y, bias=max(bias, emulation.bias)), True
-    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface)
+    used = _near_population(data, all_z, population)
+    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface, used)
     return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias), False
 
 

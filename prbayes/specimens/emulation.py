@@ -28,6 +28,9 @@ class Surface(Protocol):
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""
 
+    def variance(self, z: Floats) -> Floats:
+        """Return predictive variances, (k, m)."""
+
 
 @dataclass(frozen=True, eq=False)
 class DifferencedResponse:
@@ -45,6 +48,10 @@ class DifferencedResponse:
         values = self.values(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
         return values[0], np.moveaxis(slopes, 0, -1)
+
+    def variance(self, z: Floats) -> Floats:
+        """Return zeros: the response has no error."""
+        return np.zeros_like(self.values(z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +116,21 @@ class Emulation:
 
 
 def fit_surface(
-    z: Floats, y: Floats, readings: Readings, name: str, previous: Any = None
+    z: Floats,
+    y: Floats,
+    readings: Readings,
+    name: str,
+    previous: Any = None,
+    used: NDArray[np.bool_] | None = None,
 ) -> tuple[Emulator, Floats, NDArray[np.bool_]]:
     """Return the emulator, left-out errors, (n, m), and which runs are near the data, (n,).
 
-    Runs that are equal to nine digits count once. Left-out errors are NaN without a response.
+    Runs that are not ``used``, (n,), or without a response have NaN as their error. Runs that are
+    equal to nine digits count once.
     """
     good = np.isfinite(y).all(axis=1)
+    if used is not None and (good & used).sum() >= 8:
+        good &= used
     if good.sum() < 8:
         raise DesignError(
             f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "

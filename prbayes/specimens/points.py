@@ -37,7 +37,7 @@ class SpecimenOptions:
 
     starts: int = 12  # of the search for modes, by specimen
     gap: float = 20.0  # largest misfit of a mode above the specimen's best, in nats
-    points: int = 4  # fewest points of a mode in each half; doubled until the halves agree
+    points: int = 8  # fewest points of a mode in each half; doubled until the halves agree
     most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
     most_in_all: int = 2**17
     # Largest standard deviation, over plausible populations, of half the difference between the
@@ -71,7 +71,7 @@ class SpecimenPoints:
     def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
         """Return the points of selected specimens."""
         arrays = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **arrays)
+        return replace(self, **arrays)  # type: ignore[arg-type]
 
 
 def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
@@ -136,7 +136,7 @@ class SpecimenData:
     def inner(self) -> Floats:
         """Specimens of the prior predictive population without its tails, (n, d).
 
-        95 % of the specimens, nearest to the median in units of the quartiles' distance.
+        95 % of the specimens, nearest to the median in units of the distance of two quantiles.
         """
         z = self.prior[:, self.free]
         low, middle, high = np.quantile(z, [0.16, 0.5, 0.84], axis=0)
@@ -218,9 +218,7 @@ def _as_starts(modes: Modes, starts: Floats) -> Floats:
     return result
 
 
-def draw_points(
-    data: SpecimenData, proposals: Proposals, count: int, seed: int
-) -> SpecimenPoints:
+def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
     """Return points of all specimens, ``count`` of each."""
     emulation = proposals.residuals.response
     z, log_proposal, mode = proposals.draw(count, seed)
@@ -264,7 +262,7 @@ def specimen_points(
     points = at_scale(data, points, emulation.error, scale)
     # A branch that only a wide population reaches has its points, too.
     wide = Normal(population.mean, 2.5 * population.root)
-    weights = sum(likely_weights(data, points, normal) for normal in (population, wide))
+    weights = likely_weights(data, points, population) + likely_weights(data, points, wide)
     mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
     if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
         proposals = proposals.with_shares(mass)
@@ -306,12 +304,14 @@ def agreeing_points(
 ) -> tuple[SpecimenPoints, Proposals]:
     """Return points whose halves agree at draws, doubled from ``count`` in each half.
 
-    ``scale`` is the likely factor of an unknown error; over all factors the limit is wider.
+    ``scale`` is the likely factor of an unknown error; the halves agree over all factors, too.
     """
     options = data.options
     over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
     # Along open inputs the error falls more slowly with the number of points.
-    largest = options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open(scale) else 1)
+    largest = (
+        options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open(scale) else 1)
+    )
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]

@@ -6,7 +6,7 @@ The density of the readings of a specimen is an integral over its inputs,
           \approx \sum_k p(x_k \mid \theta) \exp(A_k), \qquad (1)
 
 with points and numbers A that do not contain theta. Inputs x = mean + L a are whitened by a normal
-reference population, and e(a) = (y - f(x)) / s are standardised errors of the readings. The residual
+reference population, and e(a) = (y - f(x)) / s are standardised errors of readings. The residual
 r(a) = (a, e(a)) has the Jacobian (I, -G). At a mode of exp(-|r|^2 / 2), G = U S V', and
 
 .. math:: \xi(a) = D (V' a - S U' e(a)), \qquad D = (1 + S^2)^{-1/2}, \qquad (2)
@@ -30,7 +30,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -46,9 +46,6 @@ from prbayes.numerics.threads import one_thread
 
 Indices = NDArray[np.intp]
 
-# Coordinates (k, d) -> values (k, m), Jacobian (k, m, d). NaN where there is no response.
-Response = Callable[[Floats], tuple[Floats, Floats]]
-
 
 @dataclass(frozen=True, eq=False)
 class Normal:
@@ -62,7 +59,8 @@ class Normal:
 class Residuals:
     """Residuals of specimens: whitened inputs, and standardised errors of the readings."""
 
-    response: Response
+    # Coordinates (k, d) -> values (k, m) and Jacobian (k, m, d), NaN without a response.
+    response: Any
     target: Floats  # (N, m): readings, any number where there is none
     emulator_error: Floats  # (m,): standard deviation of the emulator's error
     error: Floats  # (N, m): standard deviation of the reading; infinite where there is none
@@ -222,7 +220,9 @@ def _minimised(
         damped = hessian + (damping[active, None] * diagonal)[:, :, None] * np.eye(d)
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         length = np.sqrt((step**2).sum(axis=1))
-        step /= np.maximum(length, 1.0)[:, None]
+        # Far from the population, where an outlier may lie, steps are longer.
+        longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+        step /= np.maximum(length / longest, 1.0)[:, None]
         trial = a[active] + step
         new_e, new_slopes = residuals.errors(specimen[active], trial, scale)
         new_value = objective(trial, new_e)
@@ -305,35 +305,46 @@ class Proposals:
 
     def rows(self, index: Indices) -> Proposals:
         """Return the proposals of selected modes, with equal mixing weights."""
-        maps = self.inputs, self.readings, self.orientation, self.log_det
         modes = self.modes.rows(index)
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
-        return Proposals(self.residuals, modes, *(values[index] for values in maps), share)
+        return Proposals(
+            self.residuals,
+            modes,
+            self.inputs[index],
+            self.readings[index],
+            self.orientation[index],
+            self.log_det[index],
+            share,
+        )
 
     def without_covered(self) -> Proposals:
         """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
         modes = self.modes
         order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
-        sorted_ = self.rows(order)
-        table = sorted_.modes.table
+        ordered = self.rows(order)
+        table = ordered.modes.table
         kept = np.ones(len(order), dtype=bool)
         for k in range(1, table.shape[1]):
             for better in range(k):
                 pairs = table[:, k] >= 0
                 at, rows = table[pairs, better], table[pairs, k]
-                pairs = kept[at] & kept[rows] & (sorted_.modes.scale[at] == sorted_.modes.scale[rows])
+                pairs = (
+                    kept[at] & kept[rows] & (ordered.modes.scale[at] == ordered.modes.scale[rows])
+                )
                 at, rows = at[pairs], rows[pairs]
                 if not rows.size:
                     continue
-                value, jacobian = sorted_.mapped(at, sorted_.modes.a[rows])
+                value, jacobian = ordered.mapped(at, ordered.modes.a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
                 is_in_bulk = (value**2).sum(axis=1) < 1.0
-                is_in_bulk &= (sign == sorted_.orientation[at]) & (log_det > sorted_.log_det[at] - 1.0)
+                is_in_bulk &= (sign == ordered.orientation[at]) & (
+                    log_det > ordered.log_det[at] - 1.0
+                )
                 at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
-                end, _, _, converged = sorted_.solved(at, value)
-                is_reached = np.abs(end - sorted_.modes.a[rows]).max(axis=1, initial=0) < 1e-2
+                end, _, _, converged = ordered.solved(at, value)
+                is_reached = np.abs(end - ordered.modes.a[rows]).max(axis=1, initial=0) < 1e-2
                 kept[rows[converged & is_reached]] = False
-        return sorted_.rows(np.flatnonzero(kept))
+        return ordered.rows(np.flatnonzero(kept))
 
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
@@ -358,9 +369,7 @@ class Proposals:
         return xi, inputs + readings @ slopes
 
     @np.errstate(all="ignore")
-    def solved(
-        self, mode: Indices, xi: Floats
-    ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
         """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
 
         Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
@@ -379,7 +388,8 @@ class Proposals:
             active, step, length = active[usable], step[usable], length[usable]
             if not active.size:
                 break
-            step *= (fraction[active] / np.maximum(length, 1.0))[:, None]
+            longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+            step *= (fraction[active] / np.maximum(length / longest, 1.0))[:, None]
             trial = a[active] + step
             new_value, new_jacobian = self.mapped(mode[active], trial)
             accepted = np.linalg.slogdet(new_jacobian)[0] == self.orientation[mode[active]]
@@ -441,7 +451,8 @@ class Proposals:
         log_q = np.full(len(a), np.inf)
         own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
         drawn = mode[rows], own
-        log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], counts, drawn)
+        weights = counts.astype(np.float64)
+        log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], weights, drawn)
         log_q[rows] -= d / 2 * np.log(2 * np.pi)
         log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
         a[~converged] = 0.0
@@ -524,7 +535,9 @@ class Proposals:
         for _ in range(most):
             usual = np.full(n, -np.inf)
             of_modes = importance(result.modes)
-            np.maximum.at(usual, result.modes.specimen, np.where(np.isfinite(of_modes), of_modes, -np.inf))
+            np.maximum.at(
+                usual, result.modes.specimen, np.where(np.isfinite(of_modes), of_modes, -np.inf)
+            )
             excess = importance(points) - usual[points.specimen]
             excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
             order = np.lexsort((-excess, points.specimen))
