@@ -229,6 +229,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         known,
         populations.prior_specimens(),
         populations.posterior,
+        coordinates.bounds,
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
         options=replace(likelihood.options, n_first=first_run_count(likelihood)),

@@ -175,7 +175,8 @@ def extended(
     sd = np.sqrt((likely.population.root**2).sum(axis=1))
     around[:, data.free] += 0.4 * sd * rng.standard_normal((len(around), len(sd)))
     runs = np.concatenate([emulation.z, sampled, possible])
-    far = _farthest(data, runs, around, count - n_sampled - n_possible - n_explored, sd)
+    n_far = max(2, count - n_sampled - n_possible - n_explored)
+    far = _farthest(data, runs, around, n_far, sd)
     explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
     others = np.concatenate([far, explored])
     return joined(run, data, emulation, likely, sampled, specimens, possible, others)
@@ -334,6 +335,10 @@ def audited(
     likely = Likely(proposals, points, population, likely_weights(data, points, population))
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
+    # Among the quarter of them at which the emulator is the least certain.
+    deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
+    order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
+    candidates, owners = candidates[order], owners[order]
     sd = np.sqrt((population.root**2).sum(axis=1))
     scale = np.ones(emulation.z.shape[1])
     scale[data.free] = sd

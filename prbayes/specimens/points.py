@@ -121,6 +121,7 @@ class SpecimenData:
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
     prior: Floats  # (n, d): specimens of the prior predictive population
     posterior: Posterior  # points, their numbers and a smoothing to draws
+    bounds: Floats | None = None  # (2, d): ends of data sets of the prior
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
     gross_errors: bool = False  # whether readings of single specimens may be anything
     options: SpecimenOptions = SpecimenOptions()
@@ -131,6 +132,14 @@ class SpecimenData:
     def free(self) -> NDArray[np.intp]:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
+
+    @property
+    def box(self) -> Floats | None:
+        """Range of inputs, (2, d): that of the prior's data sets, and a quarter beyond it."""
+        if self.bounds is None:
+            return None
+        margin = 0.25 * (self.bounds[1] - self.bounds[0])
+        return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
 
     @cached_property
     def inner(self) -> Floats:
@@ -152,7 +161,7 @@ class SpecimenData:
         error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
         target = np.where(is_read, readings.values, 0.0)
         return Residuals(
-            emulation, target, emulation.error, error, relative, population, self.known
+            emulation, target, emulation.error, error, relative, population, self.known, self.box
         )
 
 

@@ -67,6 +67,8 @@ class Residuals:
     relative: Floats  # (N, m): further error of the reading as a share of the output
     population: Normal  # of the reference, in coordinates z
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
+    # (2, d): range in which inputs are possible; an emulator is arbitrary far beyond its runs.
+    box: Floats | None = None
 
     @property
     def free(self) -> Indices:
@@ -97,7 +99,10 @@ class Residuals:
         e, slopes = np.empty((count, m)), np.empty((count, m, a.shape[1]))
         for block in _blocks(count, m * self.known.shape[1]):
             i = specimen[block]
-            values, jacobian = self.response(self.coordinates(i, a[block]))
+            z = self.coordinates(i, a[block])
+            values, jacobian = self.response(z)
+            if self.box is not None:
+                values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
             is_read, factor = np.isfinite(self.error[i]), factors[block]
             relative = factor * self.relative[i] ** 2
             variance = self.emulator_error**2 + factor * self.error[i] ** 2

@@ -99,7 +99,7 @@ def response_share(
             emulation = replace(emulation, z=z, y=y)
         share = draw(count, 0)
         change = float(np.std(draws.log_share(share) - previous))
-        if change <= largest:
+        if change <= largest / 4:
             break
     else:
         raise DesignError(

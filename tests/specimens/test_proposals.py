@@ -18,12 +18,12 @@ from prbayes.specimens.proposals import (
     Normal,
     Proposals,
     Residuals,
-    Response,
+
     find_modes,
 )
 
 
-def differentiated(function: Callable[[Any], Any]) -> Response:
+def differentiated(function: Callable[[Any], Any]) -> Callable[[Floats], tuple[Floats, Floats]]:
     """Return the response z -> (values, Jacobian) of an analytic function, by complex steps."""
 
     def response(z: Floats) -> tuple[Floats, Floats]:
@@ -33,7 +33,7 @@ def differentiated(function: Callable[[Any], Any]) -> Response:
     return response
 
 
-def linear(a: Floats) -> Response:
+def linear(a: Floats) -> Callable[[Floats], tuple[Floats, Floats]]:
     return lambda z: (z @ a.T, np.broadcast_to(a, (len(z), *a.shape)))
 
 
@@ -42,7 +42,7 @@ def independent(mean: Any, sd: Any) -> Normal:
 
 
 def residuals_of(
-    response: Response, y: Floats, sd: Any, reference: Normal, known: Floats | None = None
+    response: Any, y: Floats, sd: Any, reference: Normal, known: Floats | None = None
 ) -> Residuals:
     nothing = np.full((len(y), len(reference.mean)), np.nan)
     sd = np.broadcast_to(np.asarray(sd, dtype=float), y.shape)
@@ -80,7 +80,7 @@ def log_likelihoods(
 class Problem:
     """A response, readings, a population, and the exact log-densities of the readings."""
 
-    response: Response
+    response: Any
     y: Floats
     sd: Floats | float
     reference: Normal
