@@ -47,7 +47,6 @@ LAYERS = (
     ("metrics", "response"),
     ("emulators",),
     ("propagation",),
-    ("specimens",),
     ("model",),
     ("inference",),
     ("optimize",),
