@@ -1,7 +1,7 @@
 """Eight inputs with sixteen hyperparameters from four outputs of 50 specimens, by `prb.sample`.
 
-The log-likelihood by specimen takes points on the fibres of the specimens, by an emulator. The
-reference has other points of the response itself: four independent sets of 1024 a specimen, which
+The log-likelihood by specimen has an emulator. The reference has other points of the response
+itself: four independent sets of 1024 a specimen, which
 reweight the draws. Bias and width are those of the sixteen hyperparameters, in standard deviations
 of the reference; its own error is that of the mean of the sets.
 
@@ -22,10 +22,15 @@ import prbayes as prb
 from benchmarks.responses import RESPONSES
 from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_preparation import PopulationDraws, Populations, Runs, prepared
-from prbayes.propagation.charts import ReferencePopulation
-from prbayes.propagation.fibre_points import FibreProposals
-from prbayes.propagation.specimen_emulation import DifferencedResponse
+from prbayes.model.specimen_preparation import (
+    PopulationDraws,
+    Populations,
+    Runs,
+    prepared,
+    specimen_data,
+)
+from prbayes.specimens.emulation import DifferencedResponse
+from prbayes.specimens.points import draw_points, fit_proposals, normal_of
 
 RESPONSE = RESPONSES["eight inputs"]
 N, SETS, POINTS = 50, 4, 1024
@@ -56,17 +61,18 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
         [idata.posterior[rv.name].values.reshape(-1) for rv in model.free_RVs]
     )
     populations = Populations(likelihood)
-    reference = ReferencePopulation.from_sample(
-        PopulationDraws(populations, thetas[::8]).specimens()
-    )
+    reference = normal_of(PopulationDraws(populations, thetas[::8]).specimens(), 1.2)
+    data = specimen_data(likelihood)
     exact = replace(
         prepared(likelihood).emulation,
         surface=DifferencedResponse(Runs(likelihood)),
         y=np.zeros_like(prepared(likelihood).emulation.y),
+        error=data.options.floor * data.readings.spread(),
     )
+    proposals = fit_proposals(data, exact, reference)
     logs = []
     for s in range(sets):
-        drawn = FibreProposals.fitted(exact, likelihood.readings, reference, 700 + s).draw(points)
+        drawn = draw_points(data, proposals, points, 700 + s)
         logs.append(populations.log_likelihoods(thetas, drawn.z, drawn.log_a).sum(axis=1))
     stored = prepared(likelihood).points
     own = populations.log_likelihoods(thetas, stored.z, stored.log_a).sum(axis=1)

@@ -31,7 +31,8 @@ from scipy.stats import norm, qmc
 
 import prbayes as prb
 from benchmarks.study import Study
-from prbayes.emulators.selection import CANDIDATES, Runs, predict_outputs, select_surfaces
+from prbayes.emulators.emulator import ROUGH_CANDIDATES
+from prbayes.emulators.selection import Runs
 from prbayes.model.evaluator import Evaluator
 
 N = 50
@@ -88,8 +89,7 @@ def emulator_error(coarse: Callable[..., Any] | None, n: int, seed: int) -> floa
     truth = amplitudes(*at.T)
     beside, there = (None, None) if coarse is None else (coarse(*x.T), coarse(*at.T))
     runs = Runs(x, amplitudes(*x.T), np.full(n, 1 / n), np.arange(n) * 8 // n, beside)
-    models, _ = select_surfaces(CANDIDATES, runs)
-    off = predict_outputs(models, runs, at, coarse=there) - truth
+    off = runs.predict(runs.fit(ROUGH_CANDIDATES), at, there) - truth
     errors = np.sqrt((off**2).mean(axis=0)) / truth.std(axis=0)
     return round(float(errors.mean()), 5)
 

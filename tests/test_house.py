@@ -47,6 +47,7 @@ LAYERS = (
     ("metrics", "response"),
     ("emulators",),
     ("propagation",),
+    ("specimens",),
     ("model",),
     ("inference",),
     ("optimize",),

@@ -13,9 +13,10 @@ import xarray as xr
 
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
+from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
+from prbayes.emulators.surfaces import Polynomial, Surface
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import Outputs, outputs_of_keys
 from prbayes.response.store import StoreError, replace_files
@@ -30,11 +31,11 @@ class SavedSurrogate:
     fields: dict[str, Any]  # of the surrogate
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
-    joined: bool | None  # whether a coarse response is an input of it; None if it follows none
+    follows_coarse: bool  # whether it follows a coarse response
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
-def write(path: str | PathLike[str], surrogate: Any, joined: bool | None, probes: Floats) -> None:
+def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
@@ -51,7 +52,7 @@ def write(path: str | PathLike[str], surrogate: Any, joined: bool | None, probes
         "outside": str(surrogate.outside.value) if hasattr(surrogate.outside, "value") else None,
         "noise": surrogate.noise,
         "n_runs": surrogate.n_runs,
-        "joined": joined,
+        "joined": None if surrogate.coarse is None else True,
         "outputs": None if names is None else names.keys,
         "labels": None if names is None else [names.dim, *names.labels],
     }
@@ -99,7 +100,8 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
             "n_runs": config["n_runs"],
             "_named": outputs,
         }
-        return SavedSurrogate(fields, kind, model, config.get("joined"), data["probes"].values)
+        follows_coarse = config.get("joined") is not None
+        return SavedSurrogate(fields, kind, model, follows_coarse, data["probes"].values)
     # Damaged files raise any error of the library that meets the damage.
     except Exception as error:
         raise StoreError(

@@ -14,7 +14,7 @@ from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surrogate import Surrogate
+from prbayes.emulators.surrogate import Surrogate, labelled
 from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
@@ -25,9 +25,10 @@ class Runs(Shown):
     """A table of runs that were computed before, in place of a function of the inputs.
 
     It is a `Surrogate` through the runs, whose error is cross-validated: the best one of two
-    Gaussian processes and quintic splines. Outside the ranges of the runs, and beside a run that
-    failed, it is NaN. `Simulator`, `predict` and `exceedance` take it as a response. With the
-    log-likelihood by specimen the error of the surface is part of the comparison.
+    Gaussian processes and quintic radial basis functions. Outside the ranges of the runs, and
+    beside a run that failed, it is NaN. `Simulator`, `predict` and `exceedance` take it as a
+    response. With the log-likelihood by specimen the error of the surface is part of the
+    comparison.
 
     Parameters
     ----------
@@ -215,3 +216,25 @@ class Runs(Shown):
         names = [*self.columns, *self.outputs]
         rows = [[name, *row[1:]] for name, row in zip(names, shown.rows, strict=False)]
         return replace(shown, heading=f"Runs: {shown.heading.partition(' through ')[2]}", rows=rows)
+
+
+def continued(runs: Runs, *inputs: ArrayLike) -> Any:
+    """Return the response, (...) or (..., m); linear beyond the ranges, NaN beside failed runs."""
+    surrogate, domain = runs.surrogate, runs.surrogate.domain
+    columns, batch = domain.columns(inputs)
+    unit = domain.scaled(columns)
+    inner = np.clip(unit, 0, 1)
+    values = surrogate._at(domain.at(inner))
+    rows = np.flatnonzero(domain.outside(columns).any(axis=1))
+    _, jacobian = surrogate._surface.emulator.alone(inner[rows])
+    change = np.einsum("kmd,kd->km", jacobian, unit[rows] - inner[rows])
+    values[rows] += change.reshape(values[rows].shape)
+    return labelled(surrogate, values, batch)
+
+
+def left_out_nearby(runs: Runs, *inputs: ArrayLike) -> Any:
+    """Return the left-out error of the nearest run, (...) or (..., m)."""
+    surrogate = runs.surrogate
+    columns, batch = surrogate.domain.columns(inputs)
+    residuals = surrogate._surface.nearby(surrogate.error.residuals, columns)[:, 0]
+    return labelled(surrogate, residuals, batch)

@@ -1,9 +1,8 @@
-"""Cross-validation of surfaces: their error, their selection, and their weight beside the runs."""
+"""Cross-validation of emulators: their error, and their weight beside the runs of a design."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -14,16 +13,8 @@ from scipy.special import ndtr
 
 from prbayes._display import without_constructor
 from prbayes._validate import Floats
-from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
-from prbayes.emulators.surfaces import (
-    MultifidelityModel,
-    Surface,
-    predict,
-    tuned_for_remainder,
-)
-
-# Tenfold: Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
-FOLDS = 10
+from prbayes.emulators.following import FollowingEmulator, fit_following
+from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
 
 @without_constructor
@@ -34,8 +25,9 @@ class CrossValidation:
     Attributes
     ----------
     residuals : ndarray, shape (n,) or (n, m)
-        Response less surrogate at each design point, fitted without the tenth of the points that
-        includes it; in units of the response, NaN where the response failed.
+        Response less surrogate at each design point, fitted without it (Gaussian processes and
+        radial basis functions), or without the tenth of the points that includes it; in units of
+        the response, NaN where the response failed.
     population_sd : float or ndarray, shape (m,)
         Standard deviation of the response, of each output where there are several: over the prior
         predictive distribution where an input is a ``.dist()``, and else over the ranges.
@@ -85,37 +77,13 @@ def _number(values: Any) -> Any:
     return float(values) if np.ndim(values) == 0 else values
 
 
-def cross_validated(
-    model: Any, x: Floats, y: Floats, random_seed: int, coarse: Floats | None = None
-) -> Floats:
-    """Return responses less predictions of surfaces without their tenth of the points, as y.
-
-    Points (n, d) in the unit cube have responses (n,), or (n, m) with a surface for each output. A
-    coarse response, (n,), is for a `MultifidelityModel`.
-    """
-    if y.ndim > 1:
-        return np.stack([cross_validated(model, x, output, random_seed) for output in y.T], axis=1)
-    order = np.random.default_rng(random_seed).permutation(len(y))
-    residuals = np.empty(len(y))
-    for fold in np.array_split(order, min(FOLDS, len(y))):
-        fitted = np.setdiff1d(order, fold)
-        pair = (None, None) if coarse is None else (coarse[fitted], coarse[fold])
-        residuals[fold] = y[fold] - predict(model, x[fitted], y[fitted], x[fold], *pair)
-    return residuals
-
-
 def points_needed(model: Any, dimensions: int) -> int:
     """Return the least number of design points such that nine tenths determine a surface."""
-    # The least model of an unknown regressor is a constant.
-    terms = model.terms(dimensions) if isinstance(model, Surface) else 1
+    terms = as_surface(model).terms(dimensions)
     n = terms + 2
     while n - -(-n // min(FOLDS, n)) < terms + 1:  # without the largest fold
         n += 1
     return n
-
-
-# Most runs of a surface, whose cost grows with their cube; with more runs their weights suffice.
-MOST_RUNS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,213 +102,81 @@ class Runs:
         return np.isfinite(self.y).all(axis=1)
 
     @cached_property
-    def center(self) -> Floats:
-        """The mean of the inputs in the relevant populations, (d,)."""
-        return self.importance @ self.x
+    def rows(self) -> NDArray[np.intp]:
+        """The different runs with outputs, on which an emulator is fitted."""
+        rows = np.flatnonzero(self.good)
+        return np.sort(rows[np.unique(self.x[rows], axis=0, return_index=True)[1]])
 
     @cached_property
     def spread(self) -> Floats:
-        """Their standard deviation, (d,)."""
-        sd = np.sqrt(self.importance @ (self.x - self.center) ** 2)
+        """The standard deviation of the inputs in the relevant populations, (d,)."""
+        sd = np.sqrt(self.importance @ (self.x - self.importance @ self.x) ** 2)
         return np.where(sd > 0, sd, 1.0)
 
     def scaled(self, x: Floats) -> Floats:
         """Return inputs in units of their spread."""
-        return np.asarray((x - self.center) / self.spread)
-
-    def among(self, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the runs in a mask that a surface is fitted on: different, good, and not too many.
-
-        Of too many, half are the most important ones, and half are spread over the others.
-        """
-        rows = np.flatnonzero(mask & self.good)
-        _, first = np.unique(self.x[rows], axis=0, return_index=True)
-        rows = rows[np.sort(first)]
-        if rows.size > MOST_RUNS:
-            order = np.argsort(-self.importance[rows], kind="stable")
-            first = order[: MOST_RUNS // 2]
-            rest = np.linspace(first.size, rows.size - 1, MOST_RUNS - first.size).astype(int)
-            rows = np.sort(rows[np.concatenate([first, order[rest]])])
-        return rows
-
-    def most_important(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the most important runs of some rows, on which models are tuned."""
-        order = np.argsort(-self.importance[rows], kind="stable")
-        return np.sort(rows[order[:MOST_TUNED]])
+        return np.asarray(x / self.spread)
 
     @cached_property
     def block_masks(self) -> NDArray[np.bool_]:
         """The runs of each block, (B, n)."""
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
+    def fit(self, tried: Sequence[Surface]) -> FollowingEmulator:
+        """Return the emulator with the smallest left-out errors, weighted by importance.
 
-# Processes with a length for each input. Either is the better one for some responses. Splines
-# around a polynomial are better only where processes err by less than 1e-4 standard deviations.
-CANDIDATES = (GaussianProcess("squared_exponential"), GaussianProcess("matern"))
-
-
-def has_enough_runs(model: Any, n: int, dimensions: int) -> bool:
-    """Return whether n runs determine a surface, and leave some to estimate its error."""
-    terms = model.terms(dimensions) if isinstance(model, Surface) else 1
-    return 2 * n >= 3 * terms
-
-
-def predict_outputs(
-    models: Sequence[Any],
-    runs: Runs,
-    at: Floats,
-    mask: NDArray[np.bool_] | None = None,
-    coarse: Floats | None = None,
-    given: Mapping[int, Floats] = {},
-) -> Floats:
-    """Return outputs at points, (k, d) -> (k, m), predicted by a model of each output.
-
-    Where the nearest run failed, the outputs are those of that run. Predictions are at most one
-    range of the runs' outputs beyond them. ``mask``, (n,), selects the runs of the fit; ``coarse``,
-    (k, m), is a coarse response at the points; ``given`` has predictions of some outputs, (k,).
-    """
-    mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
-    rows = runs.among(mask)
-    x, y = runs.scaled(runs.x[rows]), runs.y[rows]
-    points = runs.scaled(at)
-    outputs = []
-    for k, model in enumerate(models):
-        if k in given:
-            outputs.append(given[k])
-            continue
-        coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
-        coarse_points = None if coarse is None else coarse[:, k]
-        outputs.append(predict(model, x, y[:, k], points, coarse_runs, coarse_points))
-    lowest, highest = y.min(axis=0), y.max(axis=0)
-    reach = highest - lowest
-    values = np.clip(np.stack(outputs, axis=1), lowest - reach, highest + reach)
-    if not runs.good[mask].all():
-        from scipy.spatial import cKDTree
-
-        places = np.flatnonzero(mask)
-        _, index = cKDTree(runs.scaled(runs.x[places])).query(points)
-        nearest = places[index]
-        failed = ~runs.good[nearest]
-        values[failed] = runs.y[nearest[failed]]
-    return values
-
-
-def predict_without_blocks(
-    models: Sequence[Any], runs: Runs, at: Floats, coarse: Floats | None = None
-) -> Iterator[Floats]:
-    """Yield the predictions, (k, m), of surfaces without each block of the runs."""
-    rows = runs.among(np.ones(len(runs.x), dtype=bool))
-    x = runs.scaled(runs.x[rows])
-    points = runs.scaled(at)
-    by_output = {}  # (k, B), where a surface has a short way
-    for k, model in enumerate(models):
-        if isinstance(model, Surface):
-            surfaces = model.without_each(x, runs.y[rows, k], runs.block_masks[:, rows])
-            if surfaces is not None:
-                by_output[k] = surfaces(points)
-    for b, block in enumerate(runs.block_masks):
-        given = {k: values[:, b] for k, values in by_output.items()}
-        yield predict_outputs(models, runs, at, ~block, coarse, given)
-
-
-def left_out_predictions(models: Sequence[Any], runs: Runs) -> Floats:
-    """Return the predictions at the runs, (n, m), of surfaces without the block of each run."""
-    values = np.empty_like(runs.y)
-    predictions = predict_without_blocks(models, runs, runs.x, runs.coarse)
-    for block, at_runs in zip(runs.block_masks, predictions, strict=True):
-        values[block] = at_runs[block]
-    return values
-
-
-@dataclass(frozen=True, eq=False)
-class _Selection:
-    """The best models so far, for each output."""
-
-    models: tuple[Any, ...]
-    predictions: Floats  # (n, m): at runs that were left out
-    errors: Floats  # (m,)
-
-    def improved(self, models: Sequence[Any], runs: Runs, rows: NDArray[np.intp]) -> _Selection:
-        """Return the selection with other models of the outputs that they predict better."""
-        predictions = left_out_predictions(models, runs)
+        Raises numpy.linalg.LinAlgError if no surface can be fitted.
+        """
+        rows, d = self.rows, self.x.shape[1]
+        usable = [model for model in tried if 2 * len(rows) >= 3 * model.terms(d)]
         # Part of the importance is uniform: the errors of a few runs alone would be noise.
-        importance = runs.importance[rows] + 0.1 / len(runs.y)
-        # A failure predicted by a neighbour has an error of the spread.
-        y, y_left_out = runs.y[rows], predictions[rows]
-        residuals = np.where(np.isfinite(y_left_out), y_left_out - y, y.std(axis=0))
-        errors = importance @ residuals**2
-        is_better = errors < self.errors
-        pairs = zip(is_better, models, self.models, strict=True)
-        return _Selection(
-            models=tuple(model if better else best for better, model, best in pairs),
-            predictions=np.where(is_better, predictions, self.predictions),
-            errors=np.where(is_better, errors, self.errors),
-        )
+        near = self.importance[rows] + 0.1 / len(self.y)
+        coarse = None if self.coarse is None else self.coarse[rows]
+        x, y = self.scaled(self.x[rows]), self.y[rows]
+        return fit_following(x, y, coarse, near, tried=usable)
 
+    def predict(
+        self,
+        emulator: FollowingEmulator,
+        at: Floats,
+        coarse: Floats | None = None,
+        without: NDArray[np.bool_] | None = None,
+    ) -> Floats:
+        """Return outputs at points, (k, d) -> (k, m), by an emulator without some runs, (n,).
 
-def select_surfaces(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
-    """Return the model of each output with the smallest left-out errors, and its predictions.
+        Where the nearest run failed, the outputs are those of that run. Predictions are at most one
+        range of the runs' outputs beyond them. ``coarse``, (k, m), is a coarse response at the
+        points.
+        """
+        mask = np.ones(len(self.x), dtype=bool) if without is None else ~without
+        y, points = self.y[mask & self.good], self.scaled(at)
+        lowest, highest = y.min(axis=0), y.max(axis=0)
+        reach = highest - lowest
+        values = np.clip(emulator.values(points, coarse), lowest - reach, highest + reach)
+        if not self.good[mask].all():
+            from scipy.spatial import cKDTree
 
-    The predictions, (n, m), are at runs that were left out; errors are squared, and weighted by
-    importance. A coarse response adds models that follow it. Raises numpy.linalg.LinAlgError if no
-    surface can be fitted.
-    """
-    rows = runs.among(np.ones(len(runs.y), dtype=bool))
-    m = runs.y.shape[1]
-    best = _Selection((None,) * m, np.empty_like(runs.y), np.full(m, np.inf))
-    smallest = rows.size - rows.size // len(runs.block_masks) - 1
-    most_important = runs.most_important(rows)
-    x, y = runs.scaled(runs.x[most_important]), runs.y[most_important]
-    tuned = []
-    for model in tried:
-        if not has_enough_runs(model, smallest, runs.x.shape[1]):
-            continue
-        models = [model] * m
-        with suppress(np.linalg.LinAlgError):
-            if isinstance(model, Surface):
-                models = [model.tuned(x, (v - v.mean()) / (v.std() or 1.0)) for v in y.T]
-            best = best.improved(models, runs, rows)
-            tuned.append(models)
-    if None in best.models:
-        raise np.linalg.LinAlgError("no surface goes through the runs")
-    if runs.coarse is not None:
-        otherwise = best.models
-        best = _with_following(best, otherwise, otherwise, runs, rows, joined=False)
-        for models in tuned:
-            best = _with_following(best, models, otherwise, runs, rows, joined=True)
-    return best.models, best.predictions
+            places = np.flatnonzero(mask)
+            nearest = places[cKDTree(self.scaled(self.x[places])).query(points)[1]]
+            failed = ~self.good[nearest]
+            values[failed] = self.y[nearest[failed]]
+        return values
 
+    def predict_without_blocks(
+        self, emulator: FollowingEmulator, at: Floats, coarse: Floats | None = None
+    ) -> Iterator[Floats]:
+        """Yield the predictions, (k, m), of emulators without each block of the runs."""
+        emulators = emulator.without_each(self.block_masks[:, self.rows])
+        for block, without in zip(self.block_masks, emulators, strict=True):
+            yield self.predict(without, at, coarse, block)
 
-def _with_following(
-    best: _Selection,
-    models: Sequence[Any],
-    otherwise: Sequence[Any],
-    runs: Runs,
-    rows: NDArray[np.intp],
-    *,
-    joined: bool,
-) -> _Selection:
-    """Return the selection with models that follow the coarse response where they are better.
-
-    ``models`` are of each output, tuned without the coarse response; ``otherwise`` where there is
-    none; ``joined`` makes the coarse response an input.
-    """
-    assert runs.coarse is not None
-    rows_with_coarse = rows[np.isfinite(runs.coarse[rows]).all(axis=1)]
-    largest_block = runs.block_masks[:, rows_with_coarse].sum(axis=1).max()
-    smallest = rows_with_coarse.size - int(largest_block)
-    dimensions = runs.x.shape[1] + joined
-    if not all(has_enough_runs(model, smallest, dimensions) for model in models):
-        return best
-    tuning = runs.most_important(rows_with_coarse)
-    x, y, coarse = runs.scaled(runs.x[tuning]), runs.y[tuning], runs.coarse[tuning]
-    following = []
-    for k, model in enumerate(models):
-        tuned = tuned_for_remainder(model, x, y[:, k], coarse[:, k], joined=joined)
-        following.append(MultifidelityModel(tuned, otherwise[k], joined))
-    with suppress(np.linalg.LinAlgError):
-        return best.improved(following, runs, rows)
-    return best
+    def left_out_predictions(self, emulator: FollowingEmulator) -> Floats:
+        """Return the predictions at the runs, (n, m), of emulators without the block of each."""
+        values = np.empty_like(self.y)
+        predictions = self.predict_without_blocks(emulator, self.x, self.coarse)
+        for block, at_runs in zip(self.block_masks, predictions, strict=True):
+            values[block] = at_runs[block]
+        return values
 
 
 def weight_of_runs(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from typing import Any, cast
 
@@ -26,22 +26,13 @@ from prbayes._validate import (
     seed_number,
     share,
 )
+from prbayes.emulators.emulator import ROUGH_CANDIDATES
+from prbayes.emulators.following import FollowingEmulator, fit_following
 from prbayes.emulators.io import read, write
+from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
-from prbayes.emulators.selection import (
-    CANDIDATES,
-    CrossValidation,
-    cross_validated,
-    points_needed,
-)
-from prbayes.emulators.surfaces import (
-    MultifidelityModel,
-    Predict,
-    RadialBasis,
-    Surface,
-    fit_multifidelity,
-    fitted,
-)
+from prbayes.emulators.selection import CrossValidation, points_needed
+from prbayes.emulators.surfaces import Surface, as_surface
 from prbayes.emulators.table import Table, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
@@ -65,8 +56,9 @@ class FittedSurface:
     domain: Ranges
     unit: Floats  # (n, d): the design in the unit cube
     usable: NDArray[np.bool_]  # (n,): which runs have only finite outputs
-    surface: Any  # fitted in the unit cube
-    coarse: Callable[..., Any] | None
+    event: tuple[int, ...]  # shape of a response
+    emulator: FollowingEmulator  # fitted in the unit cube
+    coarse: Callable[..., Any] | None  # the coarse response that it follows
 
     @classmethod
     def of(
@@ -75,30 +67,28 @@ class FittedSurface:
         domain: Ranges,
         points: Floats,
         responses: Floats,
-        coarse: Callable[..., Any] | None,
-        *,
-        joined: bool,
+        coarse: Callable[..., Any] | None = None,
+        coarse_values: Floats | None = None,
+        seed: int = 0,
     ) -> FittedSurface:
-        """Fit a surface to runs; ``joined`` makes the coarse response one of its inputs."""
+        """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller."""
         unit, usable = domain.scaled(points), _usable(responses)
-        x, y = unit[usable], responses[usable]
-        surface: Any
-        if y.ndim > 1:
-            surface = partial(_outputs, [fitted(model, x, output) for output in y.T])
-        elif coarse is None:
-            surface = fitted(model, x, y)
-        else:
-            following = MultifidelityModel(model, model, joined)
-            coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
-            surface = fit_multifidelity(following, x, y, coarse_values)
-        return cls(domain, unit, usable, surface, coarse)
+        x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
+        of_usable = None
+        if coarse_values is not None:
+            # Fixed parts are left out, so that a file of the surrogate follows in the same way.
+            of_usable, seed = coarse_values[usable, None], 0
+        emulator = fit_following(x, y, of_usable, tried=[as_surface(model)], seed=seed)
+        is_followed = any(follower is not None for follower in emulator.following)
+        event = responses.shape[1:]
+        return cls(domain, unit, usable, event, emulator, coarse if is_followed else None)
 
     def __call__(self, columns: Floats) -> Floats:
         """Return values at rows inside the ranges, (n,) or (n, m)."""
         # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
         if self.coarse is None:
-            return np.asarray(self.surface(unit))
+            return self.emulator.values(unit).reshape(-1, *self.event)
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
         n_lost = (~np.isfinite(coarse)).sum()
         if n_lost:
@@ -110,12 +100,14 @@ class FittedSurface:
                     "many.",
                 )
             )
-        return np.asarray(self.surface(unit, coarse))
+        return self.emulator.values(unit, coarse[:, None])[:, 0]
 
     @property
-    def joined(self) -> bool | None:
-        """Whether a coarse response is an input of the surface; None if it follows none."""
-        return None if self.coarse is None else self.surface.scaling is not None
+    def left_out(self) -> Floats:
+        """Left-out errors, (n,) or (n, m); NaN without a response."""
+        left_out = np.full((len(self.usable), *self.event), np.nan)
+        left_out[self.usable] = self.emulator.left_out.reshape(-1, *self.event)
+        return left_out
 
     def probes(self) -> Floats:
         """Return values at 64 fixed points, which identify the surface."""
@@ -327,25 +319,19 @@ class Surrogate(Shown):
             responses = respond(settings, runs, tally)
             if tally.computed >= n:  # stored runs are checked as they are read
                 refuse_other_runs(settings, runs, responses, tally)
-        usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
-        # Estimate the error, then fit the surface.
-        x, y = domain.scaled(design)[usable], responses[usable]
-        coarse_values = None if coarse_values is None else coarse_values[usable]
-        residuals = np.full(responses.shape, np.nan)
-        residuals[usable], joined = _best(model, x, y, coarse_values, seed)
-        if coarse is not None and joined is None:
-            coarse = None
+        # Fit the surface, and estimate its error.
+        surface = FittedSurface.of(model, domain, design, responses, coarse, coarse_values, seed)
+        if coarse is not None and surface.coarse is None:
             _log.info("%s: the coarse response does not improve the fit, and is not used", name)
+        residuals = surface.left_out
         surrogate = cls(
             *(domain, design, responses, model, outside, tally.computed),
-            error=CrossValidation(residuals, _spread(y)),
-            coarse=coarse,
+            error=CrossValidation(residuals, _spread(responses[surface.usable])),
+            coarse=surface.coarse,
             _named=tally.named,
-            _surface=FittedSurface.of(
-                model, domain, design, responses, coarse, joined=bool(joined)
-            ),
+            _surface=surface,
         )
         if predictive is not None:
             values = surrogate._at(predictive)
@@ -409,26 +395,25 @@ class Surrogate(Shown):
         outside = Replace() if outside is None else outside
         domain, design, values = table.domain, table.points, table.responses
         seed = seed_number(random_seed, f"{name}: random_seed")
-        # Splines are better where responses of scattered runs differ by powers of ten.
-        models = (*CANDIDATES, RadialBasis("quintic")) if model is None else (model,)
+        models = ROUGH_CANDIDATES if model is None else (model,)
         for candidate in models:
             refuse_wrong_surface(name, candidate, outside)
-        usable = _usable(values)
-        _refuse_unfit(name, values, max(points_needed(m, design.shape[1]) for m in models))
-        x, y = domain.scaled(design)[usable], values[usable]
-        spread = _spread(y)
+        # A kind of surface that has too few runs is left out of several.
+        needed = [points_needed(m, design.shape[1]) for m in models]
+        _refuse_unfit(name, values, min(needed))
+        n_usable = _usable(values).sum()
+        models = tuple(m for m, n in zip(models, needed, strict=True) if n <= n_usable)
+        surfaces = [FittedSurface.of(m, domain, design, values, seed=seed) for m in models]
+        spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
-        left_out = [cross_validated(candidate, x, y, seed) for candidate in models]
         # The largest residuals are those of the most extreme runs.
-        errors = [np.quantile(np.abs(r / unit), 0.9, axis=0).sum() for r in left_out]
+        errors = [np.nanquantile(np.abs(s.left_out / unit), 0.9, axis=0).sum() for s in surfaces]
         best = int(np.argmin(errors))
-        residuals = np.full(values.shape, np.nan)
-        residuals[usable] = left_out[best]
         return cls(
             *(domain, design, values, models[best], outside, 0),
-            error=CrossValidation(residuals, spread),
+            error=CrossValidation(surfaces[best].left_out, spread),
             _named=table.labels,
-            _surface=FittedSurface.of(models[best], domain, design, values, None, joined=False),
+            _surface=surfaces[best],
         )
 
     @property
@@ -502,8 +487,7 @@ class Surrogate(Shown):
             once = f"{text}; they give {replacement}; this warning appears once."
             report(Finding("outside-ranges", once), level=level)
             self._warned[:] = [True]
-        values = values.reshape((*batch, *event))
-        return values if self._named is None else self._named.by_key(values)
+        return labelled(self, values, batch)
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
         """Return the root mean square of the cross-validation residuals nearby.
@@ -557,7 +541,7 @@ class Surrogate(Shown):
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._surface.joined, self._surface.probes())
+        write(path, self, self._surface.probes())
 
     @classmethod
     def load(
@@ -595,25 +579,24 @@ class Surrogate(Shown):
                 f"Surrogate.load: got no model, expected the {saved.kind} it was fitted with; "
                 "pass model="
             )
-        follows_coarse = saved.joined is not None
-        if follows_coarse and coarse is None:
+        if saved.follows_coarse and coarse is None:
             raise TypeError(
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        coarse = coarse if follows_coarse else None
         fields = saved.fields
-        responses = fields["responses"]
-        surface = FittedSurface.of(
-            *(model, fields["domain"], fields["points"], responses, coarse),
-            joined=bool(saved.joined),
-        )
+        domain, points, responses = (fields[key] for key in ("domain", "points", "responses"))
+        coarse = coarse if saved.follows_coarse else None
+        coarse_values = None
+        if coarse is not None:
+            coarse_values = _coarse_at("Surrogate.load", coarse, domain, points)
+        surface = FittedSurface.of(model, domain, points, responses, coarse, coarse_values)
         spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
         probes, expected = surface.probes() / size, saved.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
         if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
-            and_coarse = ", and the same coarse response" if follows_coarse else ""
+            and_coarse = ", and the same coarse response" if coarse is not None else ""
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
@@ -641,6 +624,12 @@ class Surrogate(Shown):
         return values
 
 
+def labelled(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
+    """Return values of rows in the shape of a batch, with the labels of the outputs."""
+    values = values.reshape((*batch, *surrogate.responses.shape[1:]))
+    return values if surrogate._named is None else surrogate._named.by_key(values)
+
+
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
     """Return a pseudo-random number for each row of x, (n, d) -> (n,), equal for equal rows.
 
@@ -666,11 +655,6 @@ def _spread(values: Floats) -> Any:
     """Return the standard deviation of responses, a number or one for each output."""
     sd = values.std(axis=0)
     return float(sd) if sd.ndim == 0 else sd
-
-
-def _outputs(surfaces: Sequence[Predict], at: Floats) -> Floats:
-    """Return the values of the surfaces of several outputs, (k, m)."""
-    return np.stack([surface(at) for surface in surfaces], axis=-1)
 
 
 def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
@@ -733,27 +717,6 @@ def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns
             "of the same inputs; repair it, or leave coarse= out"
         )
     return values
-
-
-def _best(
-    model: Any, x: Floats, y: Floats, coarse: Floats | None, seed: int
-) -> tuple[Floats, bool | None]:
-    """Return the least cross-validated residuals, and how a coarse response is followed for them.
-
-    None if it is not followed; else whether it is also an input of the surface.
-    """
-    least = cross_validated(model, x, y, seed)
-    choice = None
-    if coarse is None:
-        return least, choice
-    n = int(np.isfinite(coarse).sum())
-    for joined in (False, True):
-        if n < points_needed(model, x.shape[1] + joined):
-            continue
-        residuals = cross_validated(MultifidelityModel(model, model, joined), x, y, seed, coarse)
-        if (residuals**2).sum() < (least**2).sum():
-            least, choice = residuals, joined
-    return least, choice
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:

@@ -59,12 +59,19 @@ class Readings:
         return self.error * np.where(self.is_relative, np.abs(outputs), 1.0)
 
     def spread(self) -> Floats:
-        """Return the standard deviation of each output over specimens, (m,); one if it is zero."""
+        """Return the standard deviation of each output over specimens, (m,); one if it is zero.
+
+        That of few readings is no scale: outputs with less than eight have one of all of them.
+        """
         count = np.maximum(self.is_measured.sum(axis=0), 1)
         values = np.where(self.is_measured, self.values, 0.0)
         mean = values.sum(axis=0) / count
         deviations = np.where(self.is_measured, values - mean, 0.0)
         sd = np.sqrt((deviations**2).sum(axis=0) / count)
+        few = self.is_measured.sum(axis=0) < min(8, len(self))
+        pooled = self.values[:, few][self.is_measured[:, few]]
+        if few.sum() > 1 and pooled.size > 1:
+            sd[few] = pooled.std()
         return np.where(sd > 0, sd, 1.0)
 
     def robust_spread(self) -> Floats:
@@ -76,7 +83,7 @@ class Readings:
         widths = np.zeros(self.values.shape[1])
         for j, column in enumerate(self.values.T):
             measured = column[self.is_measured[:, j]]
-            if measured.size:
+            if measured.size >= min(8, len(self)):
                 high, low = np.quantile(measured, [0.75, 0.25])
                 widths[j] = high - low
         scatter = widths / 1.349

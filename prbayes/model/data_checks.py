@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,10 +20,10 @@ from scipy.special import bdtrc
 from prbayes._finding import Finding, report
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
-from prbayes.emulators.interpolant import fit_interpolant
+from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.roots import Response, Roots
+from prbayes.specimens.proposals import Modes, Proposals
 
 # Data beside the first responses, for all metrics.
 
@@ -466,8 +465,8 @@ def data_findings(
 def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
-    Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
+    Far is more than three widths of the range of the runs, outputs (n, m), over the populations of
+    the prior. An output that is constant, as at time zero, is one of the error of its readings.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
@@ -493,7 +492,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
                 "least one; leave the output out, or check the limits"
             )
         beyond = np.maximum(values - high[j], low[j] - values)
-        if values.size and (beyond > width).all():
+        if values.size and (beyond > 3 * width).all():
             raise DesignError(
                 f"{name}: got readings from {values.min():.4g} to {values.max():.4g}, but "
                 f"{low[j]:.4g} to {high[j]:.4g} for {output} at {len(finite)} runs over the range "
@@ -543,18 +542,19 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
 
 
 def refuse_undetermined(
-    name: str, emulation: Any, roots: Roots, inputs: Sequence[str], smallest: float = 3.0
+    name: str, proposals: Proposals, inputs: Sequence[str], smallest: float = 3.0
 ) -> None:
     """Raise if readings leave a direction of the inputs open, although there are enough outputs.
 
     Along such a direction the outputs change over half the prior's range by less than a few errors
-    of the emulator, at the median root. Responses without such a direction have 97 errors and more,
+    of the emulator, at the median mode. Responses without such a direction have 97 errors and more,
     those with one less than .01.
     """
-    if len(inputs) < 2 or not len(roots.z):
+    residuals, modes = proposals.residuals, proposals.modes
+    if len(inputs) < 2 or not len(modes.a):
         return
-    response: Response = emulation
-    _, jacobian = response(roots.z)
+    emulation = residuals.response
+    _, jacobian = emulation(residuals.coordinates(modes.specimen, modes.a))
     scaled = jacobian / emulation.error[:, None]
     values, directions = _singular(scaled)
     if len(values) and np.median(values[:, -1]) < smallest:
@@ -574,7 +574,7 @@ def refuse_unused_inputs(
     if d < 2 or m < d or is_finite.sum() < 4 * d:
         return
     z, outputs = z[is_finite], outputs[is_finite]
-    surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
+    surface = fit_emulator(z, outputs)
     _, jacobian = surface(z)
     spread = outputs.std(axis=0)
     values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
@@ -609,7 +609,7 @@ def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) 
 def misfit_findings(
     name: str,
     readings: Readings,
-    roots: Roots,
+    modes: Modes,
     error: Floats,
     largest: float = 50.0,
     *,
@@ -621,16 +621,16 @@ def misfit_findings(
     With gross errors in the likelihood half of the specimens may have such readings.
     """
     # The first root of each specimen with the smallest misfit.
-    order = np.lexsort((roots.misfit, roots.specimen))
-    specimens, first = np.unique(roots.specimen[order], return_index=True)
+    order = np.lexsort((modes.misfit, modes.specimen))
+    specimens, first = np.unique(modes.specimen[order], return_index=True)
     best = order[first]
-    has_root = np.isfinite(roots.misfit[best])
-    is_poor = has_root & (roots.misfit[best] > largest)
+    has_root = np.isfinite(modes.misfit[best])
+    is_poor = has_root & (modes.misfit[best] > largest)
     poor, rows = specimens[is_poor], best[is_poor]
     if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
-    off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
+    off = np.sqrt(np.mean((modes.errors[rows] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)
     return [
         Finding(

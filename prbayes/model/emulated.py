@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.emulators.interpolant import fit_interpolant
+from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.base import Metric
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -31,11 +31,12 @@ from prbayes.model.specimen_likelihood import measurements_of, specimen_likeliho
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.importance import new_specimens
-from prbayes.propagation.specimen_emulation import Coordinates, Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Surface
 
 
 @dataclass(frozen=True)
@@ -146,10 +147,9 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
         is_near = np.ones(len(run_z), dtype=bool)
     distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
     rows = np.flatnonzero(is_finite)[distinct]
-    has_near = is_near[rows].any()
-    surface = fit_interpolant(z[rows], y[rows], is_near[rows] if has_near else None)
-    left_out = surface.left_out[is_near[rows]] if has_near else surface.left_out
-    error = np.sqrt((left_out**2).mean(axis=0))
+    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
+    surface = fit_emulator(z[rows], y[rows], near)
+    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
     return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 

@@ -22,11 +22,13 @@ from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Emulation
+from prbayes.specimens.points import SpecimenOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
-    """Readings of S specimens in M outputs: those of all simulators, then exact conditions."""
+    """Readings of S specimens in the M outputs of all simulators."""
 
     readings: Readings  # repeated readings of an output by their weighted mean, with its error
     scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
@@ -117,6 +119,7 @@ class StackedReadings:
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
     conditions: Floats | None  # (S, C)
+    coordinates: Floats | None  # (S, C): those of the conditions
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
@@ -124,7 +127,7 @@ class StackedReadings:
         first = measurements[0]
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
-        conditions = None
+        conditions = coordinates = None
         variables = [first.inputs.aleatory[place] for place in first.inputs.conditions]
         if variables:
             conditions = np.empty((size, len(variables)))
@@ -134,8 +137,6 @@ class StackedReadings:
                 kind = f"values of {variable.name}"
                 conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)
                 coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
-            zero = np.zeros(conditions.shape)
-            parts.append((Readings.exact(coordinates), zero, Repeats(zero, zero, zero)))
         readings, scales, repeats = zip(*parts, strict=True)
         groups = None
         if first.groups is not None:
@@ -160,6 +161,7 @@ class StackedReadings:
             covariates,
             log_gross,
             conditions,
+            coordinates,
         )
 
 
@@ -235,7 +237,7 @@ class SpecimenLikelihood:
     measurements: tuple[Measurement, ...]  # of simulators with the same inputs
     model: Any = None  # weak reference to a pymc.Model
     shared_emulation: Emulation | None = None  # of the same responses, for other data
-    options: PointOptions = field(default_factory=PointOptions)
+    options: SpecimenOptions = field(default_factory=SpecimenOptions)
     # Values that are computed at their first use, such as the points of the specimens.
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 

@@ -11,9 +11,8 @@ import pymc as pm
 from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
-from prbayes.emulators.continued import Continued
 from prbayes.emulators.ranges import predictive_inputs
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, continued
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -155,7 +154,7 @@ def _near_data(
 ) -> Floats:
     """Return inputs, (k, d), of specimens with responses near each measured one."""
     columns, batch = runs.surrogate.domain.columns(arguments)
-    values, _ = checked(Continued(runs)(*arguments), batch, arguments, responses.outputs)
+    values, _ = checked(continued(runs, *arguments), batch, arguments, responses.outputs)
     values = values.reshape(len(columns), -1)
     data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
     spread = np.nanstd(data, axis=0)

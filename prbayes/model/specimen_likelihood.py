@@ -45,9 +45,9 @@ from prbayes.model.random_variable import (
 from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.model.unknown_error import ReadingDensity
 from prbayes.propagation.population_density import WeightedPoints
-from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
+from prbayes.specimens.response_share import ResponseShare
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
@@ -160,7 +160,6 @@ def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Flo
         if "error" in m.extras:
             error *= values[str(m.extras["error"].name)].reshape(size, -1)
         columns.append(error)
-    columns.append(np.ones((size, len(likelihood.inputs.conditions))))
     return np.concatenate(columns, axis=1)
 
 
@@ -206,7 +205,6 @@ def log_likelihood_graph(
     for m in likelihood.measurements:
         error = params[m.extras["error"]] if "error" in m.extras else 1.0
         errors.append(error + pt.zeros(m.rows.shape[1]))
-    errors.append(pt.ones(len(likelihood.inputs.conditions)))
     error = pt.concatenate(errors)
     if not likelihood.error_is_known:
         terms = terms + _readings_log_density(likelihood, error, pt)
@@ -424,11 +422,10 @@ def _with_errors(
     if share is not False:
         low, high = np.concatenate([m.range for m in measurements], axis=1)
         middle, width = (low + high) / 2, high - low
-        measured = slice(middle.size)  # without conditions
         uniform = rng.random((size, n, middle.size))
         gross_errors = middle + width * (2 * uniform - 1)
         is_gross = rng.random((size, n, 1)) < np.reshape(share, (-1, 1, 1))
-        result[..., measured] = np.where(is_gross, gross_errors, result[..., measured])
+        result = np.where(is_gross, gross_errors, result)
     return np.asarray(result)
 
 

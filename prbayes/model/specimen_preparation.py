@@ -17,13 +17,13 @@ from scipy.special import chdtri, ndtri
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
+from prbayes.emulators.runs import Runs as TableRuns
 from prbayes.model.data_checks import (
     check_failing_region,
     data_findings,
     emulator_findings,
     misfit_findings,
     outlier_findings,
-    refuse_undetermined,
     refuse_unreachable,
     refuse_unused_inputs,
     repeat_findings,
@@ -35,19 +35,21 @@ from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
-from prbayes.propagation.response_share import ResponseShare, response_share
-from prbayes.propagation.roots import Roots
-from prbayes.propagation.specimen_emulation import (
-    Emulation,
-    EmulationProblem,
-    emulate,
-    first_runs,
-)
-from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 from prbayes.response.budget import RunCost
+from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
+from prbayes.specimens.design import emulate, first_runs, most_runs
+from prbayes.specimens.emulation import DifferencedResponse, Emulation
+from prbayes.specimens.points import (
+    SpecimenData,
+    SpecimenPoints,
+    draw_points,
+    normal_of,
+    specimen_points,
+)
+from prbayes.specimens.proposals import Proposals
+from prbayes.specimens.response_share import ResponseShare, response_share
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +58,10 @@ class Preparation:
 
     emulation: Emulation
     points: SpecimenPoints
+    proposals: Proposals  # of the points
+    thetas: Floats  # (S, p): posterior draws at which the halves of the points agree
     findings: tuple[Finding, ...]  # about the data and the runs, before the fit
-    share: ResponseShare | None  # of a population with a response, if it matters
+    share: ResponseShare | None = None  # of a population with a response, if it matters
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
@@ -69,6 +73,21 @@ def prepared(likelihood: SpecimenLikelihood) -> Preparation:
         likelihood.cache["preparation"] = _prepare(likelihood)
     preparation: Preparation = likelihood.cache["preparation"]
     return preparation
+
+
+def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> SpecimenLikelihood:
+    """Return the likelihood with at least so many points of each specimen; no run is needed.
+
+    The log-likelihood of a population needs fewer points than the inputs of a specimen.
+    """
+    preparation = prepared(likelihood)
+    if preparation.points.log_a.shape[1] >= count:
+        return likelihood
+    data = specimen_data(likelihood)
+    points = draw_points(data, preparation.proposals, count, data.seed + 1)
+    result = replace(likelihood)
+    result.cache["preparation"] = replace(preparation, points=points)
+    return result
 
 
 def is_prepared(likelihood: SpecimenLikelihood) -> bool:
@@ -88,11 +107,12 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
         n = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
         return RunCost(n, 0, n, "none: the table has all runs")
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
-    batch = max(first // 2, likelihood.options.fresh)
+    batch = max(first // 2, likelihood.options.sampled + 2)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
-    least, most = first + 2 * batch, first + 5 * batch
+    least = first + 2 * batch
+    most = likelihood.options.max_runs or most_runs(likelihood.coordinates.size)
     growth = (
-        f"{least} to {most} in all, {batch} at a time at the roots of the specimens, until the "
+        f"{least} to {most} in all, in batches at the specimens' likely inputs, until the "
         f"emulator shifts no estimate by more than {likelihood.options.bias} standard deviations"
     )
     return RunCost(max(least, computed), 0, most, growth)
@@ -105,18 +125,17 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     for response in responses if not likelihood.has_table else []:
         response.on_start = partial(log_first_runs, cost, f"Reweighted(n={n})", response)
-    populations = Populations(likelihood)
     runs = Runs(likelihood)
     try:
-        emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
-        problem = _problem(runs)
-        if likelihood.has_table:  # a call of the surface is no run
-            problem = replace(problem, run=OfTables.of(likelihood, lambda table: table))
+        data = specimen_data(likelihood)
+        first = _emulate(runs, data, likelihood.shared_emulation)
+        points = first.points
         refined, share = response_share(
-            problem,
-            emulation,
-            populations.prior_specimens,
-            lambda share: populations.posterior(points.z, points.log_a, share=share),
+            # A call of a table's surface is no run.
+            OfTables.of(likelihood, TableRuns.__call__) if likelihood.has_table else runs,
+            data,
+            first.emulation,
+            lambda share: Populations(likelihood).posterior(points.z, points.log_a, share=share),
         )
         if share is not None and likelihood.inputs.conditions:
             raise DesignError(
@@ -125,20 +144,18 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                 "prb.response.condition, since the share depends on the condition; return a "
                 "number there, such as the limit of the measurement, or narrow the priors"
             )
-        if likelihood.has_table:
-            refined = emulation
-        if refined is not emulation and not _is_partial(likelihood):
+        if refined is not first.emulation and not likelihood.has_table:
             # Specimens beside the failing region have points on its right side now.
-            refined, points, findings = _emulate(runs, populations, refined)
-        return Preparation(refined, points, report(*runs.findings, *findings), share)
+            first = _emulate(runs, data, refined)
+        return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
         if likelihood.has_table:
             raise
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
         if not cause:
             outputs = np.empty((0, 0)) if runs.first is None else runs.first
-            data = _data_findings(likelihood, outputs, several_roots=False)
-            cause = "".join(finding.text.removesuffix(".") for finding in data[:1])
+            checked = _data_findings(likelihood, outputs, several_roots=False)
+            cause = "".join(finding.text.removesuffix(".") for finding in checked[:1])
         raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
         for response in responses:
@@ -159,8 +176,6 @@ class Runs:
         measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
         parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
-        # Conditions are outputs that were read exactly.
-        parts.append(z[:, likelihood.coordinates.is_condition])
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
@@ -187,87 +202,73 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
     return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
 
-def _is_partial(likelihood: SpecimenLikelihood) -> bool:
-    """Return whether the readings of a specimen leave inputs along a fibre.
-
-    They are fewer than the inputs, or some are measured, known conditions among them, and the
-    others censored: points around roots would miss the measured ones. Without a known error such
-    points are kept, or refused where their halves differ.
-    """
-    n_measured = likelihood.readings.is_measured.sum(axis=1)
-    n_present = n_measured + likelihood.readings.is_censored.sum(axis=1)
-    size = likelihood.coordinates.size
-    is_partial = n_present < size
-    has_gross_errors = any(m.gross_errors is not False for m in likelihood.measurements)
-    if likelihood.error_is_known and not has_gross_errors and not likelihood.calls_response:
-        is_partial |= (n_measured > 0) & (n_measured < size)
-    return bool(is_partial.any())
+def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
+    """Return factors of the readings' errors that span 98 % of the prior of an unknown error."""
+    ends = []
+    for m in likelihood.measurements:
+        if "error" in m.extras:
+            (draws,) = PriorSampler([m.extras["error"]])(2048, seed=0)
+            low, middle, high = np.quantile(draws, [0.01, 0.84, 0.99], axis=0)
+            ends.append((np.min(low / middle), np.max(high / middle)))
+    if not ends:
+        return (1.0,)
+    lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
+    count = 1 + int(np.ceil((highest - lowest) / np.log(ratio)))
+    return tuple(np.exp(np.linspace(lowest, highest, count)).tolist())
 
 
-def _problem(runs: Runs) -> EmulationProblem:
-    """Return the response and the readings of all simulators of the specimens."""
-    likelihood = runs.likelihood
-    n, options = first_run_count(likelihood), likelihood.options
-    return EmulationProblem(runs, likelihood.readings, options, n=n, name=likelihood.name)
+def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
+    """Return the specimens, what is known of them, and the populations of the model."""
+    populations = Populations(likelihood)
+    coordinates, conditions = likelihood.coordinates, likelihood.stacked.coordinates
+    known = np.full((len(likelihood.readings), coordinates.size), np.nan)
+    if conditions is not None:
+        known[:, coordinates.is_condition] = conditions
+    return SpecimenData(
+        likelihood.readings,
+        known,
+        populations.prior_specimens(),
+        populations.posterior,
+        coordinates.bounds,
+        scales=_error_scales(likelihood),
+        gross_errors=likelihood.measurements[0].gross_errors is not False,
+        options=replace(likelihood.options, n_first=first_run_count(likelihood)),
+        name=likelihood.name,
+    )
 
 
-def _emulate(
-    runs: Runs, populations: Populations, emulation: Emulation | None
-) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
+def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Return the emulator, the points and findings of both."""
     likelihood = runs.likelihood
-    name, options, readings = likelihood.name, likelihood.options, likelihood.readings
-    bounds, d = likelihood.coordinates.bounds, likelihood.coordinates.size
-    problem = _problem(runs)
     if likelihood.has_table:
-        emulation, points, roots = points_of_tables(
-            problem, likelihood, populations.prior_specimens, populations.posterior
-        )
-        return emulation, points, _findings(likelihood, emulation, points, roots)
-    if _is_partial(likelihood):
-        if likelihood.calls_response:
-            raise TypeError(
-                f"{name}: propagation: got prb.Resimulated, expected stored responses where "
-                "specimens have fewer readings than inputs; leave propagation= out"
-            )
-        specimens, posterior = populations.prior_specimens(), populations.posterior
-        emulation, points = fibre_points(problem, bounds, specimens, posterior)
-        return emulation, points, _findings(likelihood, emulation, points, None)
-    box = np.stack([-np.ones(d), np.ones(d)])
-    if likelihood.calls_response:
-        emulation = Emulation.of_function(problem, box, bounds)
-    emulation, roots = emulate(problem, box, bounds, emulation)
-    if not likelihood.calls_response:
-        refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
-    is_known = likelihood.error_is_known
-    has_gross_errors = likelihood.measurements[0].gross_errors is not False
-    points = draw_points(
-        emulation,
-        readings,
-        roots,
-        options,
-        error_is_known=is_known,
-        gross_errors=has_gross_errors,
-    )
-    return emulation, points, _findings(likelihood, emulation, points, roots)
+        emulation, points, proposals, draws = points_of_tables(data, likelihood)
+    elif likelihood.calls_response:
+        error = data.options.floor * data.readings.spread()
+        z = data.inner[:: len(data.inner) // 64]
+        bounds = likelihood.coordinates.bounds
+        emulation = Emulation(z, runs(z), DifferencedResponse(runs), error, 0.0, bounds)
+        population = normal_of(data.inner[:, data.free])
+        points, proposals, draws = specimen_points(data, emulation, population)
+    else:
+        emulation, points, proposals, draws = emulate(runs, data, emulation)
+    findings = tuple(_findings(likelihood, emulation, points, proposals))
+    return Preparation(emulation, points, proposals, draws.thetas, findings)
 
 
 def _findings(
     likelihood: SpecimenLikelihood,
     emulation: Emulation,
     points: SpecimenPoints,
-    roots: Roots | None,
+    proposals: Proposals,
 ) -> list[Finding]:
     """Return findings of the data, and of the emulator at the roots of the specimens, if any."""
-    if roots is None:
-        return [*_data_findings(likelihood, emulation.y, several_roots=True)]
     name, readings, error = likelihood.name, likelihood.readings, emulation.error
     return [
         *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
         *misfit_findings(
             name,
             readings,
-            roots,
+            proposals.modes,
             error,
             gross_errors=likelihood.measurements[0].gross_errors is not False,
         ),
@@ -337,8 +338,8 @@ class Populations:
     ) -> Floats:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
-        With `smoothing`, a covariance (d, d), populations are normal with the moments of the
-        coordinates z, and wider by it: the log-likelihood is then smooth.
+        With `smoothing`, a covariance of the coordinates without conditions, populations are normal
+        with the moments of the coordinates z, and wider by it: the log-likelihood is then smooth.
         """
         n, count, d = z.shape
         likelihood = self.likelihood
@@ -346,6 +347,7 @@ class Populations:
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = variables_at(self.hyperparameters, thetas)
+        free = ~likelihood.coordinates.is_condition
         contexts = likelihood.by_group if smoothing is None else likelihood.by_context
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
@@ -357,7 +359,8 @@ class Populations:
             for first in range(0, len(thetas), step):
                 block = slice(first, first + step)
                 at_block = [parent[block] for parent in parents]
-                logs = self._normal_log_density(at_block, z[rows].reshape(-1, d), smoothing)
+                at_points = z[rows].reshape(-1, d)[:, free]
+                logs = self._normal_log_density(at_block, at_points, smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
                 result[block, rows] = log_sum_exp(logs + weights[rows])
@@ -377,7 +380,9 @@ class Populations:
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
         sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
-        sample = self.likelihood.coordinates.of(sampler(parents, specimens, rng)[0], 2)
+        coordinates = self.likelihood.coordinates
+        sample = coordinates.of(sampler(parents, specimens, rng)[0], 2)
+        sample = sample[..., ~coordinates.is_condition]
         # Populations far from the prior may have inputs whose squares overflow.
         is_finite = (np.abs(sample) < 1e100).all(axis=(1, 2))
         sample[~is_finite] = 0.0
@@ -414,7 +419,12 @@ class Populations:
         d = names.size
 
         def log_likelihood(thetas: Floats) -> Floats:
-            total = self.log_likelihoods(thetas, z, log_a, smoothing).sum(axis=1)
+            logs = self.log_likelihoods(thetas, z, log_a, smoothing)
+            if self.likelihood.measurements[0].gross_errors is not False:
+                # A share of specimens that leaves outliers without influence on the population.
+                log_gross = np.log(0.1) + self.likelihood.stacked.log_gross
+                logs = np.logaddexp(np.log(0.9) + logs, log_gross)
+            total = logs.sum(axis=1)
             return total if share is None else total - self.log_share(thetas, share)
 
         thetas = names.prior_points(2048, seed)
@@ -425,7 +435,7 @@ class Populations:
             away = thetas - mean
             covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
             root = np.linalg.cholesky(1.2 * covariance)
-            u = sobol(1024, d + 1, seed + 1 + attempt)
+            u = sobol(512, d + 1, seed + 1 + attempt)
             radius = np.sqrt(5 / chdtri(5, u[:, d]))
             standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T
@@ -464,8 +474,8 @@ class PopulationDraws:
     thetas: Floats
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        """Return log p(y_i | theta) at the draws, (S, N)."""
-        return self.populations.log_likelihoods(self.thetas, z, log_a)
+        """Return log p(y_i | theta) at a quarter of the draws, (S, N)."""
+        return self.populations.log_likelihoods(self.thetas[::4], z, log_a)
 
     def log_share(self, share: ResponseShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""

@@ -10,42 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.continued import Continued, LeftOut
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.propagation.fibre_points import fibre_points
-from prbayes.propagation.roots import Roots
-from prbayes.propagation.specimen_emulation import (
-    Coordinates,
-    DifferencedResponse,
-    Emulation,
-    EmulationProblem,
-    all_roots,
-    likely_roots,
-    near_readings,
-    shift_by_misfit,
-    specimen_roots,
-)
-from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 from prbayes.response.budget import unlimited
 from prbayes.response.response import Responses
-
-
-class Draws(Protocol):
-    """Draws of populations."""
-
-    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        """Return log p(y_i | theta), (S, N)."""
-
-    def specimens(self) -> Floats:
-        """Return coordinates of specimens, (n, d)."""
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.design import Likely, error_and_bias, wider
+from prbayes.specimens.emulation import DifferencedResponse, Emulation, near_readings
+from prbayes.specimens.points import Draws, SpecimenData, SpecimenPoints, normal_of, specimen_points
+from prbayes.specimens.proposals import Proposals
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,113 +35,61 @@ class OfTables:
 
     coordinates: Coordinates
     responses: tuple[Responses, ...]
-    of_conditions: float  # one for values of conditions, zero for their errors
 
     @classmethod
-    def of(cls, likelihood: SpecimenLikelihood, kind: Callable[[Runs], Any]) -> OfTables:
+    def of(cls, likelihood: SpecimenLikelihood, function: Callable[..., Any]) -> OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:
-            function, outputs = kind(_table(m)), m.responses.outputs
-            responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
-        is_error = kind is LeftOut
-        return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
+            of_table, inputs = partial(function, _table(m)), m.responses.inputs
+            responses.append(Responses(m.name, of_table, inputs, outputs=m.responses.outputs))
+        return cls(likelihood.coordinates, tuple(responses))
 
     def __call__(self, z: Floats) -> Floats:
         """Return values by output; no run is counted."""
         inputs = self.coordinates.inputs(z)
         with unlimited():
             parts = [response(inputs, []).reshape(len(z), -1) for response in self.responses]
-        parts.append(self.of_conditions * z[:, self.coordinates.is_condition])
         return np.concatenate(parts, axis=1)
 
 
 def points_of_tables(
-    problem: EmulationProblem,
-    likelihood: SpecimenLikelihood,
-    prior_specimens: Callable[[], Floats],
-    posterior: Callable[..., Any],
-) -> tuple[Emulation, SpecimenPoints, Roots | None]:
-    """Return the surface of tables, points of the specimens, and roots if readings identify them.
+    data: SpecimenData, likelihood: SpecimenLikelihood
+) -> tuple[Emulation, SpecimenPoints, Proposals, Draws]:
+    """Return the surface of tables, points of the specimens, and their proposals.
 
     Raises DesignError if the runs do not cover the populations of the data, or the surface is too
     inaccurate there.
     """
-    readings, options = problem.readings, problem.options
-    emulation, ranges = _surface(problem, likelihood)
-    present = readings.is_measured | readings.is_censored
-    roots = None
-    if (present.sum(axis=1) < likelihood.coordinates.size).any():
-        emulation, points = fibre_points(
-            problem, emulation.box, prior_specimens(), posterior, emulation
-        )
-    else:
-        roots = specimen_roots(emulation, readings, options)
-        if len(roots.z):
-            likely = likely_roots(roots, emulation.box)
-            inside = likely[_is_inside(likely, ranges)]
-            if len(inside) >= 4:
-                error = _error(problem, OfTables.of(likelihood, LeftOut)(inside))
-                emulation = replace(emulation, error=error)
-                roots = specimen_roots(emulation, readings, options)
-        roots = all_roots(emulation, readings, options, roots, problem.seed)
-        likely = likely_roots(roots, emulation.box) if len(roots.z) else roots.z
-        emulation = _with_bias(problem, likelihood, emulation, likely, ranges)
-        _require_accurate(likelihood, problem, emulation)
-        try:
-            points = draw_points(
-                emulation,
-                readings,
-                roots,
-                options,
-                error_is_known=likelihood.error_is_known,
-                gross_errors=likelihood.measurements[0].gross_errors is not False,
-            )
-        except DesignError as error:
-            outside = ~_is_inside(likely, ranges)
-            if outside.mean() <= MAX_LOST:
-                raise
-            raise DesignError(
-                f"{likelihood.name}: got runs that do not cover the populations of the data: the "
-                f"likeliest inputs of {outside.sum()} of {len(outside)} specimens are outside "
-                f"their ranges, expected none: about {_asked(likelihood, likely, ranges)}; "
-                "prb.propose_runs(model) returns a table of runs to add"
-            ) from error
-    draws: Draws = posterior(points.z, points.log_a)
-    specimens = draws.specimens()
-    _require_cover(likelihood, points, draws, specimens, ranges)
-    if roots is None:
-        emulation = _with_bias(problem, likelihood, emulation, specimens[:1024], ranges)
-        _require_accurate(likelihood, problem, emulation)
-    return replace(emulation, box=ranges), points, roots
+    emulation, ranges = _surface(data, likelihood)
+    likely = Likely.of(data, emulation, normal_of(data.inner[:, data.free]), 0)
+    z, specimens = likely.sample(512, np.random.default_rng(data.seed))
+    inside = _is_inside(z, ranges)
+    if inside.sum() >= 4:
+        misfit = OfTables.of(likelihood, left_out_nearby)(z[inside])
+        error, bias = error_and_bias(data, emulation, likely, z[inside], specimens[inside], misfit)
+        # The error of the comparison, if it is too large, narrows the population by half its share
+        # of the variance. Beside a turning point its linear form would be far too large.
+        share = float((error / data.readings.robust_spread()).max())
+        narrowing = np.sqrt(len(data.readings) / 2) * share**2
+        emulation = replace(emulation, error=error, bias=max(bias, narrowing))
+    _require_accurate(likelihood, data, emulation)
+    try:
+        points, proposals, draws = specimen_points(data, emulation, wider(likely.population))
+    except DesignError as error:
+        if inside.mean() >= 1 - MAX_LOST:
+            raise
+        raise DesignError(
+            f"{likelihood.name}: got runs that do not cover the populations of the data: the "
+            f"likeliest inputs of {np.mean(~inside):.0%} of the specimens are outside "
+            f"their ranges, expected none: about {_asked(likelihood, z, ranges)}; "
+            "prb.propose_runs(model) returns a table of runs to add"
+        ) from error
+    _require_cover(likelihood, points, draws, draws.specimens(), ranges)
+    return emulation, points, proposals, draws
 
 
-def _with_bias(
-    problem: EmulationProblem,
-    likelihood: SpecimenLikelihood,
-    emulation: Emulation,
-    z: Floats,
-    ranges: Floats,
-) -> Emulation:
-    """Return the emulation with the bias of left-out errors at coordinates within the ranges.
-
-    Zero without any: the table is refused then, as it does not cover the specimens.
-    """
-    inside = z[_is_inside(z, ranges)]
-    jacobian = emulation.surface(inside)[1]
-    rows = np.isfinite(jacobian).all(axis=(1, 2))  # not beside failed runs
-    if rows.sum() < 2:
-        return replace(emulation, bias=0.0)
-    misfit = OfTables.of(likelihood, LeftOut)(inside[rows])
-    bias = shift_by_misfit(problem, emulation.error, misfit, jacobian[rows], inside[rows])
-    # The error of the comparison, if it is too large, narrows the population by half its share of
-    # the variance. Beside a turning point its linear form for each root would be far too large.
-    share = float((emulation.error / problem.readings.robust_spread()).max())
-    narrowing = np.sqrt(len(problem.readings) / 2) * share**2
-    return replace(emulation, bias=max(bias, narrowing))
-
-
-def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
+def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
     """Return the surface through the runs, with a wider box of the search, and their ranges."""
     coordinates, bounds = likelihood.coordinates, likelihood.coordinates.bounds
     runs, lows, highs = [], [], []
@@ -190,19 +119,13 @@ def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple
         )
     z = np.unique(np.concatenate(runs), axis=0)
     z = z[np.isfinite(z).all(axis=1)]
-    y = problem.run(z)
-    residuals = OfTables.of(likelihood, LeftOut)(z[near_readings(y, problem.readings)])
-    error = _error(problem, residuals)
-    # The noise of a process in double precision is far below its change over a thousandth.
-    surface = DifferencedResponse(OfTables.of(likelihood, Continued), step=1e-3)
-    whole = np.stack([np.full(len(low), -np.inf), np.full(len(low), np.inf)])
-    return Emulation(z, y, box, surface, error, np.inf, whole), ranges
-
-
-def _error(problem: EmulationProblem, residuals: Floats) -> Floats:
-    """Return the error of the surface by output, (m,), from left-out residuals (n, m)."""
+    y = OfTables.of(likelihood, Runs.__call__)(z)
+    residuals = OfTables.of(likelihood, left_out_nearby)(z[near_readings(y, data.readings)])
     error = 2 * np.sqrt((residuals**2).mean(axis=0))
-    return np.asarray(np.maximum(error, problem.options.floor * problem.readings.spread()))
+    error = np.maximum(error, data.options.floor * data.readings.spread())
+    # The noise of a process in double precision is far below its change over a thousandth.
+    surface = DifferencedResponse(OfTables.of(likelihood, continued), step=1e-3)
+    return Emulation(z, y, surface, error, 0.0, ranges), ranges
 
 
 def _is_inside(z: Floats, ranges: Floats) -> NDArray[np.bool_]:
@@ -250,18 +173,18 @@ def _asked(likelihood: SpecimenLikelihood, specimens: Floats, ranges: Floats) ->
 
 
 def _require_accurate(
-    likelihood: SpecimenLikelihood, problem: EmulationProblem, emulation: Emulation
+    likelihood: SpecimenLikelihood, data: SpecimenData, emulation: Emulation
 ) -> None:
     """Raise if the error of the surface is as large as the scatter, or shifts populations."""
-    share = float((emulation.error / problem.readings.robust_spread()).max())
-    if emulation.bias <= problem.options.bias and share < 1:
+    share = float((emulation.error / data.readings.robust_spread()).max())
+    if emulation.bias <= data.options.bias and share < 1:
         return
     shift = f"{emulation.bias:.2g}" if emulation.bias < 100 else "100 and more"
     raise DesignError(
         f"{likelihood.name}: got a surface through {len(emulation.z)} runs with a cross-validated "
         f"error of {share / 2:.2g} standard deviations of the readings, which would shift a mean "
         f"or standard deviation of an input by {shift} posterior standard deviations, "
-        f"expected at most {problem.options.bias}; prb.propose_runs(model) returns a table of runs "
+        f"expected at most {data.options.bias}; prb.propose_runs(model) returns a table of runs "
         "to add near the specimens"
     )
 

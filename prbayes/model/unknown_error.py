@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.propagation.specimen_points import SpecimenPoints
+from prbayes.specimens.points import SpecimenPoints
 
 
 @dataclass(frozen=True, eq=False)

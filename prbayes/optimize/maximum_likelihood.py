@@ -40,7 +40,12 @@ from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
-from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_preparation import (
+    PopulationDraws,
+    Populations,
+    prepared,
+    specimen_data,
+)
 from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
@@ -52,9 +57,8 @@ from prbayes.optimize.optimum import (
     point_text,
     require_sampling,
 )
-from prbayes.propagation.specimen_emulation import specimen_roots
-from prbayes.propagation.specimen_points import draw_points
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
+from prbayes.specimens.points import agreeing_points, fit_proposals
 
 
 @dataclass(frozen=True, eq=False)
@@ -571,6 +575,28 @@ type SpecimenData = tuple[list[Floats], Floats]
 """Points, (N, K, *event) by input, and numbers A, (N, K), of the specimens of a likelihood."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Copies:
+    """Draws of the hyperparameters, for several copies of the specimens."""
+
+    draws: PopulationDraws
+    n: int  # number of specimens
+
+    @property
+    def thetas(self) -> Floats:
+        """The draws, (S, p)."""
+        return self.draws.thetas
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta) of all copies, (S, copies * n)."""
+        copies = [slice(first, first + self.n) for first in range(0, len(z), self.n)]
+        return np.concatenate([self.draws.log_likelihoods(z[k], log_a[k]) for k in copies], axis=1)
+
+    def specimens(self) -> Floats:
+        """Return coordinates of specimens, (n, d)."""
+        return self.draws.specimens()
+
+
 def specimen_pool(
     likelihood: SpecimenLikelihood,
     values: Mapping[str, Floats],
@@ -595,13 +621,21 @@ def specimen_pool(
         missing,
         np.resize(observed.is_relative, shape),
     )
-    options = likelihood.options
+    data, preparation = specimen_data(likelihood), prepared(likelihood)
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
-    options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
-    emulation = prepared(likelihood).emulation
-    roots = specimen_roots(emulation, readings, options)
-    has_gross_errors = likelihood.measurements[0].gross_errors is not False
-    points = draw_points(emulation, readings, roots, options, gross_errors=has_gross_errors, seed=1)
+    tolerance = data.options.half_difference * np.sqrt(copies)
+    data = replace(
+        data,
+        readings=readings,
+        known=np.tile(data.known, (copies, 1)),
+        options=replace(data.options, half_difference=tolerance),
+        seed=1,
+    )
+    proposals = fit_proposals(
+        data, preparation.emulation, preparation.proposals.residuals.population
+    )
+    draws = _Copies(PopulationDraws(Populations(likelihood), preparation.thetas), n)
+    points, _ = agreeing_points(data, proposals, data.options.points, draws)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)
 

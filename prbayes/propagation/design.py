@@ -113,7 +113,7 @@ class Design:
         )
         if self.coarse is None:
             return text
-        following, outputs = self.emulator.n_following, len(self.emulator.surfaces)
+        following, outputs = self.emulator.n_following, self.emulator.runs.y.shape[1]
         if not following:
             return f"{text} It does not follow the coarse response, which adds no information."
         share = f" in {following} of {outputs} outputs" if following < outputs else ""

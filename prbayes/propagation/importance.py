@@ -15,15 +15,10 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.emulators.selection import (
-    CANDIDATES,
-    Runs,
-    predict_outputs,
-    predict_without_blocks,
-    select_surfaces,
-    weight_of_runs,
-)
-from prbayes.emulators.surfaces import MultifidelityModel
+from prbayes.emulators.emulator import ROUGH_CANDIDATES
+from prbayes.emulators.following import FollowingEmulator
+from prbayes.emulators.selection import Runs, weight_of_runs
+from prbayes.emulators.surfaces import as_surface
 from prbayes.numerics.points import base_points, inside
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
@@ -263,7 +258,7 @@ class DesignEmulator:
     """An emulator of one response, fitted to the runs of a design."""
 
     runs: Runs
-    surfaces: tuple[Any, ...]  # by output
+    emulator: FollowingEmulator
     left_out: Floats  # (n, m): predictions of runs that were left out
     event: tuple[int, ...]  # shape of one response: () or (m,)
     weights: Floats  # (T, n): of the runs in the populations that matter
@@ -306,20 +301,20 @@ class DesignEmulator:
     @property
     def n_following(self) -> int:
         """Number of outputs that follow a coarse response."""
-        return sum(isinstance(surface, MultifidelityModel) for surface in self.surfaces)
+        return sum(pair is not None for pair in self.emulator.following)
 
     @one_thread()
     def at(self, points: EmulatedPoints) -> Floats:
         """Return the responses at points, (M,) or (M, m)."""
         x = columns(points.inputs)
-        values = predict_outputs(self.surfaces, self.runs, x, coarse=points.coarse)
+        values = self.runs.predict(self.emulator, x, points.coarse)
         return values.reshape(-1, *self.event)
 
     @one_thread()
     def without_each_block(self, points: EmulatedPoints) -> list[Floats]:
         """Return the responses by emulators that were fitted without one block of the runs."""
         x = columns(points.inputs)
-        by_block = predict_without_blocks(self.surfaces, self.runs, x, points.coarse)
+        by_block = self.runs.predict_without_blocks(self.emulator, x, points.coarse)
         return [values.reshape(-1, *self.event) for values in by_block]
 
     def joined(self, points: EmulatedPoints, log_density: Floats, runs: Sample) -> Sample:
@@ -355,8 +350,8 @@ def fit_emulator(
     y = runs.values.reshape(len(runs), -1)
     fitted = Runs(x, y, weights.mean(axis=0), runs.blocks, coarse)
     try:
-        surfaces = CANDIDATES if isinstance(emulator, str) else [emulator]
-        best, left_out = select_surfaces(surfaces, fitted)
+        best = fitted.fit(ROUGH_CANDIDATES if isinstance(emulator, str) else [as_surface(emulator)])
+        left_out = fitted.left_out_predictions(best)
     except np.linalg.LinAlgError:
         return None
     fit = DesignEmulator(fitted, best, left_out, runs.values.shape[1:], weights)

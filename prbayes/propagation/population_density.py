@@ -295,9 +295,14 @@ def normalise(logs: Floats) -> Floats:
 type Normal = tuple[Floats, Floats]  # mean (d,) and lower Cholesky factor of the covariance (d, d)
 
 
-def fit_normal(z: Floats, log_a: Floats) -> Normal:
-    """Fit a normal population by EM to specimens with likelihood terms exp(log p(z) + log_a)."""
-    mean, covariance = _fit(z, log_a)
+def fit_normal(z: Floats, log_a: Floats, start: Any = None) -> Normal:
+    """Fit a normal population by EM to specimens with likelihood terms exp(log p(z) + log_a).
+
+    With a population as the start, five steps are taken.
+    """
+    if start is not None:
+        start = start.mean[None], (start.root @ start.root.T)[None]
+    mean, covariance = _fit(z, log_a, start=start)
     return mean[0], np.linalg.cholesky(covariance)[0]
 
 

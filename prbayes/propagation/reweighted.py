@@ -19,7 +19,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, counted, report
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
-from prbayes.emulators.selection import MOST_RUNS
+from prbayes.emulators.kriging import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.numerics.threads import one_thread

@@ -15,6 +15,7 @@ from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
 from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_inputs, draw_readings, specimen_likelihoods
+from prbayes.model.specimen_preparation import with_more_points
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
@@ -106,7 +107,7 @@ def individuals(
         labels = specimen_labels(likelihood)
         size = len(likelihood.readings)
         specimens = {f"specimen{suffix}": np.arange(size) if labels is None else labels}
-        inputs, gross_error = draw_inputs(likelihood, rng, points)
+        inputs, gross_error = draw_inputs(with_more_points(likelihood), rng, points)
         function = likelihood.measurements[0].responses.function
         input_names = aleatory_names(likelihood.inputs, function)
         conditions = dict(zip(likelihood.inputs.conditions, _columns(likelihood), strict=True))

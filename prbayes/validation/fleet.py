@@ -39,8 +39,9 @@ from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import specimen_target
 from prbayes.propagation.reweighted import designs_restored
-from prbayes.propagation.specimen_emulation import Coordinates, Emulation
 from prbayes.response.inputs import model_on_context
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Emulation
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
 

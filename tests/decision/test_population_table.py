@@ -252,7 +252,7 @@ def test_one_time_series_is_no_population() -> None:
             with pytest.raises(ValueError, match=f"(1, 20)|1 specimen.*{advice}"):
                 prb.Simulator("y", np.positive, x, metric=metric, observed=times[None])
         prb.Simulator("decay", lambda x: np.exp(-np.multiply.outer(x, times)), x, observed=times)
-    with pytest.raises(ResponseError, match=rf"returned shape \(64, 20\).*{advice}"):
+    with pytest.raises(ResponseError, match=rf"returned shape \(10, 20\).*{advice}"):
         prb.minimize(model, progressbar=False)
 
 

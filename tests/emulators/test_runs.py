@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.emulators.continued import Continued, LeftOut
+from prbayes.emulators.runs import continued, left_out_nearby
 from prbayes.numerics.points import sobol
 
 X = np.array([0.0, 1.0]) + sobol(48, 2, 1)
@@ -124,8 +124,8 @@ def test_outputs_keep_their_labels_and_failed_runs_are_nan_nearby() -> None:
 def test_beyond_the_ranges_the_continuation_is_linear() -> None:
     table = prb.Runs(TABLE, 3 * X[:, 0] - X[:, 1] + 2)
     at = np.array([-0.4, 1.6, 0.5]), np.array([1.5, 0.5, 1.2])
-    np.testing.assert_allclose(Continued(table)(*at), 3 * at[0] - at[1] + 2, atol=1e-3)
-    np.testing.assert_allclose(LeftOut(table)(*X[:5].T), table.error.residuals[:5])
+    np.testing.assert_allclose(continued(table, *at), 3 * at[0] - at[1] + 2, atol=1e-3)
+    np.testing.assert_allclose(left_out_nearby(table, *X[:5].T), table.error.residuals[:5])
 
 
 def test_inputs_of_a_simulator_are_those_of_the_table(runs: prb.Runs) -> None:

@@ -13,23 +13,12 @@ from sklearn.gaussian_process.kernels import RBF
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.emulators.emulator import ROUGH_CANDIDATES, fit_emulator
+from prbayes.emulators.following import FollowingEmulator, fit_follower
 from prbayes.emulators.gaussian_process import GaussianProcess
-from prbayes.emulators.selection import (
-    CANDIDATES,
-    Runs,
-    left_out_predictions,
-    predict_outputs,
-    select_surfaces,
-)
-from prbayes.emulators.surfaces import (
-    MultifidelityModel,
-    Polynomial,
-    RadialBasis,
-    Surface,
-    fit_multifidelity,
-    fitted,
-    predict,
-)
+from prbayes.emulators.radial_basis import RadialBasis
+from prbayes.emulators.selection import Runs
+from prbayes.emulators.surfaces import Following, Polynomial, Surface
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 FRESH = np.random.default_rng(3).uniform([0, 1], [3, 2], (500, 2)).T
@@ -109,10 +98,12 @@ def test_a_users_surface_equals_the_shipped_one() -> None:
     # It is fitted to responses of mean zero and unit spread; a constant has no spread.
     x = np.random.default_rng(0).random((20, 2))
     y, model = 1e6 + 1e4 * x[:, 0], Plane()
-    np.testing.assert_allclose(fitted(model, x, y)(x), y)
-    moments = model.responses[0].mean(), model.responses[0].std()
+    np.testing.assert_allclose(fit_emulator(x, y[:, None], tried=[model]).values(x)[:, 0], y)
+    (whole,) = [z for z in model.responses if len(z) == 20]
+    moments = whole.mean(), whole.std()
     np.testing.assert_allclose(moments, [0, 1], atol=1e-9)
-    np.testing.assert_array_equal(fitted(Plane(), x, np.full(20, 7.0))(x), 7.0)
+    constant = fit_emulator(x, np.full((20, 1), 7.0), tried=[Plane()])
+    np.testing.assert_array_equal(constant.values(x), 7.0)
 
 
 def test_settings() -> None:
@@ -149,57 +140,49 @@ def runs(function: Any = fine, coarse: Any = rough) -> Runs:
     return Runs(X, y, np.full(n, 1 / n), np.arange(n) * 8 // n, of_coarse)
 
 
-def selected(known: Runs) -> tuple[Any, Floats]:
-    return select_surfaces(CANDIDATES, known)
-
-
-def error(models: Any, known: Runs, function: Any = fine, coarse: Any = rough) -> float:
+def error(
+    emulator: FollowingEmulator, known: Runs, function: Any = fine, coarse: Any = rough
+) -> float:
     """Return the error at fresh points, in standard deviations of the response."""
     at = None if coarse is None else coarse(AT).reshape(len(AT), -1)
-    predictions = predict_outputs(models, known, AT, coarse=at)[:, 0]
+    predictions = known.predict(emulator, AT, at)[:, 0]
     return float(np.std(predictions - function(AT)) / np.std(function(AT)))
 
 
-@pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize("model", [Polynomial(2), GaussianProcess("matern")])
-def test_a_coarse_response_is_followed_with_its_sign(model: Any, joined: bool) -> None:
-    surface = fit_multifidelity(MultifidelityModel(model, model, joined), X, fine(X), rough(X))
-    if not joined:
-        assert surface.rho == pytest.approx(-3, abs=0.2)
-    assert (surface(AT, rough(AT)) - fine(AT)).std() < 0.15 * fine(AT).std()
-    again = pickle.loads(pickle.dumps(surface))
-    np.testing.assert_array_equal(again(AT, rough(AT)), surface(AT, rough(AT)))
-
-
 @pytest.mark.parametrize(
-    "model", [GaussianProcess("matern", lengths=(1.0, 1.0), nugget=1e-6), RadialBasis()]
+    "model",
+    [
+        *(GaussianProcess("matern"), Following(GaussianProcess("matern"))),
+        *(Polynomial(2), Following(Polynomial(2)), Following(RadialBasis())),
+    ],
+    ids=str,
 )
-def test_changes_over_short_distances_determine_rho(model: Any) -> None:
-    # A common trend is no part of the coarse response: least squares alone would give more.
-    def coarse(x: Floats) -> Floats:
-        return rough(x) + x[:, 0]
-
-    def trend(x: Floats) -> Floats:
-        return coarse(x) + 4 * np.tanh(x[:, 0])
-
-    following = MultifidelityModel(model, model, joined=False)
-    surface = fit_multifidelity(following, X, trend(X), coarse(X))
-    assert surface.rho == pytest.approx(1, abs=0.2)
-    assert np.polyfit(coarse(X), trend(X), 1)[0] > 2
-    constant = fit_multifidelity(following, X, fine(X), np.full(64, 3.0))
-    assert constant.rho == pytest.approx(0, abs=1e-12)
+def test_a_coarse_response_is_followed_with_its_sign(model: Surface) -> None:
+    follower = fit_follower(X, fine(X), rough(X), np.ones(64), tried=[model])
+    assert follower is not None
+    assert (follower.values(AT, rough(AT)) - fine(AT)).std() < 0.15 * fine(AT).std()
+    again = pickle.loads(pickle.dumps(follower))
+    np.testing.assert_array_equal(again.values(AT, rough(AT)), follower.values(AT, rough(AT)))
+    # A constant one, as an input, has no spread.
+    constant = fit_follower(X, fine(X), np.full(64, 3.0), np.ones(64), tried=[model])
+    assert constant is not None
+    assert np.isfinite(constant.values(AT, np.full(500, 3.0))).all()
 
 
-@pytest.mark.parametrize("joined", [False, True])
-def test_rho_is_that_of_the_runs_that_are_kept(joined: bool) -> None:
-    known = runs()
-    models = [MultifidelityModel(RadialBasis(), RadialBasis(), joined)]
-    expected = left_out_predictions(models, known)
-    block = known.blocks == 3
-    other_y = np.where(block[:, None], 70.0, known.y)
-    other = Runs(known.x, other_y, known.importance, known.blocks, known.coarse)
-    np.testing.assert_array_equal(left_out_predictions(models, other)[block], expected[block])
-    assert np.abs(expected - known.y).max() < 0.5 * np.ptp(known.y)
+@pytest.mark.parametrize("model", [Following(RadialBasis()), RadialBasis()], ids=str)
+def test_what_follows_is_that_of_the_runs_that_are_kept(model: Surface) -> None:
+    block = np.arange(64) % 8 == 3
+    others = [fine(X), np.where(block, 70.0, fine(X))]
+    values = []
+    for y in others:
+        follower = fit_follower(X, y, rough(X), np.ones(64), tried=[model])
+        assert follower is not None
+        (without,) = FollowingEmulator(follower.emulator, (follower,)).without_each(block[None])
+        (part,) = without.following
+        assert part is not None
+        values.append(part.values(X[block], rough(X[block])))
+    np.testing.assert_allclose(values[0], values[1], atol=1e-8)
+    assert np.abs(values[0] - fine(X[block])).max() < 0.5 * np.ptp(fine(X))
 
 
 def test_the_remainder_may_depend_on_the_coarse_response() -> None:
@@ -207,9 +190,7 @@ def test_the_remainder_may_depend_on_the_coarse_response() -> None:
         return np.exp(0.3 * x[:, 0]) * rough(x)
 
     known = runs(scaled)
-    models, _ = selected(known)
-    assert models[0].joined
-    assert error(models, known, scaled) < 0.2
+    assert error(known.fit(ROUGH_CANDIDATES), known, scaled) < 0.2
 
 
 def test_an_unrelated_coarse_response_changes_hardly_anything() -> None:
@@ -220,24 +201,24 @@ def test_an_unrelated_coarse_response_changes_hardly_anything() -> None:
         return np.sin(3 * x[:, 0]) * x[:, 1]
 
     known, alone = runs(smooth, unrelated), runs(smooth, None)
-    models, without = selected(known)[0], selected(alone)[0]
-    expected = error(without, alone, smooth, None)
-    assert error(models, known, smooth, unrelated) == pytest.approx(expected, rel=0.1)
+    expected = error(alone.fit(ROUGH_CANDIDATES), alone, smooth, None)
+    found = error(known.fit(ROUGH_CANDIDATES), known, smooth, unrelated)
+    assert found < 1.1 * expected
 
 
-def test_each_output_has_its_rho() -> None:
+def test_each_output_has_its_factor() -> None:
     known = runs(
         lambda x: np.stack([fine(x), x[:, 0]], axis=1),
         lambda x: np.stack([1e6 + 1e3 * rough(x), rough(x)], axis=1),
     )
-    models, _ = selected(known)
-    assert isinstance(models[0], MultifidelityModel)
+    emulator = known.fit(ROUGH_CANDIDATES)
+    assert emulator.following[0] is not None
     coarse = np.stack([1e6 + 1e3 * rough(AT), np.full(len(AT), 1e9)], axis=1)
-    found = predict_outputs(models, known, AT, coarse=coarse)
+    found = known.predict(emulator, AT, coarse)
     assert np.std(found[:, 0] - fine(AT)) < 0.05 * fine(AT).std()
     # Without it the errors are far larger.
     alone = runs(coarse=None)
-    assert error(selected(alone)[0], alone, coarse=None) > 0.5
+    assert error(alone.fit(ROUGH_CANDIDATES), alone, coarse=None) > 0.5
 
 
 def test_without_a_coarse_response_at_a_point_the_surface_of_the_response_serves() -> None:
@@ -245,21 +226,15 @@ def test_without_a_coarse_response_at_a_point_the_surface_of_the_response_serves
         return np.where(x[:, 0] > 1, np.nan, rough(x))
 
     known = runs(coarse=partly)
-    models, _ = selected(known)
-    assert isinstance(models[0], MultifidelityModel)
-    found = predict_outputs(models, known, AT, coarse=partly(AT)[:, None])
+    emulator = known.fit(ROUGH_CANDIDATES)
+    assert emulator.following[0] is not None
+    found = known.predict(emulator, AT, partly(AT)[:, None])
     without = AT[:, 0] > 1
-    alone = predict_outputs([models[0].otherwise], known, AT)
-    # Up to the last digit, in which sums over fewer points at a time differ.
-    np.testing.assert_allclose(found[without], alone[without], rtol=1e-12)
+    alone = known.predict(FollowingEmulator(emulator.alone), AT)
+    np.testing.assert_allclose(found[without], alone[without], rtol=1e-9)
     assert np.std(found[~without, 0] - fine(AT[~without])) < 0.1 * fine(AT).std()
 
 
 def test_too_few_coarse_responses_are_none() -> None:
     known = runs(coarse=lambda x: np.where(np.arange(len(x)) < 60, np.nan, rough(x)))
-    assert select_surfaces([Polynomial(2)], known)[0] == (Polynomial(2),)
-    # A constant one, as an input, has no spread.
-    model = GaussianProcess("matern", lengths=(1.0, 1.0, 1.0), nugget=1e-6)
-    following = MultifidelityModel(model, model, joined=True)
-    found = predict(following, X, fine(X), AT, np.full(64, 3.0), np.full(len(AT), 3.0))
-    assert np.isfinite(found).all()
+    assert known.fit([Polynomial(2)]).following == (None,)

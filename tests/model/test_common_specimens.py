@@ -20,8 +20,8 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import draw_readings, specimen_likelihoods
-from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.compile import PLAIN
+from prbayes.specimens.points import SpecimenOptions
 from prbayes.validation.cross_validation import _mean_log_losses
 
 N = 20
@@ -65,7 +65,7 @@ def two_simulators(of_a: Any = Y[A, 0], of_b: Any = Y[B, 1]) -> pm.Model:
 def fine(model: pm.Model, points: int = 512) -> pm.Model:
     """Give a model more points a root than four, for densities of single specimens."""
     for likelihood in specimen_likelihoods(model).values():
-        vars(likelihood)["options"] = replace(PointOptions(), points=points)
+        vars(likelihood)["options"] = replace(SpecimenOptions(), points=points)
     return model
 
 
@@ -202,7 +202,7 @@ def test_errors_of_both_simulators_may_be_variables() -> None:
         prb.Simulator("a", up, x, observed=Y[A, 0], specimens=A, metric=metric(error=e))
         b = metric(error=0.2)
         prb.Simulator("b", down, x, 3.0, observed=Y[B, 1], specimens=B, metric=b)
-    ours = log_density(fine(model, 32), "b")
+    ours = log_density(fine(model, 128), "b")
     assert_without_a_graph(model, "b", ours)
     for error in (0.25, 0.4):
         assert_close(

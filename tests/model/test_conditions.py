@@ -87,10 +87,6 @@ def test_several_conditions_keep_their_order_and_their_specimens() -> None:
     drawn = draw_readings(likelihood, np.random.default_rng(0), values, 12, measurement)
     error = 0.2 * first / np.sqrt(400)
     assert (np.abs(drawn.mean(axis=0) - first - second) < 4.5 * error).all()
-    # All readings: the conditions are those of the specimens.
-    drawn = draw_readings(likelihood, np.random.default_rng(0), values, 24)
-    expected = np.tile(likelihood.readings.values[:, 1:], (2, 1))
-    np.testing.assert_allclose(drawn[:, :, 1:], np.broadcast_to(expected, (400, 24, 2)), atol=1e-6)
 
 
 def test_the_range_of_a_condition_keeps_its_sign() -> None:

@@ -113,17 +113,18 @@ def test_gradients_are_those_of_the_closed_form() -> None:
     assert np.allclose(gradient, reference, atol=1e-4)
 
 
-def test_no_run_is_made_when_a_model_is_written_and_128_at_its_first_use() -> None:
+def test_no_run_is_made_when_a_model_is_written_and_few_at_its_first_use() -> None:
     response = Line()
     model = build(response)
     assert response.runs == 0
     evaluator = Evaluator.of(model)
     assert response.runs == 0
     values(model)
-    assert response.runs == 128
-    assert evaluator.n_responses == 128
+    runs = response.runs
+    assert 0 < runs <= 60
+    assert evaluator.n_responses == runs
     values(model, {"mu": 0.0, "sigma_log__": 0.0})
-    assert response.runs == 128
+    assert response.runs == runs
 
 
 def test_weights_are_factors_that_sum_to_the_number_of_specimens() -> None:
@@ -233,7 +234,7 @@ def test_groups_have_populations_of_their_own_and_share_runs() -> None:
     ours = values(model, {"mu": means, "sigma_log__": -0.5})
     expected = stats.norm.logpdf(data.values, 1 + 2 * means[index], 2 * np.exp(-0.5))
     assert np.allclose(ours, expected, atol=0.03)
-    assert response.runs == 128
+    assert 0 < response.runs <= 60
     known = pm.do(model, {"mu": [0.0, 10.0], "sigma": 0.1})
     drawn = pm.draw(known["y"], random_seed=1, mode=PLAIN)
     assert drawn[index == 0].mean() < drawn[index == 1].mean()
@@ -338,18 +339,19 @@ def test_copies_have_the_same_points(make: str) -> None:
     if make == "cloudpickle":
         (measurement,) = specimen_likelihoods(other)[other["y"]].measurements
         response = measurement.responses.function
-    assert response.runs == 128
+    assert response.runs == Evaluator.of(model).n_responses <= 60
 
 
 def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
     response = Line()
     model = build(response)
     values(model)
+    runs = response.runs
     for change in (pm.do, pm.observe):
         other = change(model, {"sigma": 0.5})
         ours = values(other, {"mu": 0.8})
         assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 1.0), atol=0.03)
-    assert response.runs == 128
+    assert response.runs == runs
 
 
 def test_other_data_of_the_same_model() -> None:
@@ -361,15 +363,15 @@ def test_other_data_of_the_same_model() -> None:
     ours = values(model)
     assert np.allclose(ours, exact(observed=other), atol=0.03)
     assert not np.allclose(ours, before, atol=0.03)
-    # The runs cover the roots of the other data too.
-    assert Evaluator.of(model).n_responses == response.runs == 128
+    runs = response.runs
+    assert Evaluator.of(model).n_responses == runs
     with model:
         pm.set_data({"data": Y})
-    assert np.array_equal(values(model), before)
+    assert np.allclose(values(model), before, rtol=1e-12)
     with model:
         pm.set_data({"data": Y[:7]})
     assert np.allclose(values(model), exact(observed=Y[:7]), atol=0.03)
-    assert response.runs == 128
+    assert response.runs <= runs + 60
 
 
 def test_data_of_another_shape_are_refused() -> None:
@@ -474,7 +476,7 @@ def test_nuts_has_the_exact_posterior(sampler: str) -> None:
             progressbar=False,
         )
     assert model
-    assert response.runs == 128
+    assert 0 < response.runs <= 60
     assert_posterior(draws.posterior)
 
 
@@ -533,8 +535,8 @@ def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture)
         assert "runs at first" not in caplog.text
         with caplog.at_level("INFO", logger="prbayes"):
             values(model, {"mu": 0.0})
-    assert "y: runs at first: 64" in caplog.text
-    assert "propagation=Reweighted(n=64); more: 128 to 224 in all" in caplog.text
+    assert "y: runs at first: 10" in caplog.text
+    assert "propagation=Reweighted(n=10); more: 30 to 256 in all" in caplog.text
 
 
 def test_the_response_itself_serves_in_place_of_an_emulator() -> None:

@@ -279,7 +279,7 @@ def test_the_same_surfaces_are_judged_again_for_other_populations() -> None:
     assert before is not None
     assert same is not None
     assert fitted is not None
-    assert same.surfaces is before.surfaces
+    assert same.emulator is before.emulator
     assert same.error != before.error
     assert fitted.runs is not before.runs
     np.testing.assert_array_equal(fitted.weights, same.weights)

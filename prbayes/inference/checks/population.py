@@ -158,7 +158,7 @@ def failing_region_findings(
     """Report populations with at least ``lost`` expected specimens without response; no run.
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
-    truncated to the other inputs (`prbayes.propagation.response_share`). Where it is +inf specimens
+    truncated to the other inputs (`prbayes.specimens.response_share`). Where it is +inf specimens
     fail: as none is among the data, a population moves away from there.
     """
     findings = []

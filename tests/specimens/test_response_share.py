@@ -16,9 +16,11 @@ from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.response_share import ResponseShare, boundary_points, response_share
-from prbayes.propagation.specimen_emulation import Coordinates, Emulation, EmulationProblem
 from prbayes.response.inputs import read_inputs
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.emulation import Emulation, fit_surface
+from prbayes.specimens.points import SpecimenData
+from prbayes.specimens.response_share import ResponseShare, boundary_points, response_share
 
 LIMIT = 0.15
 
@@ -28,13 +30,14 @@ def half_space(z: Floats) -> Floats:
     return np.where(z.mean(axis=1, keepdims=True) > LIMIT, np.nan, z[:, :1])
 
 
-def problem_of(run: Callable[[Floats], Floats]) -> EmulationProblem:
-    return EmulationProblem(run, Readings.exact(np.linspace(-0.3, 0.1, 20)[:, None]))
+READINGS = Readings.exact(np.linspace(-0.3, 0.1, 20)[:, None])
 
 
 def emulation_of(run: Callable[[Floats], Floats], d: int) -> Emulation:
-    box = np.stack([-np.ones(d), np.ones(d)])
-    return Emulation.first(problem_of(run), 2 * sobol(64, d, 0) - 1, box)
+    z = 2 * sobol(64, d, 0) - 1
+    y = run(z)
+    surface, *_ = fit_surface(z, y, READINGS, "y")
+    return Emulation(z, y, surface, np.array([1e-6]), 0.0)
 
 
 def log_share(share: ResponseShare, dist: Callable[..., Any], *parents: Floats) -> Floats:
@@ -83,9 +86,8 @@ def shared(
     """Return the emulation before and after, and the share."""
     emulation = emulation_of(run, d)
     z = 0.5 * np.random.default_rng(3).standard_normal((1000, d))  # specimens of the prior
-    after, share = response_share(
-        problem_of(run), emulation, lambda: z, lambda _: populations, batches=batches
-    )
+    data = SpecimenData(READINGS, np.full((20, d), np.nan), z, posterior=lambda *_: populations)
+    after, share = response_share(run, data, emulation, lambda _: populations, batches=batches)
     return emulation, after, share
 
 

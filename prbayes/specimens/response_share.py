@@ -24,12 +24,10 @@ from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
-from prbayes.propagation.specimen_emulation import (
-    Coordinates,
-    Emulation,
-    EmulationProblem,
-    first_runs,
-)
+from prbayes.specimens.coordinates import Coordinates
+from prbayes.specimens.design import first_runs
+from prbayes.specimens.emulation import Emulation
+from prbayes.specimens.points import SpecimenData
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +59,9 @@ class ResponseShare:
 
 
 def response_share(
-    problem: EmulationProblem,
+    run: Callable[[Floats], Floats],
+    data: SpecimenData,
     emulation: Emulation,
-    prior_specimens: Callable[[], Floats],
     posterior: Callable[[ResponseShare | None], Any],
     *,
     count: int = 1024,
@@ -80,28 +78,28 @@ def response_share(
     """
     if not np.isnan(emulation.y).any():
         return emulation, None
-    seed, name, options = problem.seed, problem.name, problem.options
+    seed, name, options = data.seed, data.name, data.options
     largest = options.half_difference
     draws = posterior(None)
 
     def draw(number: int, half: int) -> ResponseShare:
-        return _points(emulation, (prior_specimens(), draws.specimens()), number, 2 * seed + half)
+        return _points(emulation, (data.prior, draws.specimens()), number, 2 * seed + half)
 
     share = draw(count, 0)
     if np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
         return emulation, None
     draws = posterior(share)
-    batch = max(first_runs(emulation.z.shape[1]) // 2, options.fresh)
+    batch = max(2 * first_runs(emulation.z.shape[1]), 32)
     for _ in range(batches):
         fresh = boundary_points(emulation, draws.specimens(), batch, seed)
         previous = draws.log_share(share)
         if len(fresh):
             z = np.concatenate([emulation.z, fresh])
-            y = np.concatenate([emulation.y, problem.run(fresh)])
+            y = np.concatenate([emulation.y, run(fresh)])
             emulation = replace(emulation, z=z, y=y)
         share = draw(count, 0)
         change = float(np.std(draws.log_share(share) - previous))
-        if change <= largest:
+        if change <= largest / 4:
             break
     else:
         raise DesignError(

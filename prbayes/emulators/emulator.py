@@ -1,0 +1,145 @@
+"""The emulator of a response: the best surface of each output, or of each principal component.
+
+Surfaces compete by left-out errors, weighted by how near the runs are to the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._validate import Floats
+from prbayes.emulators.gaussian_process import GaussianProcess
+from prbayes.emulators.radial_basis import RadialBasis
+from prbayes.emulators.surfaces import FittedSurface, Surface
+from prbayes.numerics.threads import one_thread
+
+# Surfaces that compete; a Matern process is better for kinks and jumps.
+CANDIDATES: tuple[Surface, ...] = (GaussianProcess(), RadialBasis("quintic", degree="best"))
+ROUGH_CANDIDATES: tuple[Surface, ...] = (*CANDIDATES, GaussianProcess("matern"))
+
+
+@dataclass(frozen=True, eq=False)
+class Emulator:
+    """Surfaces through the outputs of runs.
+
+    With more than six outputs the surfaces are those of principal components.
+    """
+
+    z: Floats  # (n, d): runs
+    left_out: Floats  # (n, m): error at each run of the surface through all others
+    center: Floats  # (m,): mean of the outputs
+    unit: Floats  # (m,): spread of the outputs
+    components: Floats | None  # (c, m): principal components; None if surfaces are of outputs
+    surfaces: tuple[FittedSurface, ...]  # of each output or component
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
+        columns, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
+        values, jacobian = np.stack(columns, axis=1), np.stack(slopes, axis=1)
+        if self.components is not None:
+            values = values @ self.components
+            jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
+        return self.center + self.unit * values, self.unit[:, None] * jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return values at points, (k, d) -> (k, m)."""
+        values = np.stack([surface.values(z) for surface in self.surfaces], axis=1)
+        if self.components is not None:
+            values = values @ self.components
+        return np.asarray(self.center + self.unit * values)
+
+    def variance(self, z: Floats) -> Floats:
+        """Return predictive variances at points, (k, d) -> (k, m), in squared units of outputs."""
+        variances = np.stack([surface.variance(z) for surface in self.surfaces], axis=1)
+        if self.components is not None:
+            variances = variances @ self.components**2
+        return np.asarray(self.unit**2 * variances)
+
+    def without_each(self, masks: NDArray[np.bool_]) -> list[Emulator]:
+        """Return emulators with the same settings that lack some runs each, (B, n)."""
+        parts = zip(*(surface.without_each(masks) for surface in self.surfaces), strict=True)
+        return [replace(self, surfaces=surfaces) for surfaces in parts]
+
+
+@one_thread()
+def fit_emulator(
+    z: Floats,
+    y: Floats,
+    near: Floats | NDArray[np.bool_] | None = None,
+    *,
+    tried: Sequence[Surface] = CANDIDATES,
+    start: Emulator | None = None,
+    seed: int = 0,
+) -> Emulator:
+    """Fit the surfaces of outputs with the smallest left-out errors.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n, d)
+        Different runs.
+    y : ndarray, shape (n, m)
+        Finite outputs. Outputs far beyond the data are for the caller to limit.
+    near : ndarray, shape (n,), optional
+        Runs whose left-out errors count, as a mask or by weights; all by default.
+    tried : sequence of Surface
+        Surfaces that compete.
+    start : Emulator, optional
+        An emulator through earlier runs, whose lengths are a start of the search.
+    seed : int
+        Of the parts that are left out of surfaces without a formula for their left-out errors.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If no surface goes through the runs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> z = np.linspace(-1, 1, 24)[:, None]
+    >>> values, jacobian = fit_emulator(z, np.exp(z))(np.array([[0.5]]))
+    >>> bool(np.isclose(values, np.exp(0.5))), bool(np.isclose(jacobian, np.exp(0.5)))
+    (True, True)
+    """
+    n = len(z)
+    weights = np.ones(n) if near is None else np.asarray(near, dtype=float)
+    weights = weights / weights.sum() if weights.sum() > 0 else np.full(n, 1 / n)
+    center, unit = y.mean(axis=0), y.std(axis=0)
+    is_constant = unit <= 1e-14 * np.abs(y).max(axis=0)
+    center, unit = np.where(is_constant, y[0], center), np.where(is_constant, 1.0, unit)
+    scaled = np.where(is_constant, 0.0, (y - center) / unit)
+    components, scores = None, scaled.T
+    if y.shape[1] > 6:
+        u, sizes, components = np.linalg.svd(scaled, full_matrices=False)
+        # Scores and components of unit spread, as the outputs.
+        scores, components = np.sqrt(n) * u.T, (sizes / np.sqrt(n))[:, None] * components
+    surfaces: list[FittedSurface] = []
+    left_out, rest = np.zeros_like(y), scaled
+    for k, output in enumerate(scores):
+        earlier = start.surfaces[k] if start is not None and k < len(start.surfaces) else None
+        fits = [surface.fit(z, output, weights, earlier, seed) for surface in tried]
+        solved = [fit for fit in fits if fit is not None]
+        if not solved:
+            raise np.linalg.LinAlgError(
+                f"interpolation: got {n} points that determine no surface of {z.shape[1]} inputs"
+            )
+        # A surface alone needs no left-out errors to be selected.
+        best = min(solved, key=lambda fit: fit.error) if len(solved) > 1 else solved[0]
+        surfaces.append(best)
+        if components is None:
+            left_out[:, k] = best.left_out
+            continue
+        # Further components do not matter if what they add is far below the left-out errors.
+        rest = rest - output[:, None] * components[k]
+        left_out += best.left_out[:, None] * components[k]
+        error = np.sqrt(weights @ left_out**2)
+        if (np.sqrt((rest**2).mean(axis=0)) <= np.maximum(1e-6, 0.03 * error)).all():
+            components = components[: k + 1]
+            break
+    if components is not None:
+        left_out += rest
+    return Emulator(z, unit * left_out, center, unit, components, tuple(surfaces))

@@ -1,0 +1,106 @@
+"""Coordinates of the inputs of specimens: a smooth map to a vector with the prior range [-1, 1]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.response.distributions import PopulationSampler, PriorSampler
+from prbayes.response.inputs import Inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1]."""
+
+    shapes: tuple[tuple[int, ...], ...]  # event shape of each aleatory input
+    # (d,): logarithms are positive inputs whose prior spans more than a factor of ten.
+    is_log: NDArray[np.bool_]
+    # Of the prior range, which has 99 % of the specimens of the prior predictive population.
+    center: Floats  # (d,)
+    half_width: Floats  # (d,)
+    # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
+    # new data set of the prior exceeds an end with a probability of 1 in 4097.
+    bounds: Floats
+    is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
+
+    @classmethod
+    def of_prior(
+        cls,
+        inputs: Inputs,
+        n: int = 1,
+        populations: int = 4096,
+        sampler: PopulationSampler | None = None,
+    ) -> Coordinates:
+        """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
+        roots = PriorSampler(inputs.parents)(populations, 0)
+        sampler = PopulationSampler(inputs) if sampler is None else sampler
+        rng = np.random.default_rng([0, 11])
+
+        def draw(count: int) -> Floats:
+            drawn, _ = sampler(roots, count, rng)
+            flat = np.concatenate([x.reshape(populations * count, -1) for x in drawn], axis=1)
+            return flat[np.isfinite(flat).all(axis=1)]
+
+        flat = draw(1)
+        low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+        is_log = (flat > 0).all(axis=0) & (high > 10 * low)
+        low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
+        half_width = np.where(high > low, (high - low) / 2, 1.0)
+        center = (low + high) / 2
+        is_condition = np.zeros(center.size, dtype=bool)
+        sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
+        for place in inputs.conditions:
+            column = sum(sizes[:place])
+            is_condition[column] = True
+            scale = inputs.aleatory[place].owner.op.scale
+            is_log[column], center[column], half_width[column] = scale
+        ends = []
+        # Specimens in blocks: memory stays constant.
+        block = max(1, 16 * AT_ONCE // (populations * len(center)))
+        for first in (0, *range(1, n, block)):
+            flat = draw(min(block, n - first)) if first else flat
+            z = (_logs(flat, is_log) - center) / half_width
+            z = z[np.isfinite(z).all(axis=1)]
+            ends += [z.min(axis=0), z.max(axis=0)]
+        bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds, is_condition)
+
+    @property
+    def size(self) -> int:
+        """Number of aleatory numbers of a specimen, d."""
+        return len(self.center)
+
+    def inputs(self, z: Floats) -> list[Floats]:
+        """Return the aleatory inputs, shapes (..., *event), of coordinates (..., d)."""
+        flat = self.center + self.half_width * z
+        flat = np.where(self.is_log, np.exp(np.where(self.is_log, flat, 0.0)), flat)
+        arrays, first = [], 0
+        for shape in self.shapes:
+            last = first + int(np.prod(shape, dtype=int))
+            part = flat[..., first:last]
+            arrays.append(part.reshape(*z.shape[:-1], *shape))
+            first = last
+        return arrays
+
+    def of(self, inputs: Sequence[Floats], batch_ndim: int) -> Floats:
+        """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""
+        batch = inputs[0].shape[:batch_ndim]
+        flat = np.concatenate([x.reshape(*batch, -1) for x in inputs], axis=-1)
+        return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
+
+    def log_jacobian(self, z: Floats) -> Floats:
+        """Return log|dx/dz|, (..., d) -> (...), of all inputs but conditions."""
+        is_log = self.is_log & ~self.is_condition
+        logs = np.where(is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
+        return np.asarray(logs + np.log(self.half_width[~self.is_condition]).sum())
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _logs(flat: Floats, is_log: NDArray[np.bool_]) -> Floats:
+    """Return inputs (..., d), the logarithms of some; NaN of negative values."""
+    return np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)

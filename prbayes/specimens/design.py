@@ -1,0 +1,375 @@
+"""Runs of a response where the measured specimens are.
+
+A few runs over the prior predictive population, then batches: a sample of the specimens' likely
+inputs, whose misfit measures the error of the emulator before they join it, points far from all
+runs, and points of the prior where a specimen could lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._validate import Floats
+from prbayes.numerics.points import farthest_rows, sobol
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import fit_normal
+from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
+from prbayes.specimens.points import (
+    Draws,
+    SpecimenData,
+    SpecimenPoints,
+    at_scale,
+    draw_points,
+    fit_proposals,
+    likely_scale,
+    likely_weights,
+    normal_of,
+    specimen_points,
+    typical_specimens,
+)
+from prbayes.specimens.proposals import Normal, Proposals
+
+
+def first_runs(dimensions: int) -> int:
+    """Return the number of runs that an emulator of so many inputs starts from."""
+    return 6 * dimensions + 4
+
+
+def most_runs(dimensions: int) -> int:
+    """Return the largest number of runs before a response is refused."""
+    return 256 if dimensions <= 2 else 512 if dimensions <= 4 else 1920
+
+
+# Coordinates (n, d) -> outputs (n, m), NaN where there is no response.
+type Run = Callable[[Floats], Floats]
+
+
+def first_emulation(run: Run, data: SpecimenData) -> Emulation:
+    """Return the emulation through first runs, half as wide again as the prior's population."""
+    d = data.known.shape[1]
+    n = data.options.n_first or first_runs(d)
+    u = sobol(n, d, data.seed)
+    population = normal_of(data.inner[:, data.free])
+    z = np.empty((n, d))
+    z[:, data.free] = population.mean + 1.5 * ndtri(u[:, : len(data.free)]) @ population.root.T
+    low, high = data.prior.min(axis=0), data.prior.max(axis=0)
+    z = np.clip(z, low, high)
+    known = np.flatnonzero(~np.isnan(data.known[0]))
+    for place, column in enumerate(known):  # conditions: those of the specimens
+        values = np.quantile(data.known[:, column], u[:, len(data.free) + place])
+        z[:, column] = values
+    y = run(z)
+    while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
+        more = data.inner[
+            np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)
+        ]
+        z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
+    surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
+    rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
+    error = np.maximum(2 * rms, data.options.floor * data.readings.spread())
+    return Emulation(z, y, surface, error, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Likely:
+    """Likely inputs of the specimens: weighted points, and the population that weights them."""
+
+    proposals: Proposals
+    points: SpecimenPoints
+    population: Normal
+    weights: Floats  # (N, K)
+
+    @classmethod
+    def of(cls, data: SpecimenData, emulation: Emulation, population: Normal, seed: int) -> Likely:
+        """Return likely inputs under the population that fits them."""
+        # Twice as wide: the population of the last round may have been too narrow.
+        wide = Normal(population.mean, 2.0 * population.root)
+        proposals = fit_proposals(data, emulation, wide)
+        count = max(8 * proposals.modes.table.shape[1], 64 if proposals.is_open() else 0)
+        points = draw_points(data, proposals, count, seed)
+        scale = likely_scale(data, points, emulation.error)
+        points = at_scale(data, points, emulation.error, scale)
+        has_point = np.isfinite(points.log_a).any(axis=1)
+        if data.gross_errors:
+            has_point &= typical_specimens(proposals.modes, len(has_point))
+        z = points.z[has_point][..., data.free]
+        # A few steps of EM: along inputs that the readings leave open a fit would collapse.
+        start = None if not proposals.is_open(scale) else population
+        population = Normal(*fit_normal(z, points.log_a[has_point], start))
+        return cls(proposals, points, population, likely_weights(data, points, population))
+
+    def sample(
+        self, count: int, rng: np.random.Generator, weights: Floats | None = None
+    ) -> tuple[Floats, NDArray[np.intp]]:
+        """Return likely inputs, (count, d), and their specimens; different specimens first."""
+        weights = self.weights if weights is None else weights
+        n = len(weights)
+        specimens = np.concatenate([rng.permutation(n) for _ in range(-(-count // n))])[:count]
+        totals = np.cumsum(weights[specimens], axis=1)
+        places = (totals < rng.random((count, 1)) * totals[:, -1:]).sum(axis=1)
+        return self.points.z[specimens, places], specimens
+
+    def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
+        """Return inputs, (count, d), that are likely under a population twice as wide as the fit."""
+        wide = Normal(self.population.mean, 2.0 * self.population.root)
+        return self.sample(count, rng, likely_weights(data, self.points, wide))[0]
+
+
+def emulate(
+    run: Run, data: SpecimenData, previous: Emulation | None = None
+) -> tuple[Emulation, SpecimenPoints, Proposals, Draws]:
+    """Fit the emulator: runs over the prior, then where the specimens are until the bias is small.
+
+    ``previous`` is the emulation of the same response for other data. Raise DesignError if the
+    response cannot be emulated well enough.
+    """
+    emulation = first_emulation(run, data) if previous is None else previous
+    population = normal_of(data.inner[:, data.free])
+    most = data.options.max_runs or most_runs(data.known.shape[1])
+    rng = np.random.default_rng([data.seed, 1])
+    # An emulator of other data needs one batch, which measures its error at these.
+    batches, enough = 0, 2 if previous is None else 1
+    if previous is not None:
+        emulation = replace(emulation, bias=np.inf)
+    while True:
+        likely = Likely.of(data, emulation, population, batches)
+        population = likely.population
+        if emulation.bias <= data.options.bias and batches >= enough:
+            points, proposals, draws = specimen_points(data, emulation, wider(population))
+            emulation, passed = audited(run, data, emulation, proposals, points, draws, rng)
+            if passed:
+                return emulation, points, proposals, draws
+            likely = Likely.of(data, emulation, population, batches)
+        if len(emulation.z) >= most:
+            require_accurate(data, emulation)
+        count = max(data.options.sampled + 2, len(emulation.z) // 2 if previous is None else 0)
+        emulation = extended(run, data, emulation, likely, count, rng)
+        batches += 1
+
+
+def wider(population: Normal) -> Normal:
+    """Return a population that is twice as wide."""
+    return Normal(population.mean, 2.0 * population.root)
+
+
+def extended(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    count: int,
+    rng: np.random.Generator,
+) -> Emulation:
+    """Return the emulation with a batch of ``count`` runs."""
+    n_possible = max(2, count // 4)
+    n_explored = max(2, count // 8)
+    n_sampled = max(data.options.sampled, (count - n_explored - n_possible) // 2)
+    sampled, specimens = likely.sample(n_sampled, rng)
+    possible = likely.possible(data, n_possible, rng)
+    around, _ = likely.sample(8 * count, rng)
+    sd = np.sqrt((likely.population.root**2).sum(axis=1))
+    around[:, data.free] += 0.4 * sd * rng.standard_normal((len(around), len(sd)))
+    runs = np.concatenate([emulation.z, sampled, possible])
+    n_far = max(2, count - n_sampled - n_possible - n_explored)
+    far = _farthest(data, runs, around, n_far, sd)
+    explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
+    others = np.concatenate([far, explored])
+    return joined(run, data, emulation, likely, sampled, specimens, possible, others)
+
+
+def joined(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    sampled: Floats,
+    specimens: NDArray[np.intp],
+    possible: Floats,
+    others: Floats,
+) -> Emulation:
+    """Return the emulation with runs at fresh points.
+
+    The sampled points give its error and bias. At those that are possible under a wide population
+    a coarser error is allowed.
+    """
+    fresh = np.concatenate([sampled, possible, others])
+    outputs = run(fresh)
+    count = len(sampled) + len(possible)
+    misfit = outputs[:count] - emulation.surface.values(fresh[:count])
+    at_possible = misfit[len(sampled) :]
+    error, bias = error_and_bias(
+        data, emulation, likely, sampled, specimens, misfit[: len(sampled)]
+    )
+    bias = max(bias, _bias_of_possible(data, at_possible))
+    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
+    rows = _near_population(data, z, likely.population)
+    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
+    # The misfit is that of the emulator without these runs. Left-out errors at them show what
+    # they have improved.
+    at_sampled = left_out[len(emulation.z) :][: len(sampled)]
+    at_sampled = at_sampled[np.isfinite(at_sampled).all(axis=1)]
+    if np.isfinite(bias) and len(at_sampled):
+        improved = 2 * np.sqrt((at_sampled**2).mean(axis=0))
+        floor = data.options.floor * data.readings.spread()
+        error = np.maximum(np.minimum(error, improved), floor)
+    return Emulation(z, y, surface, error, bias)
+
+
+def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
+    """Return misfits (n, m) at possible inputs as a bias that is too large above ``largest``.
+
+    The limit is in units of the data's spread and the readings' errors.
+    """
+    readings = data.readings
+    error = np.median(readings.error_sd(np.nan_to_num(readings.values)), axis=0)
+    scaled = misfit / np.hypot(readings.spread(), error)
+    scaled = np.clip(scaled[np.isfinite(scaled).all(axis=1)], -3.0, 3.0)
+    if not len(scaled):
+        return 0.0
+    return float(data.options.bias / largest * np.sqrt((scaled**2).mean(axis=0).max()))
+
+
+def error_and_bias(
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    z: Floats,
+    specimens: NDArray[np.intp],
+    misfit: Floats,
+) -> tuple[Floats, float]:
+    """Return the error of the emulator, (m,), and the bias that it causes, from misfits (n, m)."""
+    good = np.isfinite(misfit).all(axis=1)
+    if good.sum() < 4:
+        return emulation.error, np.inf
+    z, specimens, misfit = z[good], specimens[good], misfit[good]
+    error = np.maximum(
+        2 * np.sqrt((misfit**2).mean(axis=0)), data.options.floor * data.readings.spread()
+    )
+    measured = replace(emulation, error=error)
+    residuals = data.residuals(measured, likely.population)
+    a = residuals.whitened(z)
+    _, slopes = residuals.errors(specimens, a)
+    sd = data.readings.comparison_sd(error)[specimens]
+    # Shift of the inputs of a specimen that the error of the emulator causes.
+    hessian = np.einsum("kmd,kme->kde", slopes, slopes) + np.eye(a.shape[1])
+    gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
+    shift = -np.einsum("kdm,km->kd", gain, misfit / sd)
+    bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
+    # m readings identify m of d directions; the posterior is wider than the formula assumes.
+    of_each = data.readings.is_measured.sum(axis=1).mean()
+    bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
+    # The comparison allows the error at each specimen; what the runs have overestimated of it is
+    # missing in the population's variance.
+    by_error = gain * np.where(np.isinf(sd), 0.0, error / sd)[:, None]
+    narrowing = np.sqrt(len(data.readings) / 2) * (by_error**2).sum(axis=2).mean(axis=0).max()
+    return error, float(max(bias, narrowing))
+
+
+def _near_population(
+    data: SpecimenData, z: Floats, population: Normal, far: float = 6.0
+) -> NDArray[np.bool_]:
+    """Return which runs are near a population, (n,), at least twice those of the first batch.
+
+    A response that oscillates in the tails of a vague prior needs short lengths there alone.
+    """
+    a = np.linalg.solve(population.root, (z[:, data.free] - population.mean).T)
+    distance = (a**2).sum(axis=0)
+    least = 2 * first_runs(z.shape[1])
+    limit = max(far**2, float(np.sort(distance)[min(least, len(z)) - 1]))
+    return np.asarray(distance <= limit)
+
+
+def _farthest(
+    data: SpecimenData, runs: Floats, candidates: Floats, count: int, sd: Floats
+) -> Floats:
+    """Return candidates, (count, d), each far from all runs and from those before."""
+    if count <= 0:
+        return np.empty((0, runs.shape[1]))
+    scale = np.ones(runs.shape[1])
+    scale[data.free] = sd
+    known = ~np.isnan(data.known[0])
+    scale[known] = np.maximum(np.ptp(data.known[:, known], axis=0), 1e-9)
+    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
+    return candidates[farthest_rows(candidates / scale, count, squares)]
+
+
+def _explored(
+    data: SpecimenData, emulation: Emulation, runs: Floats, count: int, rng: np.random.Generator
+) -> Floats:
+    """Return points of the prior, far from all runs, at which a specimen could lie."""
+    z = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
+    known = ~np.isnan(data.known[0])
+    z[:, known] = data.known[rng.integers(0, len(data.known), len(z))][:, known]
+    readings, spread = data.readings, data.readings.spread()
+    # What the emulator says of a place without runs may be wrong: its own deviation counts.
+    deviation = spread + 3 * np.sqrt(emulation.surface.variance(z))
+    values = emulation.surface.values(z)
+    low = np.nanmin(readings.values, axis=0) - deviation
+    high = np.nanmax(readings.values, axis=0) + deviation
+    is_possible = ((values >= low) & (values <= high)).all(axis=1)
+    if is_possible.sum() >= count:
+        z = z[is_possible]
+    sd = data.inner[:, data.free].std(axis=0)
+    return _farthest(data, runs, z, count, sd)
+
+
+def audited(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    proposals: Proposals,
+    points: SpecimenPoints,
+    draws: Draws,
+    rng: np.random.Generator,
+) -> tuple[Emulation, bool]:
+    """Return whether runs at points that matter to the posterior confirm the emulator.
+
+    Otherwise the emulation has these runs.
+    """
+    population = normal_of(draws.specimens()[:, data.free], 1.2)
+    likely = Likely(proposals, points, population, likely_weights(data, points, population))
+    sampled, specimens = likely.sample(data.options.sampled // 2, rng)
+    candidates, owners = likely.sample(64 * data.options.sampled, rng)
+    # Among the quarter of them at which the emulator is the least certain.
+    deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
+    order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
+    candidates, owners = candidates[order], owners[order]
+    sd = np.sqrt((population.root**2).sum(axis=1))
+    scale = np.ones(emulation.z.shape[1])
+    scale[data.free] = sd
+    runs = np.concatenate([emulation.z, sampled])
+    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
+    rows = farthest_rows(candidates / scale, data.options.sampled // 2, squares)
+    z, specimens = (
+        np.concatenate([sampled, candidates[rows]]),
+        np.concatenate([specimens, owners[rows]]),
+    )
+    possible = likely.possible(data, data.options.sampled // 4, rng)
+    n_audited = len(z)
+    z = np.concatenate([z, possible])
+    y = run(z)
+    misfit = y - emulation.surface.values(z)
+    at_audited = z[:n_audited], specimens, misfit[:n_audited]
+    error, bias = error_and_bias(data, emulation, likely, *at_audited)
+    bias = max(bias, _bias_of_possible(data, misfit[n_audited:]))
+    all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, y])
+    if bias <= 1.5 * data.options.bias:
+        return replace(emulation, z=all_z, y=all_y, bias=max(bias, emulation.bias)), True
+    used = _near_population(data, all_z, population)
+    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface, used)
+    return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias), False
+
+
+def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
+    """Raise: the emulator's error shifts populations."""
+    raise DesignError(
+        f"{data.name}: got an emulator whose error would shift a mean or standard deviation of an "
+        f"input by {emulation.bias:.2g} posterior standard deviations after "
+        f"{len(emulation.z)} runs, expected at most {data.options.bias}; narrow the priors, or use "
+        "metric=prb.ProbabilityResidual()"
+    )

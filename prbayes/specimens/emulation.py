@@ -1,0 +1,206 @@
+"""Emulation of a response near the measured specimens, with estimates of its error.
+
+No guard detects an error of the emulator that is smooth between the runs which measure it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._validate import Floats
+from prbayes.emulators.emulator import Emulator, fit_emulator
+from prbayes.metrics.readings import Readings
+from prbayes.propagation.base import DesignError
+
+
+class Surface(Protocol):
+    """Outputs (k, m) at coordinates (k, d) between runs, with their Jacobian (k, m, d)."""
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+
+    def variance(self, z: Floats) -> Floats:
+        """Return predictive variances, (k, m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencedResponse:
+    """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
+
+    values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
+    step: float = 1e-5  # in units of the coordinates
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        k, d = z.shape
+        axes = np.eye(d)
+        shifts = self.step * np.concatenate([np.zeros((1, d)), axes, -axes])
+        points = (z + shifts[:, None]).reshape(-1, d)
+        values = self.values(points).reshape(2 * d + 1, k, -1)
+        slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
+        return values[0], np.moveaxis(slopes, 0, -1)
+
+    def variance(self, z: Floats) -> Floats:
+        """Return zeros: the response has no error."""
+        return np.zeros_like(self.values(z))
+
+
+@dataclass(frozen=True, eq=False)
+class Emulation:
+    """Runs of the response, and the emulator through them."""
+
+    z: Floats  # (n, d): coordinates of the runs
+    y: Floats  # (n, m): their outputs; NaN where there is no response
+    surface: Surface
+    # (m,): standard deviation of the emulator's error at the specimens' likely inputs: twice the
+    # error at runs there before they were part of it.
+    error: Floats
+    # Predicted bias of a mean or standard deviation of an input, in posterior standard deviations.
+    bias: float
+    # (2, d): ends beyond which a specimen has the response at the end; by default of the runs.
+    ends: Floats | None = None
+
+    @cached_property
+    def box(self) -> Floats:
+        """Ends beyond which a specimen has the response at the end, (2, d)."""
+        if self.ends is not None:
+            return self.ends
+        return np.stack([self.z.min(axis=0), self.z.max(axis=0)])
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, NaN where the nearest run has no response."""
+        values, jacobian = self.surface(z)
+        failed = self.fails(z)
+        values[failed], jacobian[failed] = np.nan, np.nan
+        return values, jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        values = self.surface.values(z)
+        values[self.fails(z)] = np.nan
+        return values
+
+    def fails(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no finite response."""
+        return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
+
+    def is_missing(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
+        return self._of_nearest(np.isnan(self.y).any(axis=1), z)
+
+    def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
+        """Return a property of the nearest run of each point."""
+        if not of_runs.any():
+            return np.zeros(len(z), dtype=bool)
+        _, nearest = self._tree.query(z / self._width)
+        return np.asarray(of_runs[nearest])
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.z / self._width)
+
+    @property
+    def _width(self) -> Floats:
+        return np.maximum(np.ptp(self.z, axis=0), 1e-300)
+
+
+def fit_surface(
+    z: Floats,
+    y: Floats,
+    readings: Readings,
+    name: str,
+    previous: Any = None,
+    used: NDArray[np.bool_] | None = None,
+) -> tuple[Emulator, Floats, NDArray[np.bool_]]:
+    """Return the emulator, left-out errors, (n, m), and which runs are near the data, (n,).
+
+    Runs that are not ``used``, (n,), or without a response have NaN as their error. Runs that are
+    equal to nine digits count once.
+    """
+    good = np.isfinite(y).all(axis=1)
+    if used is not None and (good & used).sum() >= 8:
+        good &= used
+    if good.sum() < 8:
+        raise DesignError(
+            f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
+            "check the response, or give the hyperparameters priors where it exists"
+        )
+    spread = readings.spread()
+    rows = np.flatnonzero(good)
+    rounded = np.round(z[rows], 9)
+    _, first, copies = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    # A response that is steep outside the data would take the digits that outputs near them need:
+    # outputs are limited to 10^4 standard deviations of the data, and at least ten times the
+    # distance of 90 % of the runs.
+    yg = y[rows[first]]
+    center = np.nanmean(readings.values, axis=0)
+    largest = 10 * np.quantile(np.abs(yg - center), 0.9, axis=0)
+    largest = np.maximum(1e4 * spread, largest)
+    yg = np.clip(yg, center - largest, center + largest)
+    inside = near_readings(yg, readings)
+    start = previous if isinstance(previous, Emulator) else None
+    surface = fit_emulator(z[rows[first]], yg, inside, start=start)
+    left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
+    left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
+    return surface, left_out, is_near
+
+
+def near_readings(y: Floats, readings: Readings) -> NDArray[np.bool_]:
+    """Return which outputs (n, m) are within the range of the readings, or half of it away.
+
+    If these are less than a quarter, the nearest quarter, and at least eight.
+    """
+    spread, center = readings.spread(), np.nanmean(readings.values, axis=0)
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    is_near = ((y >= low - margin) & (y <= high + margin)).all(axis=1)
+    if is_near.sum() < len(y) // 4:
+        distance = (((y - center) / spread) ** 2).sum(axis=1)
+        is_near = np.zeros(len(y), dtype=bool)
+        is_near[np.argsort(distance, kind="stable")[: max(8, len(y) // 4)]] = True
+    return is_near
+
+
+def predicted_bias(shift: Floats, x: Floats, size: int) -> Floats:
+    """Return the bias that shifts of inputs cause, (2, d), in posterior standard deviations.
+
+    ``shift``, (n, d), is the true input less that of the emulator, at a sample x, (n, d), of the
+    inputs of ``size`` specimens. The first row is the bias of the mean, the second that of the
+    standard deviation of each input's population. Infinite if all have the same value of an input.
+    At a jump the prediction has .10 to .45 of the true size.
+    """
+    sd = x.std(axis=0)
+    if (sd == 0).any():
+        # Inputs at one place, such as the maximum of a response, show no spread.
+        return np.full((2, len(sd)), np.inf)
+    mean_bias = -shift.mean(axis=0) / sd * np.sqrt(size)
+    covariance = ((x - x.mean(axis=0)) * shift).mean(axis=0)
+    # var(x) = var(x + shift) - 2 cov(x, shift) - var(shift)
+    sd_bias = -(covariance + shift.var(axis=0) / 2) / sd**2 * np.sqrt(2 * size)
+    return np.stack([mean_bias, sd_bias])
+
+
+def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> float:
+    """Return the Monte Carlo error of the log-likelihood over the posterior, in nats.
+
+    sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2 over posterior draws theta_s, with
+    points of two independent halves a and b, both (S, N). A tilt of one nat for each posterior
+    standard deviation moves the posterior mean by one standard deviation. A specimen without a
+    point in one of the halves is left out. Size and power: docs/likelihood.md.
+    """
+    is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
+    with np.errstate(invalid="ignore"):
+        by_specimen = np.where(is_finite, log_likelihoods_a - log_likelihoods_b, 0.0)
+    difference = by_specimen.sum(axis=1)
+    return float(difference.std() / 2)

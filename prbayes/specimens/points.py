@@ -1,0 +1,429 @@
+"""Importance points of measured specimens, doubled until independent halves of them agree.
+
+    log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik).
+
+Points x_ik and numbers A_ik do not contain theta. `prbayes.specimens.proposals` derives them for a
+normal reference population, which follows from posterior draws of the hyperparameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._stats import log_sum_exp
+from prbayes._validate import Floats
+from prbayes.metrics.readings import Readings
+from prbayes.numerics.points import sobol
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import (
+    fit_normal,
+    normal_log_density,
+    normalised_weights,
+)
+from prbayes.specimens.emulation import Emulation, half_difference
+from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
+
+
+@dataclass(frozen=True)
+class SpecimenOptions:
+    """Settings of runs and points, from the study of guards (docs/likelihood.md)."""
+
+    starts: int = 12  # of the search for modes, by specimen
+    gap: float = 20.0  # largest misfit of a mode above the specimen's best, in nats
+    points: int = 8  # fewest points of a mode in each half; doubled until the halves agree
+    most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
+    most_in_all: int = 2**17
+    # Largest standard deviation, over plausible populations, of half the difference between the
+    # log-likelihoods of the two halves.
+    half_difference: float = 0.05
+    # Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
+    # More runs are added where the emulator's error could cause as much.
+    bias: float = 0.1
+    floor: float = 1e-6  # smallest error of the emulator, as a share of the data's spread
+    sampled: int = 8  # runs of a batch that measure the error, at least
+    n_first: int | None = None  # number of first runs; by default that of `first_runs`
+    max_runs: int | None = None  # by default that of `most_runs`
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenPoints:
+    """Points of N specimens."""
+
+    z: Floats  # (N, K, d)
+    outputs: Floats  # (N, K, m): the emulator's outputs at the points
+    # (N, K): the log-likelihood of a specimen under a density p of z is ``logsumexp(log p(z) +
+    # log_a, axis=1)``; -inf for points that fill up the array
+    log_a: Floats
+    # (N, K): log of the number of points times the proposal density: ``log_a`` without the density
+    # of the readings, for an error that is not known in advance
+    log_proposal: Floats
+    n_roots: NDArray[np.intp]  # (N,): number of modes of the readings' density
+    mode: NDArray[np.intp]  # (N, K): mode whose proposal drew the point
+    difference: float = np.nan  # the half difference of the log-likelihoods
+
+    def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
+        """Return the points of selected specimens."""
+        arrays = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **arrays)  # type: ignore[arg-type]
+
+
+def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
+    """Return two independent sets of points as one; each counts half."""
+    return SpecimenPoints(
+        np.concatenate([first.z, second.z], axis=1),
+        np.concatenate([first.outputs, second.outputs], axis=1),
+        np.concatenate([first.log_a, second.log_a], axis=1) - np.log(2),
+        np.concatenate([first.log_proposal, second.log_proposal], axis=1) + np.log(2),
+        first.n_roots,
+        np.concatenate([first.mode, second.mode], axis=1),
+    )
+
+
+class Draws(Protocol):
+    """Draws of the hyperparameters."""
+
+    @property
+    def thetas(self) -> Floats:
+        """The draws, (S, p)."""
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta), (S, N)."""
+
+    def specimens(self) -> Floats:
+        """Return coordinates of specimens, (n, d)."""
+
+
+type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
+
+
+def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
+    """Return the normal population with the moments of a sample, (n, d); inflation of the sd."""
+    mean = sample.mean(axis=0)
+    covariance = np.atleast_2d(np.cov(sample.T)) * inflation**2
+    sd = np.sqrt(np.diagonal(covariance))
+    sd = np.where(sd > 0, sd, 1.0)
+    correlation = covariance / np.outer(sd, sd) + 1e-10 * np.eye(len(sd))
+    return Normal(mean, sd[:, None] * np.linalg.cholesky(correlation))
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenData:
+    """Measured specimens, and what is known of them before the response is."""
+
+    readings: Readings
+    known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
+    prior: Floats  # (n, d): specimens of the prior predictive population
+    posterior: Posterior  # points, their numbers and a smoothing to draws
+    bounds: Floats | None = None  # (2, d): ends of data sets of the prior
+    scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
+    gross_errors: bool = False  # whether readings of single specimens may be anything
+    options: SpecimenOptions = SpecimenOptions()
+    name: str = "response"
+    seed: int = 0
+
+    @property
+    def free(self) -> NDArray[np.intp]:
+        """Columns of the coordinates that are not known."""
+        return np.flatnonzero(np.isnan(self.known[0]))
+
+    @property
+    def box(self) -> Floats | None:
+        """Range of inputs, (2, d): that of the prior's data sets, and a quarter beyond it."""
+        if self.bounds is None:
+            return None
+        margin = 0.25 * (self.bounds[1] - self.bounds[0])
+        return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
+
+    @cached_property
+    def inner(self) -> Floats:
+        """Specimens of the prior predictive population without its tails, (n, d).
+
+        95 % of the specimens, nearest to the median in units of the distance of two quantiles.
+        """
+        z = self.prior[:, self.free]
+        low, middle, high = np.quantile(z, [0.16, 0.5, 0.84], axis=0)
+        width = np.where(high > low, high - low, 1.0)
+        order = np.argsort(np.abs((z - middle) / width).max(axis=1), kind="stable")
+        return self.prior[order[: int(0.95 * len(order))]]
+
+    def residuals(self, emulation: Emulation, population: Normal) -> Residuals:
+        """Return the residuals of an emulator's outputs."""
+        readings, is_read = self.readings, self.readings.is_measured
+        relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
+        error = np.where(readings.is_relative, 0.0, readings.error)
+        error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
+        target = np.where(is_read, readings.values, 0.0)
+        return Residuals(
+            emulation, target, emulation.error, error, relative, population, self.known, self.box
+        )
+
+
+def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:
+    """Return proposals at the modes of all specimens.
+
+    The search for modes starts at specimens of the prior, and of the population, whose outputs are
+    nearer to the specimen's readings than those of their neighbours.
+    """
+    residuals = data.residuals(emulation, population)
+    # Candidates are not chosen by an output that a reading error dominates.
+    error = np.median(data.readings.error_sd(residuals.target), axis=0)
+    unit = np.hypot(data.readings.spread(), 10 * error)
+    unit = np.where(data.readings.is_measured, unit, np.inf)
+    starts = _starts(data, emulation, residuals, unit)
+    parts = []
+    for scale in sorted(data.scales, reverse=True):
+        modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
+        proposals = Proposals.at_modes(residuals, modes).without_covered()
+        parts.append(proposals.covering(starts, scale).modes)
+        starts = _as_starts(parts[-1], starts)
+    return Proposals.at_modes(residuals, Modes.joined(parts))
+
+
+def _starts(
+    data: SpecimenData, emulation: Emulation, residuals: Residuals, unit: Floats, most: int = 512
+) -> Floats:
+    """Return whitened starts of the search for modes, (N, S, free)."""
+    from scipy.spatial import cKDTree
+
+    free, n = data.free, len(data.known)
+    rng = np.random.default_rng([data.seed, 2])
+    of_prior = data.inner[rng.permutation(len(data.inner))[: most // 2]]
+    a = 2.0 * ndtri(sobol(most // 2, len(free), data.seed))
+    a = np.concatenate([residuals.whitened(of_prior), a])
+    # In the units of the prior's spread: a narrow population would leave regions far apart.
+    _, near = cKDTree(a).query(a, min(len(a), 4 + 2 * len(free)))
+    distance = np.zeros((n, len(a)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        if len(free) == data.known.shape[1]:
+            values = emulation.values(residuals.coordinates(np.zeros(len(a), dtype=int), a))
+            for target, simulated, scale in zip(residuals.target.T, values.T, unit.T, strict=True):
+                distance += ((target[:, None] - simulated) / scale[:, None]) ** 2
+        else:
+            for i in range(n):
+                values = emulation.values(residuals.coordinates(np.full(len(a), i), a))
+                distance[i] = (((residuals.target[i] - values) / unit[i]) ** 2).sum(axis=1)
+    distance = np.where(np.isnan(distance), np.inf, distance)
+    is_minimum = np.ones(distance.shape, dtype=bool)
+    for column in near[:, 1:].T:
+        is_minimum &= distance <= distance[:, column]
+    order = np.lexsort((distance, ~is_minimum), axis=1)[:, : data.options.starts]
+    return np.asarray(a[order])
+
+
+def _as_starts(modes: Modes, starts: Floats) -> Floats:
+    """Return the modes of each specimen as starts, (N, S, free); earlier starts without a mode."""
+    result = starts[:, :1].repeat(modes.table.shape[1], axis=1)
+    filled = modes.table
+    rows = np.flatnonzero((filled >= 0).any(axis=1))
+    first = modes.a[np.where(filled[rows] >= 0, filled[rows], filled[rows, :1])]
+    result[rows] = first
+    return result
+
+
+def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
+    """Return points of all specimens, ``count`` of each."""
+    emulation = proposals.residuals.response
+    z, log_proposal, mode = proposals.draw(count, seed)
+    n, k, d = z.shape
+    outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
+    log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
+    log_a = np.where(np.isnan(log_a), -np.inf, log_a)
+    n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
+    return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
+
+
+def specimen_points(
+    data: SpecimenData, emulation: Emulation, population: Normal
+) -> tuple[SpecimenPoints, Proposals, Draws]:
+    """Return points whose halves agree, their proposals, and posterior draws at which they agree.
+
+    ``population`` is the first reference. Where the readings leave inputs open, the reference has
+    the moments of specimens of posterior draws, refitted twice. Raise DesignError if `most_points`
+    are not enough.
+    """
+    options = data.options
+    proposals = fit_proposals(data, emulation, population)
+    count = options.points * proposals.modes.table.shape[1]
+    points = draw_points(data, proposals, 2 * count, data.seed)
+    scale = likely_scale(data, points, emulation.error)
+    if not proposals.is_open(scale):
+        points = at_scale(data, points, emulation.error, scale)
+        draws = data.posterior(points.z, points.log_a, None)
+        return *agreeing_points(data, proposals, count, draws, scale), draws
+    count = max(2 * count, 32 * options.points)
+    for refit in range(3):
+        draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit, scale)
+        count = points.log_a.shape[1]
+        previous, population = population, normal_of(draws.specimens()[:, data.free])
+        inflated = Normal(population.mean, 1.15 * population.root)
+        proposals = fit_proposals(data, emulation, inflated)
+        change = np.linalg.solve(previous.root, population.root)
+        if np.abs(change - np.eye(len(change))).max() < 0.2:
+            break
+    points = draw_points(data, proposals, count, data.seed)
+    points = at_scale(data, points, emulation.error, scale)
+    # A branch that only a wide population reaches has its points, too.
+    wide = Normal(population.mean, 2.5 * population.root)
+    weights = likely_weights(data, points, population) + likely_weights(data, points, wide)
+    mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
+    if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
+        proposals = proposals.with_shares(mass)
+    return *agreeing_points(data, proposals, count // 2, draws, scale), draws
+
+
+def at_scale(
+    data: SpecimenData, points: SpecimenPoints, error: Floats, scale: float
+) -> SpecimenPoints:
+    """Return points with weights for readings whose errors are larger by a factor."""
+    if scale == 1.0:
+        return points
+    log_a = data.readings.scaled(scale).log_density(points.outputs, error) - points.log_proposal
+    return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
+
+
+def likely_scale(data: SpecimenData, points: SpecimenPoints, error: Floats) -> float:
+    """Return the factor of the readings' errors that a fitted normal population makes likeliest."""
+    totals = []
+    for scale in data.scales if len(data.scales) > 1 else ():
+        log_a = at_scale(data, points, error, scale).log_a
+        rows = np.isfinite(log_a).any(axis=1)
+        z = points.z[rows][..., data.free]
+        logs = log_a[rows] + normal_log_density(z, *fit_normal(z, log_a[rows]))
+        totals.append(log_sum_exp(logs).sum() if rows.all() else -np.inf)
+    return data.scales[int(np.argmax(totals))] if totals else 1.0
+
+
+def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Normal) -> Floats:
+    """Return weights of the points of each specimen under a population, (N, K)."""
+    z = points.z[..., data.free]
+    logs = points.log_a + normal_log_density(z, population.mean, population.root)
+    logs[~np.isfinite(logs).any(axis=1)] = 0.0
+    return normalised_weights(logs)
+
+
+def agreeing_points(
+    data: SpecimenData, proposals: Proposals, count: int, draws: Draws, scale: float = 1.0
+) -> tuple[SpecimenPoints, Proposals]:
+    """Return points whose halves agree at draws, doubled from ``count`` in each half.
+
+    ``scale`` is the likely factor of an unknown error; the halves agree over all factors, too.
+    """
+    options = data.options
+    over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
+    # Along open inputs the error falls more slowly with the number of points.
+    largest = (
+        options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open(scale) else 1)
+    )
+    most = max(options.most_points, options.most_in_all // len(data.readings))
+    while True:
+        halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
+        difference = _half_difference(data, proposals, halves, draws, (scale,))
+        if difference <= largest and (
+            len(data.scales) == 1
+            or count >= 512
+            or _half_difference(data, proposals, halves, draws, data.scales) <= over_scales
+        ):
+            return replace(joined(*halves), difference=difference), proposals
+        if 4 * count > most:
+            raise _monte_carlo_error(data.name, 2 * count, difference, largest)
+        count *= 2
+
+
+def _half_difference(
+    data: SpecimenData,
+    proposals: Proposals,
+    halves: Sequence[SpecimenPoints],
+    draws: Draws,
+    scales: Sequence[float],
+) -> float:
+    """Return the Monte Carlo error over draws, and over scales of an unknown error."""
+    error, logs = proposals.residuals.emulator_error, []
+    for half in halves:
+        by_scale = [at_scale(data, half, error, scale) for scale in scales]
+        logs.append(np.concatenate([draws.log_likelihoods(p.z, p.log_a) for p in by_scale]))
+    a, b = logs
+    if data.gross_errors:
+        typical = typical_specimens(proposals.modes, len(data.readings))
+        a, b = a[:, typical], b[:, typical]
+    finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    return half_difference(a[finite], b[finite]) if finite.any() else np.inf
+
+
+def typical_specimens(
+    modes: Modes, n: int, far: float = 5.0, largest: float = 50.0
+) -> NDArray[np.bool_]:
+    """Return which specimens have no gross error, (n,), by the best mode of each.
+
+    An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
+    """
+    order = np.lexsort((modes.misfit, modes.specimen))
+    specimens, first = np.unique(modes.specimen[order], return_index=True)
+    a, misfit = modes.a[order[first]], modes.misfit[order[first]]
+    away = np.abs(a - np.median(a, axis=0))
+    sd = 1.4826 * np.median(away, axis=0)
+    is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)
+    typical = np.ones(n, dtype=bool)
+    if 2 * is_outlier.sum() < len(specimens):
+        typical[specimens[is_outlier]] = False
+    return typical
+
+
+def reliable_draws(
+    data: SpecimenData,
+    proposals: Proposals,
+    count: int,
+    seed: int,
+    scale: float = 1.0,
+) -> tuple[Draws, SpecimenPoints, Proposals]:
+    """Return draws at which both halves of at least ``count`` points agree, and these points.
+
+    Where points lie farther apart than populations are wide, the likely populations are those
+    where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
+    narrow the reference population, until it narrows no more; then points are doubled.
+    """
+    narrows = False
+    while True:
+        halves = [draw_points(data, proposals, count // 2, seed + h) for h in (0, 1000)]
+        points = at_scale(data, joined(*halves), proposals.residuals.emulator_error, scale)
+        if not narrows:
+            draws = data.posterior(points.z, points.log_a, None)
+            difference = _half_difference(data, proposals, halves, draws, (scale,))
+            limit = per_hyperparameter(draws)
+            if difference <= limit:
+                return draws, points, proposals
+            if 2 * count > data.options.most_points:
+                raise _monte_carlo_error(data.name, count, difference, limit)
+        previous = proposals.residuals.population
+        covariance = previous.root @ previous.root.T
+        smoothing = count ** (-2 / (len(covariance) + 4)) * covariance
+        specimens = data.posterior(points.z, points.log_a, smoothing).specimens()
+        narrow = normal_of(specimens[:, data.free])
+        root = np.linalg.cholesky(narrow.root @ narrow.root.T + smoothing)
+        narrows = bool(np.diag(root).prod() < np.diag(previous.root).prod() / 2)
+        emulation = proposals.residuals.response
+        proposals = fit_proposals(data, emulation, Normal(narrow.mean, root))
+        count = count if narrows else 2 * count
+
+
+def per_hyperparameter(draws: Draws) -> float:
+    """Return the error of a log-likelihood that shifts hyperparameters as 1 shifts each of four.
+
+    A random function of p hyperparameters with a standard deviation of s nats shifts means by about
+    s / sqrt(p) posterior standard deviations.
+    """
+    return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
+
+
+def _monte_carlo_error(name: str, count: int, difference: float, largest: float) -> DesignError:
+    return DesignError(
+        f"{name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
+        f"{difference:.2g} nats, expected at most {largest:.2g}; measure more outputs of each "
+        "specimen, narrow the priors, or use metric=prb.ProbabilityResidual()"
+    )

@@ -1,0 +1,566 @@
+r"""Importance points of measured specimens by randomize-then-optimize.
+
+The density of the readings of a specimen is an integral over its inputs,
+
+.. math:: p(y \mid \theta) = \int p(x \mid \theta) \, p(y \mid f(x)) \, dx
+          \approx \sum_k p(x_k \mid \theta) \exp(A_k), \qquad (1)
+
+with points and numbers A that do not contain theta. Inputs x = mean + L a are whitened by a normal
+reference population, and e(a) = (y - f(x)) / s are standardised errors of readings. The residual
+r(a) = (a, e(a)) has the Jacobian (I, -G). At a mode of exp(-|r|^2 / 2), G = U S V', and
+
+.. math:: \xi(a) = D (V' a - S U' e(a)), \qquad D = (1 + S^2)^{-1/2}, \qquad (2)
+
+is standard normal given the readings if f is linear [1]_. Points solve xi(a) = xi_k for standard
+normal xi_k; their density is
+
+.. math:: q(a) = N(\xi(a); 0, I) \, |\det D (V' + S U' G(a))|. \qquad (3)
+
+Directions that the readings determine are solved for, and the others have the reference population:
+accurate and inaccurate readings, more or fewer than inputs, are one case. A mode has a proposal; a
+point counts with the density of all proposals of its specimen that reach it [2]_.
+
+References
+----------
+.. [1] Bardsley, J. M., Solonen, A., Haario, H. and Laine, M. (2014), Randomize-then-optimize,
+   SIAM J. Sci. Comput. 36, doi:10.1137/140964023.
+.. [2] Veach, E. and Guibas, L. J. (1995), Optimally combining sampling techniques for Monte Carlo
+   rendering, doi:10.1145/218380.218498.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._stats import log_sum_exp
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.numerics.points import sobol
+from prbayes.numerics.threads import one_thread
+
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal population, in which inputs are whitened: z = mean + root a."""
+
+    mean: Floats  # (d,)
+    root: Floats  # (d, d): lower Cholesky factor of the covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of specimens: whitened inputs, and standardised errors of the readings."""
+
+    # Coordinates (k, d) -> values (k, m) and Jacobian (k, m, d), NaN without a response.
+    response: Any
+    target: Floats  # (N, m): readings, any number where there is none
+    emulator_error: Floats  # (m,): standard deviation of the emulator's error
+    error: Floats  # (N, m): standard deviation of the reading; infinite where there is none
+    relative: Floats  # (N, m): further error of the reading as a share of the output
+    population: Normal  # of the reference, in coordinates z
+    known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
+    # (2, d): range in which inputs are possible; an emulator is arbitrary far beyond its runs.
+    box: Floats | None = None
+
+    @property
+    def free(self) -> Indices:
+        """Columns of the coordinates that are not known."""
+        return np.flatnonzero(np.isnan(self.known[0]))
+
+    def coordinates(self, specimen: Indices, a: Floats) -> Floats:
+        """Return coordinates z, (k, d), of whitened inputs, (k, free)."""
+        z = self.known[specimen]
+        z[:, self.free] = self.population.mean + a @ self.population.root.T
+        return z
+
+    def whitened(self, z: Floats) -> Floats:
+        """Return whitened inputs, (..., free), of coordinates (..., d)."""
+        centred = z[..., self.free] - self.population.mean
+        return np.asarray(centred @ np.linalg.inv(self.population.root).T)
+
+    @np.errstate(all="ignore")
+    def errors(
+        self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
+    ) -> tuple[Floats, Floats]:
+        """Return standardised errors e, (k, m), and G = -de/da, (k, m, free).
+
+        ``scale`` is a factor of the readings' errors, a number or (k,). NaN without a response.
+        """
+        count, m = len(a), self.target.shape[1]
+        factors = np.broadcast_to(np.square(scale), (count,))[:, None]
+        e, slopes = np.empty((count, m)), np.empty((count, m, a.shape[1]))
+        for block in _blocks(count, m * self.known.shape[1]):
+            i = specimen[block]
+            z = self.coordinates(i, a[block])
+            values, jacobian = self.response(z)
+            if self.box is not None:
+                values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
+            is_read, factor = np.isfinite(self.error[i]), factors[block]
+            relative = factor * self.relative[i] ** 2
+            variance = self.emulator_error**2 + factor * self.error[i] ** 2
+            variance = variance + relative * values**2
+            residual, sd = self.target[i] - values, np.sqrt(variance)
+            # The error of a relative reading changes with the output.
+            by_output = (1 + residual * relative * values / variance) / sd
+            slope = jacobian[:, :, self.free] @ self.population.root
+            e[block] = np.where(is_read, residual / sd, 0.0)
+            slopes[block] = np.where(is_read[:, :, None], by_output[:, :, None] * slope, 0.0)
+        return e, slopes
+
+
+def _blocks(count: int, width: int) -> Iterator[slice]:
+    """Return slices of so many rows that their arrays stay in the cache."""
+    size = max(256, IN_CACHE // max(1, width))
+    for start in range(0, count, size):
+        yield slice(start, start + size)
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of the readings' density times a wide normal population, one row each."""
+
+    specimen: Indices  # (R,): row of the specimen; sorted
+    a: Floats  # (R, free): whitened inputs
+    misfit: Floats  # (R,): half the squared standardised errors, in nats
+    errors: Floats  # (R, m)
+    slopes: Floats  # (R, m, free): G
+    scale: Floats  # (R,): factor of the readings' errors
+
+    @classmethod
+    def joined(cls, parts: Sequence[Modes]) -> Modes:
+        """Return modes as one record, sorted by specimen."""
+        arrays = [np.concatenate(values) for values in zip(*(p.arrays for p in parts), strict=True)]
+        return cls(*arrays).rows(np.argsort(arrays[0], kind="stable"))
+
+    def rows(self, index: Indices) -> Modes:
+        """Return selected modes."""
+        return Modes(*(values[index] for values in self.arrays))
+
+    @property
+    def arrays(self) -> list[NDArray[Any]]:
+        """The arrays of all fields."""
+        return [getattr(self, f.name) for f in fields(self)]
+
+    @cached_property
+    def table(self) -> Indices:
+        """The modes of each specimen, (N, most), filled up with -1."""
+        return rows_by_specimen(self.specimen)
+
+
+def find_modes(
+    residuals: Residuals,
+    starts: Floats,
+    *,
+    scale: float = 1.0,
+    precision: float = 0.1,
+    gap: float = 20.0,
+) -> Modes:
+    """Find the modes of each specimen by Levenberg-Marquardt [1]_ from starts, (N, S, free).
+
+    The population is wide: it has this precision, relative to the reference. A mode within ``gap``
+    nats of the specimen's best is kept. ``scale`` is a factor of the readings' errors.
+
+    References
+    ----------
+    .. [1] Moré, J. J. (1978), The Levenberg-Marquardt algorithm, doi:10.1007/BFb0067700.
+    """
+    n, count, d = starts.shape
+    specimen = np.repeat(np.arange(n), count)
+    # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
+    # the valley's lowest point with a larger error, then the readings themselves.
+    change = 0.03 * _typical_change(residuals, starts)
+    soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
+    a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
+    a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
+    rows = _distinct(specimen, a, value, slopes, precision, gap)
+    rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
+    misfit = (e[rows] ** 2).sum(axis=1) / 2
+    scales = np.full(len(rows), scale)
+    return Modes(specimen[rows], a[rows], misfit, e[rows], slopes[rows], scales)
+
+
+def _typical_change(residuals: Residuals, starts: Floats) -> Floats:
+    """Return the standard deviation of each output in the reference population, (m,)."""
+    a = ndtri(sobol(64, starts.shape[2], 0))
+    values, _ = residuals.response(residuals.coordinates(np.resize(np.arange(len(starts)), 64), a))
+    values = values[np.isfinite(values).all(axis=1)]
+    low, high = np.quantile(values, [0.16, 0.84], axis=0) if len(values) > 1 else (0.0, 0.0)
+    return np.asarray(high - low) / 2 * np.ones(residuals.target.shape[1])
+
+
+def _minimised(
+    residuals: Residuals,
+    specimen: Indices,
+    a: Floats,
+    precision: float,
+    iterations: int,
+    scale: float,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return local minima of half the squared residuals, their values, errors and slopes."""
+    a, d = a.copy(), a.shape[1]
+    e, slopes = residuals.errors(specimen, a, scale)
+
+    def objective(a: Floats, e: Floats) -> Floats:
+        value = (e**2).sum(axis=1) / 2 + precision * (a**2).sum(axis=1) / 2
+        return np.where(np.isnan(value), np.inf, value)
+
+    value = objective(a, e)
+    damping = np.full(len(a), 1e-3)
+    active = np.flatnonzero(np.isfinite(value))
+    for _ in range(iterations):
+        if not active.size:
+            break
+        g = slopes[active]
+        hessian = np.einsum("kmd,kme->kde", g, g) + precision * np.eye(d)
+        gradient = precision * a[active] - np.einsum("kmd,km->kd", g, e[active])
+        diagonal = np.einsum("kdd->kd", hessian)
+        damped = hessian + (damping[active, None] * diagonal)[:, :, None] * np.eye(d)
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        length = np.sqrt((step**2).sum(axis=1))
+        # Far from the population, where an outlier may lie, steps are longer.
+        longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+        step /= np.maximum(length / longest, 1.0)[:, None]
+        trial = a[active] + step
+        new_e, new_slopes = residuals.errors(specimen[active], trial, scale)
+        new_value = objective(trial, new_e)
+        better = new_value < value[active]
+        gain = np.where(better, value[active] - new_value, np.inf)
+        rows = active[better]
+        a[rows], e[rows], slopes[rows] = trial[better], new_e[better], new_slopes[better]
+        value[rows] = new_value[better]
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
+        # A gain of 1e-6 nats is none; a rejected step that is this short is rounding.
+        unfinished = (gain > 1e-6) & (length > 1e-11) & (damping[active] < 1e11)
+        active = active[unfinished]
+    return a, value, e, slopes
+
+
+def _distinct(
+    specimen: Indices, a: Floats, value: Floats, slopes: Floats, precision: float, gap: float
+) -> Indices:
+    """Return the rows of different modes within the gap of the specimen's best."""
+    least = np.full(specimen.max() + 1, np.inf)
+    np.minimum.at(least, specimen, value)
+    candidates = np.flatnonzero(np.isfinite(value) & (value <= least[specimen] + gap))
+    candidates = candidates[np.lexsort((value[candidates], specimen[candidates]))]
+    if not len(candidates):
+        return candidates
+    slots = rows_by_specimen(specimen[candidates])
+    table = np.where(slots >= 0, candidates[slots], -1)
+    is_mode = table >= 0
+    for k in range(1, table.shape[1]):
+        # Each specimen's k-th candidate, beside the better ones.
+        better = table[:, :k]
+        difference = a[table[:, k], None] - a[better]
+        along = np.einsum("nkmd,nkd->nkm", slopes[better], difference)
+        square = (along**2).sum(axis=2) + precision * (difference**2).sum(axis=2)
+        is_near = np.abs(difference).max(axis=2) < 1e-5
+        is_same = is_near | (square < 1e-4)
+        is_mode[:, k] &= ~(is_same & is_mode[:, :k]).any(axis=1)
+    return np.asarray(table[is_mode])
+
+
+def rows_by_specimen(specimen: Indices) -> Indices:
+    """Return the rows of each specimen, (N, most), filled up with -1; specimens are ascending."""
+    count = np.bincount(specimen)
+    slot = np.arange(len(specimen)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(count), count.max()), -1)
+    table[specimen, slot] = np.arange(len(specimen))
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
+
+    residuals: Residuals
+    modes: Modes
+    inputs: Floats  # (R, free, free): D V'
+    readings: Floats  # (R, free, m): D S U'
+    orientation: Floats  # (R,): sign of the map's determinant at the mode
+    log_det: Floats  # (R,): log of its size
+    share: Floats  # (R,): mixing weight among the modes of the specimen
+
+    @classmethod
+    @one_thread()
+    def at_modes(cls, residuals: Residuals, modes: Modes) -> Proposals:
+        """Return the proposals at modes."""
+        count, m, d = modes.slopes.shape
+        u, s, vt = np.linalg.svd(modes.slopes, full_matrices=True)
+        scale = np.zeros((count, d))
+        rank = min(m, d)
+        scale[:, :rank] = s
+        inverse = 1 / np.sqrt(1 + scale**2)
+        readings = np.zeros((count, d, m))
+        of_left = u[:, :, :rank].swapaxes(1, 2)
+        readings[:, :rank] = (scale * inverse)[:, :rank, None] * of_left
+        orientation = np.sign(np.linalg.det(vt))
+        share = 1 / np.bincount(modes.specimen)[modes.specimen]
+        log_det = -np.log(inverse).sum(axis=1)
+        maps = inverse[:, :, None] * vt, readings, orientation, log_det
+        return cls(residuals, modes, *maps, share)
+
+    def rows(self, index: Indices) -> Proposals:
+        """Return the proposals of selected modes, with equal mixing weights."""
+        modes = self.modes.rows(index)
+        share = 1 / np.bincount(modes.specimen)[modes.specimen]
+        return Proposals(
+            self.residuals,
+            modes,
+            self.inputs[index],
+            self.readings[index],
+            self.orientation[index],
+            self.log_det[index],
+            share,
+        )
+
+    def without_covered(self) -> Proposals:
+        """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
+        modes = self.modes
+        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
+        ordered = self.rows(order)
+        table = ordered.modes.table
+        kept = np.ones(len(order), dtype=bool)
+        for k in range(1, table.shape[1]):
+            for better in range(k):
+                pairs = table[:, k] >= 0
+                at, rows = table[pairs, better], table[pairs, k]
+                pairs = (
+                    kept[at] & kept[rows] & (ordered.modes.scale[at] == ordered.modes.scale[rows])
+                )
+                at, rows = at[pairs], rows[pairs]
+                if not rows.size:
+                    continue
+                value, jacobian = ordered.mapped(at, ordered.modes.a[rows])
+                sign, log_det = np.linalg.slogdet(jacobian)
+                is_in_bulk = (value**2).sum(axis=1) < 1.0
+                is_in_bulk &= (sign == ordered.orientation[at]) & (
+                    log_det > ordered.log_det[at] - 1.0
+                )
+                at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
+                end, _, _, converged = ordered.solved(at, value)
+                is_reached = np.abs(end - ordered.modes.a[rows]).max(axis=1, initial=0) < 1e-2
+                kept[rows[converged & is_reached]] = False
+        return ordered.rows(np.flatnonzero(kept))
+
+    def is_open(self, scale: float = 1.0) -> bool:
+        """Return whether readings leave inputs of a tenth of the specimens open.
+
+        Along an open direction their precision is less than four times the population's. With a
+        larger one the reference population has little influence. ``scale`` is the likely factor of
+        the readings' errors.
+        """
+        _, m, d = self.modes.slopes.shape
+        if m < d:
+            return True
+        rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
+        least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
+        return bool(np.quantile(least, 0.1) < 4.0)
+
+    def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
+        """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
+        modes = self.modes
+        e, slopes = self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
+        inputs, readings = self.inputs[mode], self.readings[mode]
+        xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
+        return xi, inputs + readings @ slopes
+
+    @np.errstate(all="ignore")
+    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+        """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
+
+        Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
+        converged. The determinant keeps its sign on the way: beyond a fold another proposal finds
+        the points.
+        """
+        a = self.modes.a[mode].copy()
+        value, jacobian = self.mapped(mode, a)
+        fraction = np.ones(len(a))
+        converged, last = np.zeros(len(a), dtype=bool), np.full(len(a), np.inf)
+        active = np.arange(len(a))
+        for _ in range(25):
+            step = _solutions(jacobian[active], xi[active] - value[active])
+            length = np.sqrt((step**2).sum(axis=1))
+            usable = np.isfinite(length) & (fraction[active] > 1e-2)
+            active, step, length = active[usable], step[usable], length[usable]
+            if not active.size:
+                break
+            longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+            step *= (fraction[active] / np.maximum(length / longest, 1.0))[:, None]
+            trial = a[active] + step
+            new_value, new_jacobian = self.mapped(mode[active], trial)
+            accepted = np.linalg.slogdet(new_jacobian)[0] == self.orientation[mode[active]]
+            to = active[accepted]
+            a[to], value[to] = trial[accepted], new_value[accepted]
+            jacobian[to] = new_jacobian[accepted]
+            fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
+            distance = np.abs(xi[active] - value[active]).max(axis=1)
+            # Rounding of the emulator may end the decrease. At a fold, where the determinant
+            # vanishes, a small distance may be one to values that no inputs have.
+            is_regular = np.linalg.slogdet(jacobian[active])[1] > self.log_det[mode[active]] - 1.0
+            is_last = (distance < 0.01) & (distance > last[active] / 2) & is_regular
+            converged[active] = (distance < 1e-6) | is_last
+            last[active] = distance
+            active = active[~converged[active]]
+        log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
+        return a, value, log_det, converged
+
+    def with_shares(self, mass: Floats) -> Proposals:
+        """Return the proposals with mixing weights by the mass of each mode, (R,).
+
+        A tenth of the points is for all modes alike: another population may be the likely one.
+        """
+        specimen = self.modes.specimen
+        total = np.bincount(specimen, mass)[specimen]
+        count = np.bincount(specimen)[specimen]
+        own = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
+        return replace(self, share=0.9 * own + 0.1 / count)
+
+    def _counts(self, count: int) -> Indices:
+        """Return the number of points of each mode, (R,), which have the sum ``count``."""
+        share, table = self.share, self.modes.table
+        least = np.where(table >= 0, np.floor(count * share[table]), -1)
+        rest = np.where(table >= 0, count * share[table] - least, -1.0)
+        missing = count - np.where(table >= 0, least, 0).sum(axis=1)
+        # The largest remainders get one point more.
+        rank = np.argsort(np.argsort(-rest, axis=1, kind="stable"), axis=1, kind="stable")
+        counts = least + (rank < missing[:, None])
+        return np.asarray(counts[table >= 0], dtype=np.intp)
+
+    @one_thread()
+    def draw(self, count: int, seed: int) -> tuple[Floats, Floats, Indices]:
+        """Draw ``count`` points of each specimen.
+
+        Return coordinates (N, K, d), logs of K times their density, (N, K), and the mode that drew
+        each, (N, K). The log is infinite where there is no point.
+        """
+        modes, residuals = self.modes, self.residuals
+        n, d = len(residuals.known), modes.a.shape[1]
+        counts = self._counts(count)
+        mode = np.repeat(np.arange(len(counts)), counts)
+        place = np.arange(len(mode)) - np.repeat(np.cumsum(counts) - counts, counts)
+        # The first coordinates of the sequence, the most even ones, are those of open directions.
+        u = sobol(int(counts.max()), d, seed)[:, ::-1]
+        shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
+        xi = ndtri(np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12))
+        a, value, log_det, converged = self.solved(mode, xi)
+        rows = np.flatnonzero(converged)
+        log_q = np.full(len(a), np.inf)
+        own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
+        drawn = mode[rows], own
+        weights = counts.astype(np.float64)
+        log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], weights, drawn)
+        log_q[rows] -= d / 2 * np.log(2 * np.pi)
+        log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
+        a[~converged] = 0.0
+        specimen = modes.specimen[mode]
+        z = np.zeros((n, count, residuals.known.shape[1]))
+        by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
+        slot = np.arange(len(mode)) - np.searchsorted(specimen, specimen)
+        z[specimen, slot] = residuals.coordinates(specimen, a)
+        by_specimen[specimen, slot], owner[specimen, slot] = log_q, mode
+        return z, by_specimen, owner
+
+    def log_mixture(
+        self,
+        specimen: Indices,
+        a: Floats,
+        weights: Floats,
+        drawn: tuple[Indices, Floats] | None = None,
+    ) -> Floats:
+        """Return logs of weighted sums of the densities of all modes that reach points, (k,).
+
+        ``weights`` are of the modes, (R,). ``drawn`` has the mode that drew each point and the log
+        of its density there, up to a constant, both (k,).
+        """
+        modes = self.modes
+        # A specimen with one mode at each scale of its errors has one sheet of points.
+        size = np.bincount(modes.specimen)[modes.specimen] / len(np.unique(modes.scale))
+        table = modes.table[specimen]
+        with np.errstate(divide="ignore"):
+            logs = np.log(weights)
+        largest = np.full(len(a), -np.inf)
+        terms = []
+        if drawn is not None:
+            terms = [drawn[1] + logs[drawn[0]]]
+            largest = terms[0]
+        for slot in range(table.shape[1]):
+            at = table[:, slot]
+            rows = np.flatnonzero((at >= 0) & (weights[at] > 0))
+            if drawn is not None:
+                rows = rows[at[rows] != drawn[0][rows]]
+            term = np.full(len(a), -np.inf)
+            if rows.size:
+                at = at[rows]
+                value, jacobian = self.mapped(at, a[rows])
+                sign, log_det = np.linalg.slogdet(jacobian)
+                density = log_det - (value**2).sum(axis=1) / 2 + logs[at]
+                matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
+                rows, at, density = rows[matters], at[matters], density[matters]
+                is_reached = (size[at] <= 1) & (drawn is not None)
+                check = np.flatnonzero(~is_reached)
+                end, _, _, converged = self.solved(at[check], value[matters][check])
+                distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
+                is_reached[check] = converged & (distance < 1e-3)
+                term[rows[is_reached]] = density[is_reached]
+            terms.append(term)
+        return log_sum_exp(np.stack(terms, axis=1))
+
+    def covering(self, starts: Floats, scale: float, most: int = 4) -> Proposals:
+        """Return proposals with further ones where the fibre of a specimen is not covered.
+
+        A proposal ends at folds. Points at which the readings are met, nearest to starts
+        (N, S, free), are not covered if their importance under a wide population is more than
+        three times that of the modes; the most important one gets a proposal.
+        """
+        residuals, result = self.residuals, self
+        n, count, d = starts.shape
+        specimen = np.repeat(np.arange(n), count)
+        a, _, e, slopes = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)
+        misfit = (e**2).sum(axis=1) / 2
+        least = np.full(n, np.inf)
+        np.minimum.at(least, self.modes.specimen, self.modes.misfit)
+        rows = np.flatnonzero(misfit <= least[specimen] + 10.0)
+        points = Modes(
+            specimen[rows], a[rows], misfit[rows], e[rows], slopes[rows], np.full(len(rows), scale)
+        )
+
+        def importance(modes: Modes) -> Floats:
+            log_q = result.log_mixture(modes.specimen, modes.a, result.share)
+            return np.asarray(-0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q)
+
+        for _ in range(most):
+            usual = np.full(n, -np.inf)
+            of_modes = importance(result.modes)
+            np.maximum.at(
+                usual, result.modes.specimen, np.where(np.isfinite(of_modes), of_modes, -np.inf)
+            )
+            excess = importance(points) - usual[points.specimen]
+            excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
+            order = np.lexsort((-excess, points.specimen))
+            first = order[np.unique(points.specimen[order], return_index=True)[1]]
+            added = first[excess[first] > np.log(3.0)]
+            if not added.size:
+                break
+            modes = Modes.joined([result.modes, points.rows(added)])
+            result = Proposals.at_modes(residuals, modes)
+        return result
+
+
+@np.errstate(all="ignore")
+def _solutions(matrices: Floats, right: Floats) -> Floats:
+    """Return the solutions (n, m) of n linear systems, NaN where a matrix is singular."""
+    if matrices.shape[-1] == 1:
+        return right / matrices[..., 0]
+    singular = ~(np.abs(np.linalg.det(matrices)) > 0)
+    safe = np.where(singular[:, None, None], np.eye(matrices.shape[-1]), matrices)
+    solution = np.linalg.solve(safe, right[..., None])[..., 0]
+    return np.where(singular[:, None], np.nan, solution)

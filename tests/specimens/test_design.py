@@ -1,0 +1,238 @@
+"""Runs of a response at the likely inputs of specimens: how many there are, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from prbayes._validate import Floats
+from prbayes.metrics.readings import Readings
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import fit_normal
+from prbayes.specimens.design import emulate, first_runs, most_runs
+from prbayes.specimens.emulation import Emulation
+from prbayes.specimens.points import SpecimenData, SpecimenOptions, SpecimenPoints
+
+
+@dataclass(frozen=True)
+class NormalDraws:
+    """Normal populations around the one that fits weighted points best."""
+
+    mean: Floats
+    sd: Floats
+    n: int
+
+    @property
+    def thetas(self) -> Floats:
+        rng = np.random.default_rng(3)
+        scatter = rng.standard_normal((32, 2, len(self.mean))) / np.sqrt(self.n)
+        means = self.mean + self.sd * scatter[:, 0]
+        return np.concatenate([means, self.sd * np.exp(scatter[:, 1] / np.sqrt(2))], axis=1)
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        means, sds = np.split(self.thetas[:, None, None], 2, axis=-1)
+        log_p = norm(means, sds).logpdf(z).sum(axis=-1)
+        return np.asarray(logsumexp(log_p + log_a, axis=2))
+
+    def specimens(self) -> Floats:
+        rng = np.random.default_rng(0)
+        means, sds = np.split(self.thetas, 2, axis=1)
+        z = means + sds * rng.standard_normal((64, *means.shape))
+        return z.reshape(-1, len(self.mean))
+
+    @staticmethod
+    def posterior(z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+        rows = np.isfinite(log_a).any(axis=1)
+        mean, root = fit_normal(z[rows], log_a[rows])
+        variance = np.diag(root @ root.T).copy()
+        if smoothing is not None:
+            variance += np.diag(smoothing)
+        return NormalDraws(mean, np.sqrt(variance), len(z))
+
+
+@dataclass
+class Recorded:
+    """A response that remembers its runs."""
+
+    function: Callable[[Floats], Floats]
+    batches: list[Floats] = field(default_factory=list)
+
+    def __call__(self, z: Floats) -> Floats:
+        self.batches.append(z)
+        return self.function(z)
+
+    @property
+    def z(self) -> Floats:
+        return np.concatenate(self.batches)
+
+
+def emulated(
+    function: Callable[[Floats], Floats], x: Floats, prior_sd: float = 0.4, **settings: Any
+) -> tuple[Recorded, Emulation, SpecimenPoints]:
+    """Return the runs for specimens with inputs x, (N, d), the emulation and the points."""
+    run, (n, d) = Recorded(function), x.shape
+    prior = prior_sd * np.random.default_rng(1).standard_normal((4096, d))
+    readings = settings.pop("readings", None) or Readings.exact(function(x))
+    posterior = settings.pop("posterior", NormalDraws.posterior)
+    data = SpecimenData(readings, np.full((n, d), np.nan), prior, posterior, **settings)
+    emulation, points, _, _ = emulate(run, data)
+    return run, emulation, points
+
+
+def population(mean: Any, sd: Any, n: int = 20) -> Floats:
+    mean, sd = np.atleast_1d(mean), np.atleast_1d(sd)
+    return np.asarray(mean + sd * np.random.default_rng(2).standard_normal((n, len(mean))))
+
+
+def line(z: Floats) -> Floats:
+    return z @ np.array([[1.0, 2.0], [0.5, -1.0]])[: z.shape[1]]
+
+
+def fold(z: Floats) -> Floats:
+    return z**2
+
+
+def frame(z: Floats) -> Floats:
+    """Two stiffnesses of a frame; a mirror frame has the same two outputs."""
+    k, g = np.exp(z[:, 0]), np.exp(z[:, 1])
+    return np.stack([k + 2 * g, k * g], axis=1)
+
+
+def underdetermined(z: Floats) -> Floats:
+    return np.exp(z[:, :1]) + 0.5 * z[:, 1:]
+
+
+CASES = [
+    (line, population(0.1, 0.15)),
+    (line, population([0.1, -0.1], [0.15, 0.1])),
+    (fold, population(0.4, 0.1)),
+    (frame, population([0.2, -0.1], [0.1, 0.15])),
+]
+
+
+@pytest.mark.parametrize(("function", "x"), CASES)
+def test_smooth_responses_need_few_runs(function: Callable[[Floats], Floats], x: Floats) -> None:
+    run, emulation, points = emulated(function, x)
+    d = x.shape[1]
+    assert len(run.batches[0]) == first_runs(d) == 6 * d + 4
+    assert len(run.z) <= 60
+    np.testing.assert_array_equal(emulation.z, run.z)
+    np.testing.assert_array_equal(emulation.y, function(run.z))
+    assert emulation.bias <= 0.15
+    # The points of each specimen have its outputs: within five errors of the comparison.
+    assert (np.isfinite(points.log_a).mean(axis=1) > 0.5).all()
+    is_point = np.isfinite(points.log_a)
+    away = np.abs(points.outputs - function(x)[:, None]) / emulation.error
+    assert np.quantile(away[is_point], 0.9) < 5
+    # Twice the emulator's error at the specimens' inputs is stated; it is small at mirror inputs.
+    misfit = np.abs(function(points.z[is_point]) - points.outputs[is_point])
+    assert (misfit.max(axis=0) < 0.01 * function(x).std(axis=0)).all()
+    at_inputs = function(x) - emulation.values(x)
+    assert (np.sqrt((at_inputs**2).mean(axis=0)) < 2 * emulation.error).all()
+
+
+def test_fewer_readings_than_inputs_need_few_runs() -> None:
+    x = population([0.1, 0.1], [0.1, 0.1])
+    draws = NormalDraws(x.mean(axis=0), x.std(axis=0), len(x))
+    run, emulation, points = emulated(underdetermined, x, posterior=lambda *_: draws)
+    assert len(run.z) <= 60
+    assert emulation.bias <= 0.15
+    # Points are along the inputs that have the reading.
+    away = np.abs(underdetermined(points.z.reshape(-1, 2)) - points.outputs.reshape(-1, 1))
+    assert np.median(away) < 0.01
+    assert (points.z.std(axis=1).min(axis=0) > [0.03, 0.07]).all()
+
+
+@pytest.mark.parametrize(("mean", "sd"), [(0.3, 0.02), (1.2, 0.1)])
+def test_runs_lie_where_the_specimens_are(mean: float, sd: float) -> None:
+    """Also if these are three standard deviations of the prior from its middle."""
+    x = population(mean, sd)
+    run, *_ = emulated(lambda z: np.exp(2 * z), x)
+    later = np.concatenate(run.batches[1:])
+    assert (np.abs(later - x.mean()) < 4 * x.std()).mean() > 0.5
+
+
+def test_both_branches_of_a_fold_have_runs() -> None:
+    x = population(0.5, 0.05)
+    run, _, points = emulated(fold, x)
+    later = np.concatenate(run.batches[1:])
+    for sign in (-1, 1):
+        assert (np.abs(later - sign * 0.5) < 0.15).sum() >= 5
+    assert (points.n_roots == 2).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_response_that_fails_in_a_region_keeps_its_runs(bad: float) -> None:
+    def failing(z: Floats) -> Floats:
+        return np.where(z > 0.5, bad, np.exp(z))
+
+    x = population(0.1, 0.15)
+    x = x[x < 0.45][:, None]
+    run, emulation, _ = emulated(failing, x)
+    assert len(run.z) <= 60
+    np.testing.assert_array_equal(emulation.z, run.z)
+    assert (~np.isfinite(emulation.y)).any()
+    np.testing.assert_array_equal(emulation.y, failing(run.z))
+    assert emulation.error[0] < 1e-3 * np.exp(x).std()
+
+
+def test_more_first_runs_are_made_while_most_of_them_fail() -> None:
+    def rare(z: Floats) -> Floats:
+        return np.where(np.abs(z - 0.1) > 0.15, np.nan, z)
+
+    x = population(0.1, 0.03)
+    run, emulation, _ = emulated(rare, x)
+    assert np.isfinite(emulation.y).sum() >= 8
+    assert len(emulation.z) == len(run.z)
+    with pytest.raises(DesignError, match=r"got 0 runs with a response of 80, expected at least 8"):
+        emulated(lambda z: np.full_like(z, np.nan), x, readings=Readings.exact(x))
+
+
+def test_a_response_that_no_emulator_follows_is_refused_at_the_limit() -> None:
+    rough = Recorded(lambda z: z + 0.5 * np.sin(1e4 * z))
+    x = population(0.1, 0.2)
+    options = SpecimenOptions(max_runs=64)
+    with pytest.raises(DesignError) as caught:
+        emulated(rough, x, options=options)
+    message = str(caught.value)
+    assert "response: got an emulator whose error would shift" in message
+    assert "metric=prb.ProbabilityResidual()" in message
+    assert len(message) < 5 * 90
+    # A batch is half of the runs so far, and the limit is checked before each.
+    assert 64 <= len(rough.z) - len(x) <= 64 * 3 // 2 + 8
+
+
+def test_first_runs_of_the_user() -> None:
+    run, *_ = emulated(np.exp, population(0.1, 0.15), options=SpecimenOptions(n_first=32))
+    assert len(run.batches[0]) == 32
+
+
+def test_limits_grow_with_the_inputs() -> None:
+    assert [first_runs(d) for d in (1, 2, 8)] == [10, 16, 52]
+    assert [most_runs(d) for d in (1, 2, 4, 8)] == [256, 256, 512, 1920]
+
+
+def test_runs_are_those_of_the_seed() -> None:
+    x = population([0.2, -0.1], [0.1, 0.15])
+    first, second, third = (emulated(frame, x, seed=seed)[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.z, second.z)
+    assert not np.array_equal(first.batches[0], third.batches[0])
+
+
+def test_an_earlier_emulation_of_the_response_is_extended() -> None:
+    """As for a bootstrap sample: its specimens have most of the runs already."""
+    x = population(0.1, 0.15)
+    run, emulation, _ = emulated(np.exp, x)
+    prior = 0.4 * np.random.default_rng(1).standard_normal((4096, 1))
+    known = np.full((20, 1), np.nan)
+    data = SpecimenData(Readings.exact(np.exp(x[::-1])), known, prior, NormalDraws.posterior)
+    again = Recorded(np.exp)
+    extended, *_ = emulate(again, data, emulation)
+    np.testing.assert_array_equal(extended.z[: len(run.z)], run.z)
+    assert len(extended.z) == len(run.z) + len(again.z)
