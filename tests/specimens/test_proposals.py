@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp, ndtri
 from scipy.stats import multivariate_normal, ncx2, norm, rice
+from scipy.stats import t as student
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
@@ -18,7 +19,6 @@ from prbayes.specimens.proposals import (
     Normal,
     Proposals,
     Residuals,
-
     find_modes,
 )
 
@@ -142,11 +142,17 @@ LINEAR = pytest.mark.parametrize(("d", "m"), [(1, 1), (2, 1), (3, 2), (2, 3)])
 def test_one_point_is_exact_of_a_linear_response_and_the_reference(
     d: int, m: int, size: float
 ) -> None:
-    """The proposal is then the density of the inputs given the readings."""
+    """The proposal is then the density of the inputs given the readings; Student's t widens it."""
     p = linear_problem(d, m, size)
     _, (a, *_) = p.response(np.zeros((1, d)))
     exact = multivariate_normal(cov=a @ a.T + np.diag(np.square(p.sd))).logpdf(p.y)
-    np.testing.assert_allclose(log_likelihoods(p.proposals(), p.reference, 1), exact, rtol=1e-6)
+    proposals = p.proposals()
+    z, *_ = proposals.draw(1, 1)
+    mode = np.arange(len(p.y))
+    xi, _ = proposals.mapped(mode, proposals.residuals.whitened(z[:, 0]))
+    open_axes = np.where(proposals.open_axes, norm.logpdf(xi) - student.logpdf(xi, 5), 0.0)
+    exact += open_axes.sum(axis=1)
+    np.testing.assert_allclose(log_likelihoods(proposals, p.reference, 1), exact, rtol=1e-6)
 
 
 # Standard errors of log L with 1024 points: largest root mean square error of a specimen, 8 seeds.

@@ -100,7 +100,7 @@ def test_the_share_is_the_distribution_function(d: int) -> None:
     assert np.std(error) <= 0.1
     assert np.std(populations.exact()) > 1  # without the term
     assert len(after.z) > len(before.z)
-    assert len(share.z) == 2048  # as both first halves agree
+    assert len(share.z) == 8192  # as both first halves agree
 
 
 def test_a_region_far_away_and_failed_specimens_have_no_share() -> None:
