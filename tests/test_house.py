@@ -399,7 +399,7 @@ def test_the_likelihood_of_the_readme_prints_what_it_says(
     script = tmp_path / "example.py"
     script.write_text(preamble + LIKELIHOOD_SCRIPT, encoding="utf-8")
     variables = runpy.run_path(str(script))
-    assert variables["optimum"].n_responses == 128
+    assert variables["optimum"].n_responses <= 60
     printed = capsys.readouterr().out
     printed = printed[printed.index(LIKELIHOOD_OUTPUT.splitlines()[0]) :]
     number = re.compile(r"\d+\.\d+|\d+")

@@ -321,8 +321,8 @@ def input_indices(
     for values in outputs:
         numbers = quantity.of_specimen(values, at).reshape(z.shape[:-1])
         replicates.append(_indices_of_matched(numbers, transform.columns))
-    best, *others = (Indices.of_replicates(indices) for indices in replicates)
-    emulator_error = np.sum([(other.values - best.values) ** 2 for other in others], axis=0)
+    best, *resampled = (Indices.of_replicates(indices) for indices in replicates)
+    emulator_error = np.sum([(indices.values - best.values) ** 2 for indices in resampled], axis=0)
     is_known = np.array([[True], [True], [quantity.differentiable]])
     values = np.where(is_known, best.values, np.nan)
     errors = np.where(is_known, np.sqrt(best.errors**2 + emulator_error), np.nan)

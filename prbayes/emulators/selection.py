@@ -198,10 +198,10 @@ def weight_of_runs(
     bias, variance = 0.0, 0.0
     member = (blocks == np.unique(blocks)[:, None]).astype(float)
     for output, prediction in zip(y.T, predictions.T, strict=True):
-        levels, width = _levels(output, weights.mean(axis=0))
-        below = _below(output, levels, width)
+        steps = SmoothedSteps.of(output, weights.mean(axis=0))
+        below = steps(output)
         # Error of the emulator's distribution functions: by block, (T, B, L).
-        error = _below(prediction, levels, width) - below
+        error = steps(prediction) - below
         errors = np.einsum("tn,bn,nl->tbl", weights, member, error)
         squared_bias = errors.sum(axis=1) ** 2 - variance_of_sum(errors)
         bias += float(np.maximum(squared_bias, 0.0).sum(axis=-1).mean())
@@ -213,26 +213,33 @@ def weight_of_runs(
     return bias / (bias + variance) if bias > 0 else 0.0
 
 
-def _levels(values: Floats, importance: Floats) -> tuple[Floats, float]:
-    """Return 32 quantiles of finite weighted values, and the width of smoothed steps there.
+@dataclass(frozen=True, eq=False)
+class SmoothedSteps:
+    """Smoothed indicators of values below levels: quantiles of the outputs of runs.
 
     The width, .2 standard deviations, is a bandwidth of a thousand data. Without it a response with
     one value for many specimens would be wrong at all of them where an emulator errs by a rounding.
     """
-    is_finite = np.isfinite(values)
-    values, weights = values[is_finite], importance[is_finite]
-    order = np.argsort(values)
-    values, weights = values[order], weights[order]
-    total = weights.sum()
-    cumulated = np.cumsum(weights) - 0.5 * weights
-    levels = np.interp((np.arange(32) + 0.5) / 32 * total, cumulated, values)
-    low, high = np.interp(ndtr([-1.0, 1.0]) * total, cumulated, values)
-    return levels, 0.2 * (high - low) / 2
 
+    levels: Floats  # (L,)
+    width: float
 
-def _below(values: Floats, levels: Floats, width: float) -> Floats:
-    """Return a smoothed indicator of values below levels, (n, L); NaN and +inf never are."""
-    if not width > 0:
-        return (values[:, None] <= levels).astype(float)
-    ramp = (levels - values[:, None]) / width + 0.5
-    return np.asarray(np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0))
+    @classmethod
+    def of(cls, values: Floats, importance: Floats) -> SmoothedSteps:
+        """Return the steps at 32 quantiles of finite weighted values."""
+        is_finite = np.isfinite(values)
+        values, weights = values[is_finite], importance[is_finite]
+        order = np.argsort(values)
+        values, weights = values[order], weights[order]
+        total = weights.sum()
+        cumulated = np.cumsum(weights) - 0.5 * weights
+        levels = np.interp((np.arange(32) + 0.5) / 32 * total, cumulated, values)
+        low, high = np.interp(ndtr([-1.0, 1.0]) * total, cumulated, values)
+        return cls(levels, 0.2 * (high - low) / 2)
+
+    def __call__(self, values: Floats) -> Floats:
+        """Return the indicators, (n, L); NaN and +inf are below no level."""
+        if not self.width > 0:
+            return (values[:, None] <= self.levels).astype(float)
+        ramp = (self.levels - values[:, None]) / self.width + 0.5
+        return np.asarray(np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0))

@@ -150,8 +150,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
 _UNSUPPORTED = Finding(
     "narrow-population",
     "The likelihood is largest for a population that is narrower than the distances between the "
-    "points of the specimens, where its value is not known to half a nat: the data do not bound the "
-    "spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
+    "points of the specimens, where its value is not known to half a nat: the data do not bound "
+    "the spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
     "likelihood.md#narrow-population",
 )
 

@@ -59,8 +59,8 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
     z[:, data.free] = population.mean + 1.5 * ndtri(u[:, : len(data.free)]) @ population.root.T
     low, high = data.prior.min(axis=0), data.prior.max(axis=0)
     z = np.clip(z, low, high)
-    known = np.flatnonzero(~np.isnan(data.known[0]))
-    for place, column in enumerate(known):  # conditions: those of the specimens
+    conditions = np.flatnonzero(~np.isnan(data.known[0]))
+    for place, column in enumerate(conditions):  # conditions: those of the specimens
         values = np.quantile(data.known[:, column], u[:, len(data.free) + place])
         z[:, column] = values
     y = run(z)
@@ -119,7 +119,7 @@ class Likely:
         return data.scale(np.sqrt((self.population.root**2).sum(axis=1)))
 
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
-        """Return inputs, (count, d), that are likely under a population twice as wide as the fit."""
+        """Return inputs, (count, d), that are likely under a population twice as wide."""
         wide = Normal(self.population.mean, 2.0 * self.population.root)
         return self.sample(count, rng, likely_weights(data, self.points, wide))[0]
 
@@ -143,7 +143,8 @@ def emulate(
     while True:
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
-        if emulation.bias <= data.options.bias and batches >= enough:
+        is_complete = batches >= enough or len(emulation.z) >= most
+        if emulation.bias <= data.options.bias and is_complete:
             points, proposals, draws = specimen_points(data, emulation, wider(population))
             stated = emulation.error
             emulation = audited(run, data, emulation, proposals, points, draws, rng)
@@ -154,7 +155,9 @@ def emulate(
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
             require_accurate(data, emulation)
-        count = max(data.options.sampled + 2, len(emulation.z) // 2 if previous is None else 0)
+        # Batches of half the runs there are, up to three times the first.
+        half = min(len(emulation.z) // 2, 3 * first_runs(data.known.shape[1]))
+        count = max(data.options.sampled + 2, half if previous is None else 0)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
 
@@ -188,11 +191,11 @@ def extended(
     around = np.concatenate([near, of_population])
     runs = np.concatenate([emulation.z, sampled, possible])
     # Where specimens have few inputs, there are runs at them already.
-    n_new = _is_new(emulation.z, runs[len(emulation.z) :], scale).sum()
+    n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
     far = _farthest(runs, around, max(2, count - n_explored - n_new), scale)
     explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
-    others = np.concatenate([far, explored])
-    return joined(run, data, emulation, likely, sampled, specimens, possible, others)
+    distant = np.concatenate([far, explored])
+    return joined(run, data, emulation, likely, sampled, specimens, possible, distant)
 
 
 def joined(
@@ -203,14 +206,14 @@ def joined(
     sampled: Floats,
     specimens: NDArray[np.intp],
     possible: Floats,
-    others: Floats,
+    distant: Floats,
 ) -> Emulation:
     """Return the emulation with runs at fresh points.
 
     The sampled points give its error and bias. At those that are possible under a wide population
     a coarser error is allowed.
     """
-    fresh = np.concatenate([sampled, possible, others])
+    fresh = np.concatenate([sampled, possible, distant])
     is_new = _is_new(emulation.z, fresh, likely.scale(data))
     outputs, misfit = _compared(run, emulation, fresh, is_new)
     at_sampled, at_possible, _ = np.split(misfit, [len(sampled), len(sampled) + len(possible)])
@@ -324,8 +327,9 @@ def _explored(
 ) -> Floats:
     """Return points of the prior, far from all runs, at which a specimen could lie."""
     z = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
-    known = ~np.isnan(data.known[0])
-    z[:, known] = data.known[rng.integers(0, len(data.known), len(z))][:, known]
+    is_condition = ~np.isnan(data.known[0])
+    of_specimens = data.known[rng.integers(0, len(data.known), len(z))]
+    z[:, is_condition] = of_specimens[:, is_condition]
     readings, spread = data.readings, data.readings.spread()
     # What the emulator says of a place without runs may be wrong: its own deviation counts.
     deviation = spread + 3 * np.sqrt(emulation.surface.variance(z))

@@ -324,15 +324,15 @@ def agreeing_points(
     """
     options = data.options
     over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
-    wanted = options.half_difference * per_hyperparameter(draws)
+    limit = options.half_difference * per_hyperparameter(draws)
     # Along open inputs the error falls more slowly with the number of points.
-    largest = wanted * (2 if proposals.is_open(scale) else 1)
+    largest = limit * (2 if proposals.is_open(scale) else 1)
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
         difference = _half_difference(data, proposals, halves, draws, (scale,))
         is_cheap = 4 * count * len(data.readings) <= options.cheap_in_all
-        if difference <= (wanted if is_cheap else largest) and (
+        if difference <= (limit if is_cheap else largest) and (
             len(data.scales) == 1
             or count >= 512
             or _half_difference(data, proposals, halves, draws, data.scales) <= over_scales

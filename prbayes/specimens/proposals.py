@@ -33,7 +33,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,6 @@ from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 
 Indices = NDArray[np.intp]
-
-# Readings leave a direction open whose precision is less than this many times the population's.
-LEAST_PRECISION = 4.0
-DEGREES = 5.0  # of Student's t distribution of points along open directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +281,10 @@ def rows_by_specimen(specimen: Indices) -> Indices:
 class Proposals:
     """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
 
+    # Readings leave a direction open whose precision is less than this many times the population's.
+    least_precision: ClassVar[float] = 4.0
+    degrees: ClassVar[float] = 5.0  # of Student's t distribution along open directions
+
     residuals: Residuals
     modes: Modes
     inputs: Floats  # (R, free, free): D V'
@@ -312,7 +312,7 @@ class Proposals:
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
         log_det = -np.log(inverse).sum(axis=1)
         maps = inverse[:, :, None] * vt, readings, orientation, log_det
-        return cls(residuals, modes, *maps, scale**2 < LEAST_PRECISION, share)
+        return cls(residuals, modes, *maps, scale**2 < cls.least_precision, share)
 
     def rows(self, index: Indices) -> Proposals:
         """Return the proposals of selected modes, with equal mixing weights."""
@@ -335,13 +335,15 @@ class Proposals:
         order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
         ordered = self.rows(order)
         table = ordered.modes.table
-        kept = np.ones(len(order), dtype=bool)
+        is_kept = np.ones(len(order), dtype=bool)
         for k in range(1, table.shape[1]):
             for better in range(k):
                 pairs = table[:, k] >= 0
                 at, rows = table[pairs, better], table[pairs, k]
                 pairs = (
-                    kept[at] & kept[rows] & (ordered.modes.scale[at] == ordered.modes.scale[rows])
+                    is_kept[at]
+                    & is_kept[rows]
+                    & (ordered.modes.scale[at] == ordered.modes.scale[rows])
                 )
                 at, rows = at[pairs], rows[pairs]
                 if not rows.size:
@@ -355,8 +357,8 @@ class Proposals:
                 at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
                 end, _, _, converged = ordered.solved(at, value)
                 is_reached = np.abs(end - ordered.modes.a[rows]).max(axis=1, initial=0) < 1e-2
-                kept[rows[converged & is_reached]] = False
-        return ordered.rows(np.flatnonzero(kept))
+                is_kept[rows[converged & is_reached]] = False
+        return ordered.rows(np.flatnonzero(is_kept))
 
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
@@ -370,7 +372,7 @@ class Proposals:
             return True
         rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
         least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
-        return bool(np.quantile(least, 0.1) < LEAST_PRECISION)
+        return bool(np.quantile(least, 0.1) < self.least_precision)
 
     def log_density(self, mode: Indices, xi: Floats) -> Floats:
         """Return the log-density of proposals at xi, (k, free) -> (k,), less that of the maps.
@@ -383,10 +385,10 @@ class Proposals:
         .. [1] Hesterberg, T. (1995), Weighted average importance sampling and defensive mixture
            distributions, Technometrics 37, doi:10.1080/00401706.1995.10484303.
         """
-        square = xi**2
-        constant = gammaln((DEGREES + 1) / 2) - gammaln(DEGREES / 2) - np.log(DEGREES / 2) / 2
-        student = constant - (DEGREES + 1) / 2 * np.log1p(square / DEGREES)
-        return np.where(self.open_axes[mode], student, -square / 2).sum(axis=1)
+        half = self.degrees / 2
+        constant = gammaln(half + 0.5) - gammaln(half) - np.log(half) / 2
+        student = constant - (half + 0.5) * np.log1p(xi**2 / self.degrees)
+        return np.asarray(np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1))
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
@@ -446,8 +448,8 @@ class Proposals:
         specimen = self.modes.specimen
         total = np.bincount(specimen, mass)[specimen]
         count = np.bincount(specimen)[specimen]
-        own = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
-        return replace(self, share=0.9 * own + 0.1 / count)
+        by_mass = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
+        return replace(self, share=0.9 * by_mass + 0.1 / count)
 
     def _counts(self, count: int) -> Indices:
         """Return the number of points of each mode, (R,), which have the sum ``count``."""
@@ -476,12 +478,11 @@ class Proposals:
         u = sobol(int(counts.max()), d, seed)[:, ::-1]
         shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
         u = np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12)
-        xi = np.where(self.open_axes[mode], stdtrit(DEGREES, u), ndtri(u))
+        xi = np.where(self.open_axes[mode], stdtrit(self.degrees, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
-        own = log_det[rows] + self.log_density(mode[rows], value[rows])
-        drawn = mode[rows], own
+        drawn = mode[rows], log_det[rows] + self.log_density(mode[rows], value[rows])
         weights = counts.astype(np.float64)
         log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], weights, drawn)
         log_q[rows] -= d / 2 * np.log(2 * np.pi)

@@ -106,14 +106,14 @@ def cross_validate(
     folds = most_folds(optimum, 5) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
-    held_out, kept, sizes = _folds(evaluator.simulators, folds, seed)
+    held_out, training, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
         if by_specimen:
-            thetas, converged = refits.reweighted(kept)
+            thetas, converged = refits.reweighted(training)
         else:
             observed = [node.target.observed for node in evaluator.nodes]
             sampling = optimum.sampling()
-            x, converged = refit(sampling, DataSets(observed, kept))
+            x, converged = refit(sampling, DataSets(observed, training))
             thetas = sampling.thetas(x)
     losses = _mean_log_losses if by_specimen else _discrepancies
     scores, weights = _scores(evaluator, thetas, held_out)
@@ -121,7 +121,7 @@ def cross_validate(
     return CrossValidationTable(
         {
             "discrepancy": (dims, losses(evaluator, thetas, held_out)),
-            "calibrated": (dims, losses(evaluator, thetas, kept)),
+            "calibrated": (dims, losses(evaluator, thetas, training)),
             "n_held_out": (dims, sizes),
             "converged": ("fold", converged),
             "score": ("specimen", scores),
@@ -206,21 +206,21 @@ def _folds(
     # The 3 makes random numbers differ from others with the same seed.
     rng = np.random.default_rng([random_seed, 3])
     fold_of = rng.permutation(np.arange(total) % folds)
-    held_out, kept, sizes, too_few = [], [], [], []
+    held_out, training, sizes, too_few = [], [], [], []
     for simulator, number in zip(simulators, numbers, strict=True):
         is_out = fold_of[number] == np.arange(folds)[:, None]
         rest = np.where(is_out, 0.0, simulator.weights)
         if ((rest > 0).sum(axis=1) < 2).any():
             too_few.append(simulator.name)
         held_out.append(np.where(is_out, simulator.weights, 0.0))
-        kept.append(rest)
+        training.append(rest)
         sizes.append(is_out.sum(axis=1))
     if too_few:
         raise ValueError(
             f"folds: got {folds}, with fewer than 2 observations of {too_few} in the others, "
             "expected fewer folds"
         )
-    return held_out, [w / w.sum(axis=1, keepdims=True) for w in kept], np.array(sizes).T
+    return held_out, [w / w.sum(axis=1, keepdims=True) for w in training], np.array(sizes).T
 
 
 def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:

@@ -201,7 +201,7 @@ def test_a_response_that_no_emulator_follows_is_refused_at_the_limit() -> None:
     with pytest.raises(DesignError) as caught:
         emulated(rough, x, options=options)
     message = str(caught.value)
-    assert "response: got an emulator whose error would shift" in message
+    assert "response: the response is not smooth enough" in message
     assert "metric=prb.ProbabilityResidual()" in message
     assert len(message) < 5 * 90
     # A batch is half of the runs so far, and the limit is checked before each.
