@@ -191,10 +191,6 @@ def weight_of_runs(
     Weights of the runs in T populations, (T, n), have rows of sum one; outputs y, (n, m), are not
     finite where they failed; predictions, (n, m), are without the block of each run.
     """
-
-    def variance_of_sum(parts: Floats) -> Floats:  # over independent blocks, (T, B, L) -> (T, L)
-        return np.asarray(parts.shape[1] * parts.var(axis=1, ddof=1))
-
     bias, variance = 0.0, 0.0
     member = (blocks == np.unique(blocks)[:, None]).astype(float)
     for output, prediction in zip(y.T, predictions.T, strict=True):
@@ -203,13 +199,15 @@ def weight_of_runs(
         # Error of the emulator's distribution functions: by block, (T, B, L).
         error = steps(prediction) - below
         errors = np.einsum("tn,bn,nl->tbl", weights, member, error)
-        squared_bias = errors.sum(axis=1) ** 2 - variance_of_sum(errors)
+        # The variance of a sum over independent blocks.
+        squared_bias = errors.sum(axis=1) ** 2 - len(member) * errors.var(axis=1, ddof=1)
         bias += float(np.maximum(squared_bias, 0.0).sum(axis=-1).mean())
         # Weighted runs around their distribution function.
         function = np.einsum("tn,nl->tl", weights, below)
         deviations = below - function[:, None, :]
         by_block = np.einsum("tn,bn,tnl->tbl", weights, member, deviations)
-        variance += float(variance_of_sum(by_block).sum(axis=-1).mean())
+        of_sum = len(member) * by_block.var(axis=1, ddof=1)
+        variance += float(of_sum.sum(axis=-1).mean())
     return bias / (bias + variance) if bias > 0 else 0.0
 
 

@@ -29,7 +29,7 @@ from prbayes.optimize.convergence import (
     stored_overlap,
 )
 from prbayes.optimize.objective import Ridge
-from prbayes.propagation.base import DesignError, refuse_lost_share
+from prbayes.propagation.base import DesignError, refuse_lost_share, valid_parents
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
@@ -345,10 +345,10 @@ def draw_samples(
         bound = node.reweighted
         if bound is None or not bound.design.is_emulated or node.name not in names:
             continue
-        components = _components(evaluator, thetas, k)
         if not larger or bound.design.emulated_size < SIZES.largest:
+            parents = valid_parents(bound, _components(evaluator, thetas, k))
             growth = 2 if larger else 1
-            bound.reach(components, same_surfaces=same_surfaces, growth=growth)
+            bound.reach(parents, same_surfaces=same_surfaces, growth=growth)
             is_drawn = True
     return is_drawn
 

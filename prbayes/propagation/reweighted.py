@@ -359,16 +359,14 @@ class ReweightedBound(Bound):
         components = valid_parents(self, components)
         self.design = self._sampler.with_runs(self._design, components, n, self.responses)
 
-    def reach(
-        self, components: Sequence[Floats], *, same_surfaces: bool = False, growth: int = 1
-    ) -> None:
-        """Draw ``growth`` times as many emulated points for populations at parents, without a run.
+    def reach(self, parents: list[Floats], *, same_surfaces: bool = False, growth: int = 1) -> None:
+        """Draw ``growth`` times as many emulated points for valid populations, without a run.
 
         To select surfaces for these populations takes most of the time.
         """
         design = replace(self._design, emulated_size=growth * self._design.emulated_size)
         emulator = design.emulator if same_surfaces else None
-        self.design = self._sampler.resampled(design, valid_parents(self, components), emulator)
+        self.design = self._sampler.resampled(design, parents, emulator)
 
     def points_of(self, inputs: Inputs, points: Sequence[Floats] | None = None) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
