@@ -21,6 +21,7 @@ from prbayes.propagation.population_density import fit_normal
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
 from prbayes.specimens.points import (
     Draws,
+    Plausible,
     SpecimenData,
     SpecimenPoints,
     at_scale,
@@ -29,7 +30,6 @@ from prbayes.specimens.points import (
     likely_scale,
     likely_weights,
     normal_of,
-    specimen_points,
     typical_specimens,
 )
 from prbayes.specimens.proposals import Normal, Proposals
@@ -145,13 +145,13 @@ def emulate(
         population = likely.population
         is_complete = batches >= enough or len(emulation.z) >= most
         if emulation.bias <= data.options.bias and is_complete:
-            points, proposals, draws = specimen_points(data, emulation, wider(population))
-            stated = emulation.error
-            emulation = audited(run, data, emulation, proposals, points, draws, rng)
+            plausible = Plausible.of(data, emulation, wider(population))
+            surface = emulation.surface
+            emulation = audited(run, data, emulation, plausible, rng)
             if emulation.bias <= 1.5 * data.options.bias:
-                if (emulation.error > stated).any():
-                    points, proposals, draws = specimen_points(data, emulation, wider(population))
-                return emulation, points, proposals, draws
+                if emulation.surface is not surface:
+                    plausible = plausible.of_emulation(data, emulation)
+                return emulation, *plausible.agreeing(data), plausible.draws
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
             require_accurate(data, emulation)
@@ -347,17 +347,17 @@ def audited(
     run: Run,
     data: SpecimenData,
     emulation: Emulation,
-    proposals: Proposals,
-    points: SpecimenPoints,
-    draws: Draws,
+    plausible: Plausible,
     rng: np.random.Generator,
 ) -> Emulation:
     """Return the emulation with runs at points that matter to the posterior, and their bias.
 
     Its surface and error stay if the error at these runs is at most twice the stated one.
     """
-    population = normal_of(draws.specimens()[:, data.free], 1.2)
-    likely = Likely(proposals, points, population, likely_weights(data, points, population))
+    points = plausible.points
+    population = normal_of(plausible.draws.specimens()[:, data.free], 1.2)
+    weights = likely_weights(data, points, population)
+    likely = Likely(plausible.proposals, points, population, weights)
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
     # Among the quarter of them at which the emulator is the least certain.

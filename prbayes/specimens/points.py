@@ -40,7 +40,7 @@ class SpecimenOptions:
     points: int = 8  # fewest points of a mode in each half; doubled until the halves agree
     most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
     most_in_all: int = 2**17
-    cheap_in_all: int = 2**16  # up to which points are doubled for half the difference
+    cheap_in_all: int = 2**16  # up to which points are doubled for the sake of few populations
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
     half_difference: float = 0.05
@@ -246,43 +246,79 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
 
 
+@dataclass(frozen=True, eq=False)
+class Plausible:
+    """Posterior draws of the hyperparameters, and coarse points of which they follow."""
+
+    draws: Draws
+    proposals: Proposals
+    points: SpecimenPoints
+    scale: float  # the likely factor of an unknown error
+    count: int  # points of each half to begin with
+
+    @classmethod
+    def of(cls, data: SpecimenData, emulation: Emulation, population: Normal) -> Plausible:
+        """Return draws; ``population`` is the first reference.
+
+        Where the readings leave inputs open, the reference has the moments of specimens of
+        posterior draws, refitted twice. Raise DesignError if `most_points` are not enough.
+        """
+        options = data.options
+        proposals = fit_proposals(data, emulation, population)
+        count = options.points * proposals.modes.table.shape[1]
+        points = draw_points(data, proposals, 2 * count, data.seed)
+        scale = likely_scale(data, points, emulation.error)
+        if not proposals.is_open(scale):
+            points = at_scale(data, points, emulation.error, scale)
+            draws = data.posterior(points.z, points.log_a, None)
+            return cls(draws, proposals, points, scale, count)
+        count = max(2 * count, 32 * options.points)
+        for refit in range(3):
+            seed = data.seed + refit
+            draws, points, proposals = reliable_draws(data, proposals, count, seed, scale)
+            count = points.log_a.shape[1]
+            previous, population = population, normal_of(draws.specimens()[:, data.free])
+            inflated = Normal(population.mean, 1.15 * population.root)
+            proposals = fit_proposals(data, emulation, inflated)
+            change = np.linalg.solve(previous.root, population.root)
+            if np.abs(change - np.eye(len(change))).max() < 0.2:
+                break
+        points = draw_points(data, proposals, count, data.seed)
+        points = at_scale(data, points, emulation.error, scale)
+        return cls(draws, proposals, points, scale, count // 2)
+
+    def of_emulation(self, data: SpecimenData, emulation: Emulation) -> Plausible:
+        """Return the same draws with proposals of a better emulator."""
+        reference = self.proposals.residuals.population
+        proposals = fit_proposals(data, emulation, reference)
+        points = draw_points(data, proposals, self.points.log_a.shape[1], data.seed)
+        points = at_scale(data, points, emulation.error, self.scale)
+        return replace(self, proposals=proposals, points=points)
+
+    def agreeing(self, data: SpecimenData) -> tuple[SpecimenPoints, Proposals]:
+        """Return points whose halves agree at the draws."""
+        proposals, points = self.proposals, self.points
+        # A scale that is not likely needs its points all the same.
+        if proposals.is_open(self.scale) and len(data.scales) == 1:
+            population = normal_of(self.draws.specimens()[:, data.free])
+            # A branch that only a wide population reaches has its points, too.
+            wide = Normal(population.mean, 2.5 * population.root)
+            weights = likely_weights(data, points, population)
+            weights += likely_weights(data, points, wide)
+            mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
+            proposals = proposals.with_shares(mass)
+        return agreeing_points(data, proposals, self.count, self.draws, self.scale)
+
+
 def specimen_points(
     data: SpecimenData, emulation: Emulation, population: Normal
 ) -> tuple[SpecimenPoints, Proposals, Draws]:
     """Return points whose halves agree, their proposals, and posterior draws at which they agree.
 
-    ``population`` is the first reference. Where the readings leave inputs open, the reference has
-    the moments of specimens of posterior draws, refitted twice. Raise DesignError if `most_points`
-    are not enough.
+    ``population`` is the first reference. Raise DesignError if `most_points` are not enough.
     """
-    options = data.options
-    proposals = fit_proposals(data, emulation, population)
-    count = options.points * proposals.modes.table.shape[1]
-    points = draw_points(data, proposals, 2 * count, data.seed)
-    scale = likely_scale(data, points, emulation.error)
-    if not proposals.is_open(scale):
-        points = at_scale(data, points, emulation.error, scale)
-        draws = data.posterior(points.z, points.log_a, None)
-        return *agreeing_points(data, proposals, count, draws, scale), draws
-    count = max(2 * count, 32 * options.points)
-    for refit in range(3):
-        draws, points, proposals = reliable_draws(data, proposals, count, data.seed + refit, scale)
-        count = points.log_a.shape[1]
-        previous, population = population, normal_of(draws.specimens()[:, data.free])
-        inflated = Normal(population.mean, 1.15 * population.root)
-        proposals = fit_proposals(data, emulation, inflated)
-        change = np.linalg.solve(previous.root, population.root)
-        if np.abs(change - np.eye(len(change))).max() < 0.2:
-            break
-    points = draw_points(data, proposals, count, data.seed)
-    points = at_scale(data, points, emulation.error, scale)
-    # A branch that only a wide population reaches has its points, too.
-    wide = Normal(population.mean, 2.5 * population.root)
-    weights = likely_weights(data, points, population) + likely_weights(data, points, wide)
-    mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
-    if len(data.scales) == 1:  # a scale that is not likely needs its points all the same
-        proposals = proposals.with_shares(mass)
-    return *agreeing_points(data, proposals, count // 2, draws, scale), draws
+    plausible = Plausible.of(data, emulation, population)
+    return *plausible.agreeing(data), plausible.draws
 
 
 def at_scale(
@@ -316,7 +352,11 @@ def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Norma
 
 
 def agreeing_points(
-    data: SpecimenData, proposals: Proposals, count: int, draws: Draws, scale: float = 1.0
+    data: SpecimenData,
+    proposals: Proposals,
+    count: int,
+    draws: Draws,
+    scale: float = 1.0,
 ) -> tuple[SpecimenPoints, Proposals]:
     """Return points whose halves agree at draws, doubled from ``count`` in each half.
 
@@ -324,22 +364,22 @@ def agreeing_points(
     """
     options = data.options
     over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
-    limit = options.half_difference * per_hyperparameter(draws)
     # Along open inputs the error falls more slowly with the number of points.
-    largest = limit * (2 if proposals.is_open(scale) else 1)
+    largest = options.half_difference * per_hyperparameter(draws)
+    largest *= 2 if proposals.is_open(scale) else 1
     most = max(options.most_points, options.most_in_all // len(data.readings))
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
         difference = _half_difference(data, proposals, halves, draws, (scale,))
         is_cheap = 4 * count * len(data.readings) <= options.cheap_in_all
-        if difference <= (limit if is_cheap else largest) and (
+        if difference[0 if is_cheap else 1] <= largest and (
             len(data.scales) == 1
             or count >= 512
-            or _half_difference(data, proposals, halves, draws, data.scales) <= over_scales
+            or _half_difference(data, proposals, halves, draws, data.scales)[0] <= over_scales
         ):
-            return replace(joined(*halves), difference=difference), proposals
+            return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
-            raise _monte_carlo_error(data.name, 2 * count, difference, largest)
+            raise _monte_carlo_error(data.name, 2 * count, difference[1], largest)
         count *= 2
 
 
@@ -349,8 +389,12 @@ def _half_difference(
     halves: Sequence[SpecimenPoints],
     draws: Draws,
     scales: Sequence[float],
-) -> float:
-    """Return the Monte Carlo error over draws, and over scales of an unknown error."""
+) -> tuple[float, float]:
+    """Return the Monte Carlo error over draws, and over scales of an unknown error.
+
+    The second number has no contribution of the few populations that are narrower than the
+    distances between points.
+    """
     error, logs = proposals.residuals.emulator_error, []
     for half in halves:
         by_scale = [at_scale(data, half, error, scale) for scale in scales]
@@ -360,7 +404,7 @@ def _half_difference(
         typical = typical_specimens(proposals.modes, len(data.readings))
         a, b = a[:, typical], b[:, typical]
     finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    return half_difference(a[finite], b[finite]) if finite.any() else np.inf
+    return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf)
 
 
 def typical_specimens(
@@ -401,7 +445,7 @@ def reliable_draws(
         points = at_scale(data, joined(*halves), proposals.residuals.emulator_error, scale)
         if not narrows:
             draws = data.posterior(points.z, points.log_a, None)
-            difference = _half_difference(data, proposals, halves, draws, (scale,))
+            difference, _ = _half_difference(data, proposals, halves, draws, (scale,))
             limit = per_hyperparameter(draws)
             if difference <= limit:
                 return draws, points, proposals
