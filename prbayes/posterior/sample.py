@@ -193,11 +193,12 @@ def modes_of(target: Target) -> list[Laplace] | None:
     except (ValueError, np.linalg.LinAlgError):
         return None
     highest = max(mode.log_mass for mode in candidates)
-    return [
+    modes = [
         mode
         for i, mode in enumerate(_distinct(candidates))
         if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
     ]
+    return modes or None  # populations that shrink to a point have no mass
 
 
 def _distinct(modes: list[Laplace]) -> list[Laplace]:

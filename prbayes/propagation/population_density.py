@@ -167,7 +167,7 @@ class WeightedPoints:
     @classmethod
     def of(cls, inputs: Inputs, x: Sequence[Floats], log_a: Floats) -> WeightedPoints:
         """Return the points with their form, if they have one population, and the inputs a form."""
-        if inputs.nested or (inputs.covariates and len(log_a) > 1) or not log_a.size:
+        if inputs.nested or not log_a.size:
             return cls(x, log_a, None)
         flat = [v.swapaxes(0, 1).reshape(log_a.size, *v.shape[2:]) for v in x]
         return cls(x, log_a, ExponentialForm.of(inputs.aleatory, flat))
@@ -228,6 +228,8 @@ class PopulationDensity:
         n, count = log_a.shape
         if form is None:
             return self._by_graph(parents, points)
+        if self.inputs.covariates and n > 1:
+            return self._by_specimen(parents, points, form)
         at_each = self.inputs.for_points(parents, len(form.anchors[0]))
         with np.errstate(all="ignore"):
             (at_anchors,) = self._log_density(*at_each, *form.anchors)
@@ -251,6 +253,31 @@ class PopulationDensity:
             narrow = [parent[is_rounded] for parent in parents]
             result[:, is_rounded] = self._by_graph(narrow, points).T
         return result.T
+
+    def _by_specimen(
+        self, parents: Sequence[Floats], points: WeightedPoints, form: ExponentialForm
+    ) -> Floats:
+        """Return log-likelihoods where each specimen has a population of its own."""
+        n, count = points.log_a.shape
+        size = len(form.anchors[0])
+        anchors = [np.concatenate([values] * n) for values in form.anchors]
+        result = np.empty((len(parents[0]), n))
+        step = max(1, IN_CACHE // points.log_a.size)
+        statistics = form.statistics.reshape(-1, count, n).T  # (N, K, q + 1)
+        log_a = np.where(form.is_inside.reshape(count, n).T, points.log_a, -np.inf)
+        for first in range(0, len(result), step):
+            block = [parent[first : first + step] for parent in parents]
+            with np.errstate(all="ignore"):
+                (at_anchors,) = self._log_density(*self.inputs.for_points(block, size), *anchors)
+            natural, is_rounded = form.natural_parameters(at_anchors.reshape(-1, size))
+            natural = natural.reshape(-1, n, size).transpose(1, 2, 0)
+            exponents = statistics @ natural + log_a[..., None]
+            logs = _log_sum_exp_first(np.maximum(exponents, -1e300).swapaxes(0, 1)).T
+            narrow = is_rounded.reshape(-1, n).any(axis=1)
+            if narrow.any():
+                logs[narrow] = self._by_graph([parent[narrow] for parent in block], points)
+            result[first : first + step] = logs
+        return result
 
     def _by_graph(self, parents: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return log-likelihoods by the compiled log-density."""

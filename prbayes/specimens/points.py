@@ -363,7 +363,7 @@ def agreeing_points(
     ``scale`` is the likely factor of an unknown error; the halves agree over all factors, too.
     """
     options = data.options
-    over_scales = 0.05 * np.sqrt(max(len(data.readings), 10) / 10)
+    over_scales = 0.03 * np.sqrt(max(len(data.readings), 10) / 10)
     # Along open inputs the error falls more slowly with the number of points.
     largest = options.half_difference * per_hyperparameter(draws)
     largest *= 2 if proposals.is_open(scale) else 1

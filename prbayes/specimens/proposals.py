@@ -516,8 +516,10 @@ class Proposals:
         of its density there, up to a constant, both (k,).
         """
         modes = self.modes
-        # A specimen with one mode at each scale of its errors has one sheet of points.
-        size = np.bincount(modes.specimen)[modes.specimen] / len(np.unique(modes.scale))
+        # The only mode of a specimen at a scale of its errors reaches all points.
+        pairs = np.stack([modes.specimen, modes.scale], axis=1)
+        _, place, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+        is_alone = counts[place.ravel()] == 1
         table = modes.table[specimen]
         with np.errstate(divide="ignore"):
             logs = np.log(weights)
@@ -539,7 +541,7 @@ class Proposals:
                 density = log_det + self.log_density(at, value) + logs[at]
                 matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
-                is_reached = (size[at] <= 1) & (drawn is not None)
+                is_reached = is_alone[at] & (drawn is not None)
                 check = np.flatnonzero(~is_reached)
                 end, _, _, converged = self.solved(at[check], value[matters][check])
                 distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
