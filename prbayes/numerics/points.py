@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._validate import Floats
 
@@ -25,6 +26,22 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random(1) if n == 1 else engine.random_base2(int(np.ceil(np.log2(n))))[:n]
     return inside(points)
+
+
+def lattice(place: NDArray[np.intp], count: NDArray[np.intp], dimensions: int) -> Floats:
+    """Return points of lattices in the unit cube, (n, dimensions), at places 0 to count - 1.
+
+    The first coordinates are place / count. The others are multiples of powers of the root of
+    x^d = x + 1, a generalised golden ratio. Source: Niederreiter (1992), Random number generation
+    and quasi-Monte Carlo methods, doi:10.1137/1.9781611970081, ch. 3 and 5.
+
+    Integrals of narrow densities are more accurate than with scrambled points.
+    """
+    root = 2.0
+    for _ in range(60):
+        root = (1.0 + root) ** (1.0 / max(dimensions, 2))
+    steps = root ** -np.arange(1.0, dimensions)
+    return np.column_stack([place / count, (place[:, None] * steps) % 1.0])
 
 
 def farthest_rows(points: Floats, count: int, squares: Floats | None = None) -> list[int]:

@@ -155,9 +155,10 @@ def emulate(
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
             require_accurate(data, emulation)
-        # Batches of half the runs there are, up to three times the first.
-        half = min(len(emulation.z) // 2, 3 * first_runs(data.known.shape[1]))
-        count = max(data.options.sampled + 2, half if previous is None else 0)
+        # Batches of half the runs there are, a quarter near the end; at most three times the first.
+        share = 2 if emulation.bias > 3 * data.options.bias else 4
+        growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
+        count = max(data.options.sampled + 2, growth if previous is None else 0)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
 
@@ -391,7 +392,7 @@ def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
     share = emulation.error / data.readings.spread()
     worst = int(np.argmax(share))
     output = f"output {worst}" if len(share) > 1 else "the output"
-    is_rough = share[worst] > 0.1
+    is_rough = share[worst] > 0.03
     cause = "the response is not smooth enough for prb.LogLikelihood(): " if is_rough else ""
     raise DesignError(
         f"{data.name}: {cause}got an emulator of {len(emulation.z)} runs whose error at the "

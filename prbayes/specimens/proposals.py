@@ -41,7 +41,7 @@ from scipy.special import gammaln, ndtri, stdtrit
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import lattice, sobol
 from prbayes.numerics.threads import one_thread
 
 Indices = NDArray[np.intp]
@@ -474,10 +474,10 @@ class Proposals:
         counts = self._counts(count)
         mode = np.repeat(np.arange(len(counts)), counts)
         place = np.arange(len(mode)) - np.repeat(np.cumsum(counts) - counts, counts)
-        # The first coordinates of the sequence, the most even ones, are those of open directions.
-        u = sobol(int(counts.max()), d, seed)[:, ::-1]
         shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
-        u = np.clip((u[place] + shifts[mode]) % 1.0, 1e-12, 1 - 1e-12)
+        # The first coordinate, whose points are equidistant, is that of the most open direction.
+        u = (lattice(place, counts[mode], d)[:, ::-1] + shifts[mode]) % 1.0
+        u = np.clip(u, 1e-12, 1 - 1e-12)
         xi = np.where(self.open_axes[mode], stdtrit(self.degrees, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
