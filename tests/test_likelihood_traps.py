@@ -297,7 +297,7 @@ TRAPS = {
         partial(two_outputs, response=three_outputs),
     ),
     "readings above all responses": Trap(
-        "outside the range of all runs",
+        "outside the range of all runs|readings-misfit",
         partial(of_data, response=bell, change=lambda y: y + 1.1),
         partial(of_data, response=fold, change=lambda y: y),
     ),

@@ -12,6 +12,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, report
@@ -39,7 +40,7 @@ from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
-from prbayes.specimens.design import emulate, first_runs, most_runs
+from prbayes.specimens.design import emulate, first_runs, most_corrections, most_runs
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
 from prbayes.specimens.points import (
     SpecimenData,
@@ -115,7 +116,10 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
         f"{least} to {most} in all, in batches at the specimens' likely inputs, until the "
         f"emulator shifts no estimate by more than {likelihood.options.bias} standard deviations"
     )
-    return RunCost(max(least, computed), 0, most, growth)
+    further = most_corrections(len(likelihood.readings), likelihood.coordinates.size)
+    if further:
+        growth += f"; {further} more at the specimens' inputs if the response has a kink or a jump"
+    return RunCost(max(least, computed), 0, most + further, growth)
 
 
 def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
@@ -230,6 +234,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         populations.prior_specimens(),
         populations.posterior,
         coordinates.bounds,
+        populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
         options=replace(likelihood.options, n_first=first_run_count(likelihood)),
@@ -369,6 +374,20 @@ class Populations:
     def prior_specimens(self) -> Floats:
         """Return coordinates of specimens of the prior predictive population, (n, d)."""
         return PopulationDraws(self, self.hyperparameters.prior_thetas(2048, 0)).specimens(1)
+
+    def order(self) -> NDArray[np.intp]:
+        """Return the coordinates without conditions: those of the least known spread first."""
+        likelihood, coordinates = self.likelihood, self.likelihood.coordinates
+        values = variables_at(self.hyperparameters, self.hyperparameters.prior_thetas(256, 0))
+        group, rows = likelihood.by_group[0]
+        parents = likelihood.parents(values, group, rows[:1])
+        inputs, _ = likelihood.density.sampler(parents, 64, np.random.default_rng(0))
+        z = coordinates.of(inputs, 2)[..., ~coordinates.is_condition]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_sd = np.log(z.std(axis=1))
+        log_sd = log_sd[np.isfinite(log_sd).all(axis=1)]
+        spread = log_sd.std(axis=0) if len(log_sd) else np.zeros(z.shape[-1])
+        return np.argsort(-spread, kind="stable")
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""

@@ -632,7 +632,9 @@ def specimen_pool(
         seed=1,
     )
     proposals = fit_proposals(
-        data, preparation.emulation, preparation.proposals.residuals.population
+        data,
+        replace(preparation.emulation, offsets=None),
+        preparation.proposals.residuals.population,
     )
     draws = _Copies(PopulationDraws(Populations(likelihood), preparation.thetas), n)
     points, _ = agreeing_points(data, proposals, data.options.points, draws)

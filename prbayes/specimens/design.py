@@ -139,7 +139,7 @@ def emulate(
     # An emulator of other data needs one batch, which measures its error at these.
     batches, enough = 0, 2 if previous is None else 1
     if previous is not None:
-        emulation = replace(emulation, bias=np.inf)
+        emulation = replace(emulation, bias=np.inf, offsets=None)
     while True:
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
@@ -149,12 +149,24 @@ def emulate(
             surface = emulation.surface
             emulation = audited(run, data, emulation, plausible, rng)
             if emulation.bias <= 1.5 * data.options.bias:
-                if emulation.surface is not surface:
+                is_open = plausible.proposals.is_open(plausible.scale)
+                if (
+                    is_rough(data, emulation)
+                    and not is_open
+                    and most_corrections(*data.known.shape)
+                ):
+                    emulation = corrected(run, data, emulation, population)
+                if emulation.surface is not surface or emulation.offsets is not None:
                     plausible = plausible.of_emulation(data, emulation)
                 return emulation, *plausible.agreeing(data), plausible.draws
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
-            require_accurate(data, emulation)
+            if not likely.proposals.is_open() and most_corrections(*data.known.shape):
+                emulation = corrected(run, data, emulation, population)
+            if emulation.bias > data.options.bias:
+                require_accurate(data, emulation)
+            plausible = Plausible.of(data, emulation, wider(population))
+            return emulation, *plausible.agreeing(data), plausible.draws
         # Batches of half the runs there are, a quarter near the end; at most three times the first.
         share = 2 if emulation.bias > 3 * data.options.bias else 4
         growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
@@ -385,6 +397,45 @@ def audited(
     used = _near_population(data, all_z, population)
     surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface, used)
     return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias)
+
+
+def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
+    """Return whether the emulator's error is not small beside the scatter of the readings."""
+    return bool((emulation.error > largest * data.readings.robust_spread()).any())
+
+
+def most_corrections(specimens: int, dimensions: int) -> int:
+    """Return the largest number of runs of corrections: three of each of not too many specimens."""
+    return 3 * specimens if 2 * specimens <= most_runs(dimensions) else 0
+
+
+def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: Normal) -> Emulation:
+    """Return the emulation with the response itself at the likely inputs of each specimen.
+
+    A kink or a jump between runs leaves an error that more runs hardly decrease. The output less
+    that of the surface, at the best mode of a specimen, is added to the surface; the mode moves,
+    and the change in the next round is the error that is left.
+    """
+    offsets = np.zeros(data.readings.values.shape)
+    for seed in range(most_corrections(*data.known.shape) // len(offsets)):
+        likely = Likely.of(data, emulation, population, seed)
+        modes = likely.proposals.modes
+        mass = np.zeros(len(modes.specimen))
+        np.add.at(mass, likely.points.mode.ravel(), likely.weights.ravel())
+        order = np.lexsort((-mass, modes.specimen))
+        rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
+        z = likely.proposals.residuals.coordinates(modes.specimen[rows], modes.a[rows])
+        outputs = run(z)
+        misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
+        offsets[modes.specimen[rows]] += np.nan_to_num(misfit)
+        all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, outputs])
+        error, bias = error_and_bias(data, emulation, likely, z, modes.specimen[rows], misfit)
+        emulation = replace(
+            emulation, z=all_z, y=all_y, error=error, bias=bias, offsets=offsets.copy()
+        )
+        if seed and not is_rough(data, emulation):
+            break
+    return emulation
 
 
 def require_accurate(data: SpecimenData, emulation: Emulation) -> None:

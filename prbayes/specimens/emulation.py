@@ -101,6 +101,8 @@ class Emulation:
     bias: float
     # (2, d): ends beyond which a specimen has the response at the end; by default of the runs.
     ends: Floats | None = None
+    # (N, m): output less that of the surface at the likely inputs of each specimen
+    offsets: Floats | None = None
 
     @cached_property
     def box(self) -> Floats:

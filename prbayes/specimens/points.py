@@ -123,6 +123,8 @@ class SpecimenData:
     prior: Floats  # (n, d): specimens of the prior predictive population
     posterior: Posterior  # points, their numbers and a smoothing to draws
     bounds: Floats | None = None  # (2, d): ends of data sets of the prior
+    # (free,): the columns that are not known, those whose population may be narrow first
+    order: NDArray[np.intp] | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
     gross_errors: bool = False  # whether readings of single specimens may be anything
     options: SpecimenOptions = SpecimenOptions()
@@ -167,8 +169,18 @@ class SpecimenData:
         error = np.where(readings.is_relative, 0.0, readings.error)
         error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
         target = np.where(is_read, readings.values, 0.0)
+        if emulation.offsets is not None:
+            target = target - emulation.offsets
         return Residuals(
-            emulation, target, emulation.error, error, relative, population, self.known, self.box
+            emulation,
+            target,
+            emulation.error,
+            error,
+            relative,
+            population,
+            self.known,
+            self.box,
+            self.order,
         )
 
 
@@ -240,6 +252,8 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
     outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
+    if emulation.offsets is not None:
+        outputs = outputs + emulation.offsets[:, None]
     log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)

@@ -69,6 +69,8 @@ class Residuals:
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
     # (2, d): range in which inputs are possible; an emulator is arbitrary far beyond its runs.
     box: Floats | None = None
+    # (free,): the columns that are not known, those whose population may be narrow first.
+    order: Indices | None = None
 
     @property
     def free(self) -> Indices:
@@ -311,8 +313,18 @@ class Proposals:
         orientation = np.sign(np.linalg.det(vt))
         share = 1 / np.bincount(modes.specimen)[modes.specimen]
         log_det = -np.log(inverse).sum(axis=1)
-        maps = inverse[:, :, None] * vt, readings, orientation, log_det
-        return cls(residuals, modes, *maps, scale**2 < cls.least_precision, share)
+        inputs = inverse[:, :, None] * vt
+        is_open = scale**2 < cls.least_precision
+        # Open directions are rotated: the first input of the order changes along the first one
+        # alone, the next along two. Equidistant points of narrow populations follow from that.
+        order = np.arange(d) if residuals.order is None else residuals.order
+        rotation, _ = np.linalg.qr((is_open[:, :, None] * inputs)[:, :, order])
+        orientation = orientation * np.sign(np.linalg.det(rotation))
+        back = rotation.swapaxes(1, 2)
+        first = np.arange(d) < is_open.sum(axis=1, keepdims=True)
+        return cls(
+            residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
+        )
 
     def rows(self, index: Indices) -> Proposals:
         """Return the proposals of selected modes, with equal mixing weights."""
@@ -475,8 +487,7 @@ class Proposals:
         mode = np.repeat(np.arange(len(counts)), counts)
         place = np.arange(len(mode)) - np.repeat(np.cumsum(counts) - counts, counts)
         shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
-        # The first coordinate, whose points are equidistant, is that of the most open direction.
-        u = (lattice(place, counts[mode], d)[:, ::-1] + shifts[mode]) % 1.0
+        u = (lattice(place, counts[mode], d) + shifts[mode]) % 1.0
         u = np.clip(u, 1e-12, 1 - 1e-12)
         xi = np.where(self.open_axes[mode], stdtrit(self.degrees, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)

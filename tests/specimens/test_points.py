@@ -191,7 +191,7 @@ def test_the_log_proposal_serves_another_error() -> None:
 
 def test_points_are_doubled_until_both_halves_agree() -> None:
     # Means along the open direction are not identified, and populations are narrow.
-    draws = draws_of(2, mean_sd=0.0, sd=0.005)
+    draws = draws_of(2, mean_sd=0.0, sd=0.01)
     along = np.linspace(-0.4, 0.4, len(draws.means))[:, None] * [[1.0, -1.0]]
     draws = replace(draws, means=draws.means + along)
     a = np.ones((1, 2))
