@@ -11,7 +11,6 @@ those of the first ones have none; their observed variables are parameters of th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.conditions import at_conditions
@@ -44,6 +44,7 @@ from prbayes.model.random_variable import (
 )
 from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.model.unknown_error import ReadingDensity
+from prbayes.numerics.threads import one_thread
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
@@ -169,6 +170,7 @@ def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
     return values[str(share.name)] if isinstance(share, TensorVariable) else share
 
 
+@one_thread()
 def _with_unknown_error(
     likelihood: SpecimenLikelihood,
     errors: Floats,
@@ -182,11 +184,9 @@ def _with_unknown_error(
     The points are ``columns`` of all points.
     """
     result = np.empty((len(errors), len(rows)))
-    for k, error in enumerate(errors):
-        log_a = points.log_a + _readings_log_density(likelihood, error, np)[rows, columns]
-        population = [parent[k : k + 1] for parent in parents]
-        at_error = replace(points, log_a=log_a)
-        (result[k],) = likelihood.density.log_likelihoods(population, at_error)
+    for k, log_p in enumerate(likelihood.density.at_points(parents, points)):
+        of_readings = _readings_log_density(likelihood, errors[k], np)[rows, columns]
+        result[k] = log_sum_exp(log_p + points.log_a + of_readings)
     return result
 
 

@@ -16,7 +16,7 @@ Normal populations of specimens that are known by weighted points are fitted by 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -253,6 +253,32 @@ class PopulationDensity:
             narrow = [parent[is_rounded] for parent in parents]
             result[:, is_rounded] = self._by_graph(narrow, points).T
         return result.T
+
+    def at_points(self, parents: Sequence[Floats], points: WeightedPoints) -> Iterator[Floats]:
+        """Yield log p(x_ik | theta), (N, K), of each population, for numbers A of its own."""
+        form, (n, count) = points.form, points.log_a.shape
+        flat = [np.ascontiguousarray(v.reshape(n * count, *v.shape[2:])) for v in points.x]
+        if form is not None:
+            size, has_covariates = len(form.anchors[0]), bool(self.inputs.covariates) and n > 1
+            anchors = [np.concatenate([v] * (n if has_covariates else 1)) for v in form.anchors]
+            with np.errstate(all="ignore"):
+                at_each = self.inputs.for_points(parents, size)
+                (at_anchors,) = self._log_density(*at_each, *anchors)
+            natural, is_rounded = form.natural_parameters(at_anchors.reshape(-1, size))
+            natural = natural.reshape(len(parents[0]), -1, size, 1)
+            is_rounded = is_rounded.reshape(len(parents[0]), -1).any(axis=1)
+            statistics = np.ascontiguousarray(form.statistics.reshape(-1, count, n).T)
+            is_outside = ~form.is_inside.reshape(count, n).T
+        for s in range(len(parents[0])):
+            if form is None or is_rounded[s]:
+                of_draw = self.inputs.for_points([p[s : s + 1] for p in parents], count)
+                with np.errstate(all="ignore"):
+                    (logs,) = self._log_density(*of_draw, *flat)
+                yield np.where(np.isnan(logs), -np.inf, logs).reshape(n, count)
+                continue
+            logs = (statistics @ natural[s])[..., 0]
+            logs[is_outside] = -np.inf
+            yield logs
 
     def _by_specimen(
         self, parents: Sequence[Floats], points: WeightedPoints, form: ExponentialForm
