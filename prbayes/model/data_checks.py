@@ -23,7 +23,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
-from prbayes.specimens.proposals import Modes, Proposals
+from prbayes.specimens.proposals import Modes
 
 # Data beside the first responses, for all metrics.
 
@@ -539,26 +539,6 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
     away = np.median(readings, axis=0) - runs.mean(axis=0)
     direction = np.linalg.pinv(np.cov(runs.T), rcond=1e-6) @ away
     return int((readings @ direction > (runs @ direction).max()).sum())
-
-
-def refuse_undetermined(
-    name: str, proposals: Proposals, inputs: Sequence[str], smallest: float = 3.0
-) -> None:
-    """Raise if readings leave a direction of the inputs open, although there are enough outputs.
-
-    Along such a direction the outputs change over half the prior's range by less than a few errors
-    of the emulator, at the median mode. Responses without such a direction have 97 errors and more,
-    those with one less than .01.
-    """
-    residuals, modes = proposals.residuals, proposals.modes
-    if len(inputs) < 2 or not len(modes.a):
-        return
-    emulation = residuals.response
-    _, jacobian = emulation(residuals.coordinates(modes.specimen, modes.a))
-    scaled = jacobian / emulation.error[:, None]
-    values, directions = _singular(scaled)
-    if len(values) and np.median(values[:, -1]) < smallest:
-        raise _undetermined(name, scaled.shape[1], directions, inputs)
 
 
 def refuse_unused_inputs(

@@ -229,7 +229,8 @@ class PopulationDensity:
         if form is None:
             return self._by_graph(parents, points)
         if self.inputs.covariates and n > 1:
-            return self._by_specimen(parents, points, form)
+            logs = self.at_points(parents, points)
+            return np.stack([log_sum_exp(of_draw + log_a) for of_draw in logs])
         at_each = self.inputs.for_points(parents, len(form.anchors[0]))
         with np.errstate(all="ignore"):
             (at_anchors,) = self._log_density(*at_each, *form.anchors)
@@ -280,31 +281,6 @@ class PopulationDensity:
             logs[is_outside] = -np.inf
             yield logs
 
-    def _by_specimen(
-        self, parents: Sequence[Floats], points: WeightedPoints, form: ExponentialForm
-    ) -> Floats:
-        """Return log-likelihoods where each specimen has a population of its own."""
-        n, count = points.log_a.shape
-        size = len(form.anchors[0])
-        anchors = [np.concatenate([values] * n) for values in form.anchors]
-        result = np.empty((len(parents[0]), n))
-        step = max(1, IN_CACHE // points.log_a.size)
-        statistics = form.statistics.reshape(-1, count, n).T  # (N, K, q + 1)
-        log_a = np.where(form.is_inside.reshape(count, n).T, points.log_a, -np.inf)
-        for first in range(0, len(result), step):
-            block = [parent[first : first + step] for parent in parents]
-            with np.errstate(all="ignore"):
-                (at_anchors,) = self._log_density(*self.inputs.for_points(block, size), *anchors)
-            natural, is_rounded = form.natural_parameters(at_anchors.reshape(-1, size))
-            natural = natural.reshape(-1, n, size).transpose(1, 2, 0)
-            exponents = statistics @ natural + log_a[..., None]
-            logs = _log_sum_exp_first(np.maximum(exponents, -1e300).swapaxes(0, 1)).T
-            narrow = is_rounded.reshape(-1, n).any(axis=1)
-            if narrow.any():
-                logs[narrow] = self._by_graph([parent[narrow] for parent in block], points)
-            result[first : first + step] = logs
-        return result
-
     def _by_graph(self, parents: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return log-likelihoods by the compiled log-density."""
         log_a = points.log_a
@@ -353,53 +329,29 @@ def fit_normal(z: Floats, log_a: Floats, start: Any = None) -> Normal:
 
     With a population as the start, five steps are taken.
     """
-    if start is not None:
-        start = start.mean[None], (start.root @ start.root.T)[None]
-    mean, covariance = _fit(z, log_a, start=start)
-    return mean[0], np.linalg.cholesky(covariance)[0]
-
-
-def bootstrap_normals(z: Floats, log_a: Floats, draws: int, seed: int) -> list[Normal]:
-    """Fit normal populations to Bayesian bootstrap samples of the specimens."""
-    n, count, _ = z.shape
-    rng = np.random.default_rng([seed, 7])
-    start = _fit(z, log_a)
-    shares = np.stack([rng.dirichlet(np.ones(n)) for _ in range(draws)])
-    # A bootstrap sample has its fit near that of all specimens. In blocks, for memory's sake.
-    block = max(1, IN_CACHE // (n * count))
-    fits = [
-        _fit(z, log_a, shares[first : first + block], start) for first in range(0, draws, block)
-    ]
-    mean, covariance = (np.concatenate(parts) for parts in zip(*fits, strict=True))
-    return list(zip(mean, np.linalg.cholesky(covariance), strict=True))
-
-
-def _fit(
-    z: Floats, log_a: Floats, shares: Floats | None = None, start: Normal | None = None
-) -> tuple[Floats, Floats]:
-    """Return means (B, d) and covariances (B, d, d) for shares (B, N) of the specimens."""
-    n, _, d = z.shape
-    columns = np.ascontiguousarray(z.reshape(-1, d).T)
+    columns = np.ascontiguousarray(z.reshape(-1, z.shape[-1]).T)
     prior = 1e-12 * np.diag(np.maximum(columns.var(axis=1), 1e-300))
 
     def moments(weights: Floats) -> tuple[Floats, Floats]:
-        weights = weights.reshape(len(weights), -1)
-        mean = weights @ columns.T
-        centred = columns - mean[..., None]
-        return mean, (centred * weights[:, None]) @ centred.swapaxes(1, 2) + prior
+        flat = weights.ravel() / len(weights)
+        mean = columns @ flat
+        centred = columns - mean[:, None]
+        return mean, (centred * flat) @ centred.T + prior
 
-    shares = np.full((1, n), 1 / n) if shares is None else shares
-    mean, covariance = moments(normalised_weights(log_a)[None] / n) if start is None else start
+    if start is None:
+        mean, covariance = moments(normalised_weights(log_a))
+    else:
+        mean, covariance = start.mean, start.root @ start.root.T
     for _ in range(30 if start is None else 5):
         log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
         previous_mean, previous_covariance = mean, covariance
-        mean, covariance = moments(normalised_weights(log_w) * shares[..., None])
-        variance = np.einsum("...dd->...d", covariance)
-        change = np.einsum("...dd->...d", covariance - previous_covariance) / variance
+        mean, covariance = moments(normalised_weights(log_w))
+        variance = np.diag(covariance)
+        change = np.diag(covariance - previous_covariance) / variance
         shift = (mean - previous_mean) / np.sqrt(variance)
         if max(np.abs(change).max(), np.abs(shift).max()) < 1e-9:
             break
-    return mean, covariance
+    return mean, np.linalg.cholesky(covariance)
 
 
 def normalised_weights(log_w: Floats) -> Floats:
@@ -409,13 +361,9 @@ def normalised_weights(log_w: Floats) -> Floats:
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
-    """Return log-densities of points (..., d) in one normal population, (...), or in B, (B, ...).
-
-    Means have shape (d,) or (B, d), and lower Cholesky factors of covariances one axis more.
-    """
+    """Return log-densities of points (..., d) in a normal population, (...)."""
     d = z.shape[-1]
-    centred = np.ascontiguousarray(z.reshape(-1, d).T) - mean[..., None]
-    standard = np.linalg.inv(root) @ centred
-    square = np.einsum("...dk,...dk->...k", standard, standard)
-    constant = np.log(np.einsum("...dd->...d", root)).sum(axis=-1) + d / 2 * np.log(2 * np.pi)
-    return np.asarray(-0.5 * square - constant[..., None]).reshape(*mean.shape[:-1], *z.shape[:-1])
+    centred = np.ascontiguousarray(z.reshape(-1, d).T) - mean[:, None]
+    square = np.square(np.linalg.inv(root) @ centred).sum(axis=0)
+    constant = np.log(np.diag(root)).sum() + d / 2 * np.log(2 * np.pi)
+    return np.asarray(-0.5 * square - constant).reshape(z.shape[:-1])

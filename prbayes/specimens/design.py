@@ -414,8 +414,10 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
     A kink or a jump between runs leaves an error that more runs hardly decrease. The output less
     that of the surface, at the best mode of a specimen, is added to the surface; the mode moves,
-    and the change in the next round is the error that is left.
+    and the change in the next round is the error that is left. Where no inputs reproduce most of
+    the specimens, the error stays.
     """
+    uncorrected = emulation
     offsets = np.zeros(data.readings.values.shape)
     for seed in range(most_corrections(*data.known.shape) // len(offsets)):
         likely = Likely.of(data, emulation, population, seed)
@@ -435,6 +437,9 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         )
         if seed and not is_rough(data, emulation):
             break
+    misfit = Likely.of(data, emulation, population, 0).proposals.modes.best_misfit()
+    if np.median(misfit) > 50:
+        return replace(uncorrected, z=emulation.z, y=emulation.y)
     return emulation
 
 

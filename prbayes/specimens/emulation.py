@@ -225,14 +225,17 @@ def predicted_bias(shift: Floats, x: Floats, size: int) -> Floats:
     return np.stack([mean_bias, sd_bias])
 
 
-def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> tuple[float, float]:
+def half_difference(
+    log_likelihoods_a: Floats, log_likelihoods_b: Floats
+) -> tuple[float, float, float]:
     """Return the Monte Carlo error of the log-likelihood over the posterior, in nats.
 
     sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2 over posterior draws theta_s, with
     points of two independent halves a and b, both (S, N). A tilt of one nat for each posterior
     standard deviation moves the posterior mean by one standard deviation. A specimen without a
     point in one of the halves is left out. The second number is the standard deviation of a normal
-    distribution with the same deciles. Size and power: docs/likelihood.md.
+    distribution with the same deciles, and the third that of a constant. Size and power:
+    docs/likelihood.md.
     """
     is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
     with np.errstate(invalid="ignore"):
@@ -240,4 +243,5 @@ def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> tup
     difference = by_specimen.sum(axis=1) / 2
     low, high = np.quantile(difference, [0.1, 0.9])
     by_deciles = (high - low) / (ndtri(0.9) - ndtri(0.1))
-    return float(difference.std()), float(min(by_deciles, difference.std()))
+    total = float(difference.std())
+    return total, min(float(by_deciles), total), abs(float(difference.mean()))

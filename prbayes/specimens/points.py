@@ -65,7 +65,7 @@ class SpecimenPoints:
     # (N, K): log of the number of points times the proposal density: ``log_a`` without the density
     # of the readings, for an error that is not known in advance
     log_proposal: Floats
-    n_roots: NDArray[np.intp]  # (N,): number of modes of the readings' density
+    n_roots: NDArray[np.intp]  # (N,): modes of the readings' density with a thousandth of the mass
     mode: NDArray[np.intp]  # (N, K): mode whose proposal drew the point
     difference: float = np.nan  # the half difference of the log-likelihoods
 
@@ -311,17 +311,28 @@ class Plausible:
 
     def agreeing(self, data: SpecimenData) -> tuple[SpecimenPoints, Proposals]:
         """Return points whose halves agree at the draws."""
-        proposals, points = self.proposals, self.points
+        proposals, points, modes = self.proposals, self.points, self.proposals.modes
+        population = normal_of(self.draws.specimens()[:, data.free])
+        # A branch that only a wide population reaches has its points, too.
+        wide = Normal(population.mean, 2.5 * population.root)
+        masses = [
+            np.bincount(
+                points.mode.ravel(),
+                likely_weights(data, points, reference).ravel(),
+                len(proposals.share),
+            )
+            for reference in (population, wide)
+        ]
         # A scale that is not likely needs its points all the same.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
-            population = normal_of(self.draws.specimens()[:, data.free])
-            # A branch that only a wide population reaches has its points, too.
-            wide = Normal(population.mean, 2.5 * population.root)
-            weights = likely_weights(data, points, population)
-            weights += likely_weights(data, points, wide)
-            mass = np.bincount(points.mode.ravel(), weights.ravel(), len(proposals.share))
-            proposals = proposals.with_shares(mass)
-        return agreeing_points(data, proposals, self.count, self.draws, self.scale)
+            proposals = proposals.with_shares(masses[0] + masses[1])
+        result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
+        largest = np.zeros(len(data.known))
+        np.maximum.at(largest, modes.specimen, masses[0])
+        scale = modes.scale[np.abs(modes.scale - self.scale).argmin()]
+        counts = (masses[0] > 1e-3 * largest[modes.specimen]) & (modes.scale == scale)
+        n_roots = np.bincount(modes.specimen[counts], minlength=len(data.known))
+        return replace(result, n_roots=np.maximum(n_roots, 1)), proposals
 
 
 def specimen_points(
@@ -386,7 +397,8 @@ def agreeing_points(
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
         difference = _half_difference(data, proposals, halves, draws, (scale,))
         is_cheap = 4 * count * len(data.readings) <= options.cheap_in_all
-        if difference[0 if is_cheap else 1] <= largest and (
+        is_precise = difference[0 if is_cheap else 1] <= largest and difference[2] <= 4 * largest
+        if is_precise and (
             len(data.scales) == 1
             or count >= 512
             or _half_difference(data, proposals, halves, draws, data.scales)[0] <= over_scales
@@ -403,11 +415,11 @@ def _half_difference(
     halves: Sequence[SpecimenPoints],
     draws: Draws,
     scales: Sequence[float],
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Return the Monte Carlo error over draws, and over scales of an unknown error.
 
     The second number has no contribution of the few populations that are narrower than the
-    distances between points.
+    distances between points. The third is that of a constant.
     """
     error, logs = proposals.residuals.emulator_error, []
     for half in halves:
@@ -418,7 +430,7 @@ def _half_difference(
         typical = typical_specimens(proposals.modes, len(data.readings))
         a, b = a[:, typical], b[:, typical]
     finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf)
+    return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf, np.inf)
 
 
 def typical_specimens(
@@ -459,7 +471,7 @@ def reliable_draws(
         points = at_scale(data, joined(*halves), proposals.residuals.emulator_error, scale)
         if not narrows:
             draws = data.posterior(points.z, points.log_a, None)
-            difference, _ = _half_difference(data, proposals, halves, draws, (scale,))
+            difference, *_ = _half_difference(data, proposals, halves, draws, (scale,))
             limit = per_hyperparameter(draws)
             if difference <= limit:
                 return draws, points, proposals

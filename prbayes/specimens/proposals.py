@@ -103,6 +103,8 @@ class Residuals:
             i = specimen[block]
             z = self.coordinates(i, a[block])
             values, jacobian = self.response(z)
+            # Differences beside inputs without a response have no slopes.
+            values[~np.isfinite(jacobian).all(axis=(1, 2))] = np.nan
             if self.box is not None:
                 values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
             is_read, factor = np.isfinite(self.error[i]), factors[block]
@@ -145,6 +147,12 @@ class Modes:
     def rows(self, index: Indices) -> Modes:
         """Return selected modes."""
         return Modes(*(values[index] for values in self.arrays))
+
+    def best_misfit(self) -> Floats:
+        """Return the least misfit of each specimen that has a mode, (N,)."""
+        least = np.full(self.specimen.max() + 1, np.inf)
+        np.minimum.at(least, self.specimen, self.misfit)
+        return least[np.unique(self.specimen)]
 
     @property
     def arrays(self) -> list[NDArray[Any]]:

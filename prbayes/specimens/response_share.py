@@ -105,7 +105,7 @@ def response_share(
         raise DesignError(
             f"{name}: got a failing region (NaN) whose boundary still changes the log-likelihood "
             f"by {change:.2g} nats after {batches} batches of {batch} runs there, expected at most "
-            f"{largest}; repair the response, narrow the priors, or use "
+            f"{largest / 4}; repair the response, narrow the priors, or use "
             "metric=prb.ProbabilityResidual()"
         )
     draws = posterior(share)
