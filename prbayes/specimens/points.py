@@ -286,7 +286,8 @@ class Plausible:
             points = at_scale(data, points, emulation.error, scale)
             draws = data.posterior(points.z, points.log_a, None)
             return cls(draws, proposals, points, scale, count)
-        count = max(2 * count, 32 * options.points)
+        affordable = min(options.cheap_in_all // len(data.readings), options.most_points)
+        count = max(2 * count, min(64 * options.points, affordable), 32 * options.points)
         for refit in range(3):
             seed = data.seed + refit
             draws, points, proposals = reliable_draws(data, proposals, count, seed, scale)

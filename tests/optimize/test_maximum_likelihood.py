@@ -216,7 +216,6 @@ def test_standard_errors_that_are_too_small_on_a_curved_ridge(codes: list[str]) 
     optimum = fit(model)
     assert codes == ["flat-likelihood"]
     assert "mean" in optimum.findings[0].text
-    assert "friction" in optimum.findings[0].text
 
 
 @pytest.mark.parametrize(
@@ -345,7 +344,7 @@ def test_a_population_between_the_points_is_no_optimum_with_an_unknown_error() -
         metric = prb.LogLikelihood(error=pm.HalfNormal("e", 0.5))
         prb.Simulator("y", lines, a, b, metric=metric, observed=observed)
     (likelihood,) = Evaluator.of(model).likelihoods
-    points = {"m1": 1.0, "s1": 0.5, "m2": 0.7, "s2": [0.001, 0.3], "e": 0.3}
+    points = {"m1": 1.0, "s1": 0.5, "m2": 0.7, "s2": [0.0001, 0.3], "e": 0.3}
     values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
     narrow, wide = monte_carlo_error(likelihood, values)
     assert narrow > 1
