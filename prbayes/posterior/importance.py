@@ -132,7 +132,7 @@ def importance_sample(
     options: ImportanceOptions = ImportanceOptions(),
     prior: Prior | None = None,
 ) -> ImportanceSample:
-    """Return ``size`` draws by importance sampling around modes, later also from the prior."""
+    """Return ``size`` draws by importance sampling around modes and from the prior."""
     masses = np.array([mode.log_mass for mode in modes])
     # A mode whose mass the approximation gets wrong still has points.
     shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
@@ -154,6 +154,11 @@ def importance_sample(
     elif pilot < len(points):
         log_p = np.concatenate([log_p, log_density(points[pilot:])])
     proposals, n_prior = [(proposal, len(points))], 0
+    if prior is not None:
+        # A ridge between modes has no points of theirs.
+        n_prior = int(options.prior_share * len(points))
+        new = prior[0](n_prior, seed)
+        points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
     rng = np.random.default_rng([seed, 1])
     for round_ in range(1, options.rounds + 1):
         terms = [

@@ -345,13 +345,16 @@ def _explored(
     z[:, is_condition] = of_specimens[:, is_condition]
     readings, spread = data.readings, data.readings.spread()
     # What the emulator says of a place without runs may be wrong: its own deviation counts.
-    deviation = spread + 3 * np.sqrt(emulation.surface.variance(z))
+    error = np.sqrt(emulation.surface.variance(z))
+    deviation = spread + 3 * error
     values = emulation.surface.values(z)
     low = np.nanmin(readings.values, axis=0) - deviation
     high = np.nanmax(readings.values, axis=0) + deviation
     is_possible = ((values >= low) & (values <= high)).all(axis=1)
     if is_possible.sum() >= count:
-        z = z[is_possible]
+        z, error = z[is_possible], error[is_possible]
+    order = np.argsort(-(error / spread).max(axis=1), kind="stable")
+    z = z[order[: max(count, len(z) // 4)]]
     scale = data.scale(data.inner[:, data.free].std(axis=0))
     return _farthest(runs, z, count, scale)
 
