@@ -196,18 +196,25 @@ def extended(
     scale = likely.scale(data)
     # Specimens near the likely ones, and others of the population: the emulator predicts them.
     near, _ = likely.sample(8 * count, rng)
-    of_population = near.copy()
-    noise = rng.standard_normal((2, len(near), len(data.free)))
-    near[:, data.free] += 0.4 * scale[data.free] * noise[0]
-    root = likely.population.root
-    of_population[:, data.free] = likely.population.mean + noise[1] @ root.T
-    around = np.concatenate([near, of_population])
+    of_population = near.repeat(4, axis=0)
+    noise = rng.standard_normal((len(near), len(data.free)))
+    near[:, data.free] += 0.4 * scale[data.free] * noise
+    noise = 2.0 * rng.standard_normal((len(of_population), len(data.free)))
+    of_population[:, data.free] = likely.population.mean + noise @ likely.population.root.T
+    prior = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
+    is_condition = ~np.isnan(data.known[0])
+    of_specimens = data.known[rng.integers(0, len(data.known), len(prior))]
+    prior[:, is_condition] = of_specimens[:, is_condition]
+    of_prior = data.scale(data.inner[:, data.free].std(axis=0))
     runs = np.concatenate([emulation.z, sampled, possible])
     # Where specimens have few inputs, there are runs at them already.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
-    far = _farthest(runs, around, max(2, count - n_explored - n_new), scale)
-    explored = _explored(data, emulation, np.concatenate([runs, far]), n_explored, rng)
-    distant = np.concatenate([far, explored])
+    far = _farthest(runs, near, max(2, count - n_explored - n_new), scale)
+    distant = [far, _explored(data, emulation, runs, of_population, 2, scale)]
+    distant.append(
+        _explored(data, emulation, np.concatenate([runs, *distant]), prior, n_explored, of_prior)
+    )
+    distant = np.concatenate(distant)
     return joined(run, data, emulation, likely, sampled, specimens, possible, distant)
 
 
@@ -336,13 +343,12 @@ def _farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Fl
 
 
 def _explored(
-    data: SpecimenData, emulation: Emulation, runs: Floats, count: int, rng: np.random.Generator
+    data: SpecimenData, emulation: Emulation, runs: Floats, z: Floats, count: int, scale: Floats
 ) -> Floats:
-    """Return points of the prior, far from all runs, at which a specimen could lie."""
-    z = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
-    is_condition = ~np.isnan(data.known[0])
-    of_specimens = data.known[rng.integers(0, len(data.known), len(z))]
-    z[:, is_condition] = of_specimens[:, is_condition]
+    """Return points of a sample z, (n, d), that are uncertain, and at which a specimen could lie.
+
+    They are far from all runs.
+    """
     readings, spread = data.readings, data.readings.spread()
     # What the emulator says of a place without runs may be wrong: its own deviation counts.
     error = np.sqrt(emulation.surface.variance(z))
@@ -355,7 +361,6 @@ def _explored(
         z, error = z[is_possible], error[is_possible]
     order = np.argsort(-(error / spread).max(axis=1), kind="stable")
     z = z[order[: max(count, len(z) // 4)]]
-    scale = data.scale(data.inner[:, data.free].std(axis=0))
     return _farthest(runs, z, count, scale)
 
 
