@@ -209,7 +209,7 @@ def extended(
     runs = np.concatenate([emulation.z, sampled, possible])
     # Where specimens have few inputs, there are runs at them already.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
-    far = _farthest(runs, near, max(2, count - n_explored - n_new), scale)
+    far = _farthest(runs, near, max(1, count - n_explored - n_new - 2), scale)
     distant = [far, _explored(data, emulation, runs, of_population, 2, scale)]
     distant.append(
         _explored(data, emulation, np.concatenate([runs, *distant]), prior, n_explored, of_prior)
