@@ -210,11 +210,10 @@ def extended(
     # Where specimens have few inputs, there are runs at them already.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
     far = _farthest(runs, near, max(1, count - n_explored - n_new - 2), scale)
-    distant = [far, _explored(data, emulation, runs, of_population, 2, scale)]
-    distant.append(
-        _explored(data, emulation, np.concatenate([runs, *distant]), prior, n_explored, of_prior)
-    )
-    distant = np.concatenate(distant)
+    uncertain = _explored(data, emulation, runs, of_population, 2, scale)
+    runs = np.concatenate([runs, far, uncertain])
+    explored = _explored(data, emulation, runs, prior, n_explored, of_prior)
+    distant = np.concatenate([far, uncertain, explored])
     return joined(run, data, emulation, likely, sampled, specimens, possible, distant)
 
 
