@@ -319,9 +319,10 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     (likelihood,) = optimum.evaluator.likelihoods
     at_optimum = {name: np.atleast_1d(value) for name, value in optimum.point.items()}
     (error,) = monte_carlo_error(likelihood, at_optimum)
-    assert error < 0.2
-    assert -optimum.discrepancy == pytest.approx(exact, abs=3 * error)
-    points = {"m1": 0.8308, "s1": [0.00104, 0.2], "m2": 2.306, "s2": 0.5255}
+    # On a flat ridge, three standard deviations of the prior away: an optimum is known to half a nat.
+    assert error < 0.5
+    assert -optimum.discrepancy == pytest.approx(exact, abs=0.5)
+    points = {"m1": 1.0, "s1": [0.0005, 0.2], "m2": 2.0, "s2": 0.3}
     values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
     narrow, wide = monte_carlo_error(likelihood, values)
     assert narrow > 1
