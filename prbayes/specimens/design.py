@@ -421,8 +421,8 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
     A kink or a jump between runs leaves an error that more runs hardly decrease. The output less
     that of the surface, at the best mode of a specimen, is added to the surface; the mode moves,
-    and the change in the next round is the error that is left. Where no inputs reproduce most of
-    the specimens, the error stays.
+    and the change in the next round is the error that is left. The error stays where specimens
+    have several likely modes, or no inputs reproduce most of them.
     """
     uncorrected = emulation
     offsets = np.zeros(data.readings.values.shape)
@@ -431,6 +431,8 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         modes = likely.proposals.modes
         mass = np.zeros(len(modes.specimen))
         np.add.at(mass, likely.points.mode.ravel(), likely.weights.ravel())
+        if (np.bincount(modes.specimen[mass > 0.01]) > 1).any():
+            return uncorrected
         order = np.lexsort((-mass, modes.specimen))
         rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
         z = likely.proposals.residuals.coordinates(modes.specimen[rows], modes.a[rows])
@@ -455,12 +457,11 @@ def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
     share = emulation.error / data.readings.spread()
     worst = int(np.argmax(share))
     output = f"output {worst}" if len(share) > 1 else "the output"
-    is_rough = share[worst] > 0.03
-    cause = "the response is not smooth enough for prb.LogLikelihood(): " if is_rough else ""
     raise DesignError(
-        f"{data.name}: {cause}got an emulator of {len(emulation.z)} runs whose error at the "
-        f"specimens is {share[worst]:.2g} times the scatter of {output} and would shift a mean or "
-        f"standard deviation of an input by {emulation.bias:.2g} posterior standard deviations, "
-        f"expected at most {data.options.bias}; narrow the priors, ask for more first runs with "
-        "prb.Reweighted(n), or use metric=prb.ProbabilityResidual()"
+        f"{data.name}: the response is not smooth enough for prb.LogLikelihood() in the range of "
+        f"the priors: got an emulator of {len(emulation.z)} runs whose error at the specimens is "
+        f"{share[worst]:.2g} times the scatter of {output} and would shift an estimate by "
+        f"{emulation.bias:.2g} posterior standard deviations, expected at most "
+        f"{data.options.bias}; narrow the priors, ask for more first runs with prb.Reweighted(n), "
+        "or use metric=prb.ProbabilityResidual()"
     )
