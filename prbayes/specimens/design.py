@@ -209,8 +209,8 @@ def extended(
     runs = np.concatenate([emulation.z, sampled, possible])
     # Where specimens have few inputs, there are runs at them already.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
-    far = _farthest(runs, near, max(1, count - n_explored - n_new - 2), scale)
-    uncertain = _explored(data, emulation, runs, of_population, 2, scale)
+    far = _farthest(runs, near, max(0, count - n_explored - n_new - 3), scale)
+    uncertain = _explored(data, emulation, runs, of_population, 3, scale)
     runs = np.concatenate([runs, far, uncertain])
     explored = _explored(data, emulation, runs, prior, n_explored, of_prior)
     distant = np.concatenate([far, uncertain, explored])
