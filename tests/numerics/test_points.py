@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes.numerics.points import base_points, monte_carlo, points_from, sobol
+from prbayes.numerics.points import base_points, lattice, monte_carlo, points_from, sobol
 
 
 @pytest.mark.parametrize("points", [sobol, monte_carlo])
@@ -27,6 +27,15 @@ def test_only_sobol_points_fill_every_cell_of_dyadic_grids() -> None:
             for points in (sobol, monte_carlo)
         ]
         assert filled[0] == 64 > filled[1]
+
+
+def test_lattices_are_equidistant_along_the_first_coordinate_and_even_in_the_plane() -> None:
+    place = np.concatenate([np.arange(50), np.arange(89)])
+    points = lattice(place, np.repeat([50, 89], [50, 89]), 2)
+    np.testing.assert_allclose(points[:50, 0], np.arange(50) / 50)
+    # The golden ratio: no cell of a grid of half as many is empty.
+    np.testing.assert_allclose(points[51, 1], (np.sqrt(5) - 1) / 2)
+    assert len(np.unique((points[50:] * (4, 8)).astype(int), axis=0)) == 32
 
 
 def test_points_by_name_or_by_function() -> None:

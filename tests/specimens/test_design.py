@@ -15,9 +15,15 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import fit_normal
-from prbayes.specimens.design import emulate, first_runs, most_runs
+from prbayes.specimens.design import corrected, emulate, first_emulation, first_runs, most_runs
 from prbayes.specimens.emulation import Emulation
-from prbayes.specimens.points import SpecimenData, SpecimenOptions, SpecimenPoints
+from prbayes.specimens.points import (
+    SpecimenData,
+    SpecimenOptions,
+    SpecimenPoints,
+    fit_proposals,
+    normal_of,
+)
 
 
 @dataclass(frozen=True)
@@ -236,3 +242,38 @@ def test_an_earlier_emulation_of_the_response_is_extended() -> None:
     extended, *_ = emulate(again, data, emulation)
     np.testing.assert_array_equal(extended.z[: len(run.z)], run.z)
     assert len(extended.z) == len(run.z) + len(again.z)
+
+
+def test_likely_inputs_are_corrected_by_the_response() -> None:
+    """The emulator of the first runs is poor beside a kink; after two rounds its error is small."""
+
+    def kinked(z: Floats) -> Floats:
+        return z + 0.8 * np.abs(z - 0.1)
+
+    x, prior = population(0.1, 0.15, 30), 0.4 * np.random.default_rng(1).standard_normal((4096, 1))
+    run = Recorded(kinked)
+    nothing = np.full(x.shape, np.nan)
+    options = SpecimenOptions(n_first=24)
+    readings = Readings.exact(kinked(x))
+    data = SpecimenData(readings, nothing, prior, NormalDraws.posterior, options=options)
+    first = first_emulation(run, data)
+    emulation = corrected(run, data, first, normal_of(x))
+    assert [len(batch) for batch in run.batches[1:]] in ([30, 30], [30, 30, 30])
+    assert emulation.offsets is not None
+    # The response at a mode is the reading: of the emulator with the offsets, and of itself.
+    proposals = fit_proposals(data, emulation, normal_of(x))
+    modes = proposals.modes
+    z = proposals.residuals.coordinates(modes.specimen, modes.a)
+    before = np.median(np.abs(kinked(x) - first.values(x)))
+    assert np.median(np.abs(kinked(z) - kinked(x)[modes.specimen])) < 0.2 * before
+
+
+def test_outputs_far_beyond_the_data_leave_the_digits_near_them() -> None:
+    def steep(z: Floats) -> Floats:
+        return np.exp(8 * z)
+
+    x = population(0.1, 0.05)
+    run, emulation, _ = emulated(steep, x)
+    assert steep(run.z).max() > 100 * steep(x).std()
+    misfit = emulation.values(x) - steep(x)
+    assert np.abs(misfit).max() < 1e-3 * steep(x).std()
