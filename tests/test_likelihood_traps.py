@@ -355,12 +355,10 @@ def test_errors_come_before_further_runs() -> None:
         runs.append(np.size(x))
         return line(x)
 
+    # A likelihood does not keep its model.
+    model = model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
     with pytest.raises(DesignError, match="check the units"):
-        prepared(
-            likelihood_of(
-                model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
-            )
-        )
+        prepared(likelihood_of(model))
     assert sum(runs) <= 10 + 3  # three single ones: specimens by themselves have the same response
 
 
