@@ -11,10 +11,12 @@ r(a) = (a, e(a)) has the Jacobian (I, -G). At a mode of exp(-|r|^2 / 2), G = U S
 
 .. math:: \xi(a) = D (V' a - S U' e(a)), \qquad D = (1 + S^2)^{-1/2}, \qquad (2)
 
-is standard normal given the readings if f is linear [1]_. Points solve xi(a) = xi_k for standard
-normal xi_k; their density is
+is standard normal given the readings if f is linear [1]_. Points solve xi(a) = xi_k for quantiles
+xi_k of a lattice; their density is
 
-.. math:: q(a) = N(\xi(a); 0, I) \, |\det D (V' + S U' G(a))|. \qquad (3)
+.. math:: q(a) = g(\xi(a)) \, |\det D (V' + S U' G(a))|, \qquad (3)
+
+where g is normal along directions that the readings determine, and Student's t along open ones.
 
 Directions that the readings determine are solved for, and the others have the reference population:
 accurate and inaccurate readings, more or fewer than inputs, are one case. A mode has a proposal; a
