@@ -19,7 +19,7 @@ from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, counted, from_json
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
-from prbayes.decision.populations import Populations, ResponseSample
+from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
 from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
@@ -310,9 +310,7 @@ class _Forecast:
         """Return the standard deviation of the quantity."""
         assert self.quantity is not None
         assert self.sample is not None
-        values = self.sample.evaluate(self.quantity, thetas)
-        # A quantile may be infinite where specimens fail.
-        return float(values.std()) if np.isfinite(values).all() else np.inf
+        return standard_deviation(self.sample.evaluate(self.quantity, thetas))
 
     def needed(self, information: Floats, name: str, target: float | None) -> float:
         """Return the smallest number of specimens that reaches a target; inf, NaN without one."""

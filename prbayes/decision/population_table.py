@@ -16,7 +16,7 @@ from prbayes._finding import as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import PopulationReader
-from prbayes.decision.populations import Populations
+from prbayes.decision.populations import Populations, quantiles_of
 from prbayes.model.locking import locked
 from prbayes.model.parameters import element_name
 from prbayes.optimize.optimum import Optimum
@@ -193,19 +193,19 @@ def population(
 
 
 def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:
-    """Return quantiles over populations, (groups, k) -> (p, groups)."""
-    return np.array([np.quantile(_defined(row), probabilities) for row in draws]).T
+    """Return quantiles over populations, (groups, k) -> (p, groups); a draw may be infinite."""
+    return np.array([quantiles_of(_defined(row, np.isnan(row)), probabilities) for row in draws]).T
 
 
 def _mean(draws: Floats) -> Floats:
     """Return means over populations, (groups, k) -> (groups,)."""
-    return np.array([_defined(row).mean() for row in draws])
+    return np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
 
 
-def _defined(row: Floats) -> Floats:
-    """Return the finite numbers of populations; NaN where most populations have none."""
-    finite = row[np.isfinite(row)]
-    return finite if finite.size > 0.5 * row.size else np.array([np.nan])
+def _defined(row: Floats, is_left_out: Any) -> Floats:
+    """Return the other numbers of populations; NaN where most populations are left out."""
+    others = row[~is_left_out]
+    return others if others.size > 0.5 * row.size else np.array([np.nan])
 
 
 class PopulationTable(Table):

@@ -378,8 +378,8 @@ def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, .
     if sample.emulator is None:
         return ()
     thetas = sample.populations.thinned()
-    change = np.nanstd(_range_effect(sample, quantity, thetas)) / 2
-    if not change > 0.1 * np.nanstd(sample.evaluate(quantity, thetas)):
+    change = standard_deviation(_range_effect(sample, quantity, thetas)) / 2
+    if not change > 0.1 * standard_deviation(sample.evaluate(quantity, thetas)):
         return ()
     text = (
         f"{quantity!r}: some populations extend beyond the range of the runs, where the response "
@@ -395,7 +395,8 @@ def _range_effect(sample: ResponseSample, quantity: Quantity, thetas: Floats) ->
     populations = sample.populations
     mass = sample.design.populations(populations.evaluator.parents(thetas, sample.k))[1]
     constant, *_, steeper = sample.emulated(sample.points)
-    return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
+    with np.errstate(invalid="ignore"):  # both may be infinite
+        return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
 
 
 def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
@@ -404,6 +405,18 @@ def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
     weights = weights[:, order]
     with np.errstate(invalid="ignore"):
         return quantity.of(values[order], weights / weights.sum(axis=1, keepdims=True))
+
+
+def standard_deviation(by_draw: Floats) -> float:
+    """Return that of a quantity, infinite if it is at a draw, as a quantile where specimens fail."""
+    return np.inf if np.isinf(by_draw).any() else float(np.nanstd(by_draw))
+
+
+def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:
+    """Return quantiles of draws, (n,), of which some may be infinite."""
+    # The mean of two infinite neighbours is NaN.
+    method: Any = "inverted_cdf" if np.isinf(by_draw).any() else "linear"
+    return np.asarray(np.quantile(by_draw, levels, method=method))
 
 
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:
@@ -643,7 +656,7 @@ def evaluate(
     findings, error = sample.checked_quantity(quantity)
     by_draw = sample.evaluate(quantity, populations.thetas)
     (center,) = sample.evaluate(quantity, populations.center[None])
-    lower, upper = np.nanquantile(by_draw, [(1 - prob) / 2, (1 + prob) / 2])
+    lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], [(1 - prob) / 2, (1 + prob) / 2])
     return QuantityTable(
         {
             "estimate": np.nanmean(by_draw) if populations.are_draws else center,

@@ -20,7 +20,12 @@ from scipy.stats import rankdata
 from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
-from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
+from prbayes.decision.populations import (
+    InverseTransform,
+    Populations,
+    ResponseSample,
+    standard_deviation,
+)
 from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.model.locking import locked
 from prbayes.numerics.points import sobol
@@ -181,7 +186,7 @@ def sensitivity(
             "quantity": repr(quantity),
             "value": float(sample.evaluate(quantity, populations.center[None])[0]),
             "value_error": error,
-            "sd": float(np.nanstd(sample.evaluate(quantity, populations.thetas))),
+            "sd": standard_deviation(sample.evaluate(quantity, populations.thetas)),
             "of_inputs": quantity.of_inputs,
             "scatter": _aleatory_share(sample, quantity),
             "responses": sample.responses.count,
@@ -212,6 +217,8 @@ class SensitivityTable(Table):
             cells = [f"{x:.2f} ± {error:.2f}" if np.isfinite(x) else "" for x, error in numbers]
             rows.append([str(factor), str(row["kind"].item()), *cells])
         sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        if np.isinf(attrs["sd"]):
+            sentences.append("The quantity is infinite at some draws, which the shares leave out.")
         if attrs["inputs"]:
             sentences.append(f"Inputs: {attrs['inputs']}.")
         sentences.append(

@@ -94,7 +94,8 @@ class EmulatedResponse:
         # Slopes are differences to points further inside, by 2 % of the range at most.
         share = 0.02 / np.maximum((np.abs(beyond) / self._width).max(axis=1), 1e-12)
         inner = self._in_range(ends - share[:, None] * beyond)
-        difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
+        with np.errstate(invalid="ignore"):  # both may be infinite
+            difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from decisions import OBSERVED, doubled, normal, optimum, posterior, same
+from scipy.special import ndtri
 
 import prbayes as prb
 from prbayes.decision.populations import InverseTransform, Populations, output_column
@@ -237,3 +238,35 @@ def test_a_quantity_has_the_value_and_interval_of_its_draws() -> None:
     assert float(at_optimum.error) == pytest.approx(shares.attrs["value_error"], rel=1e-3)
     with pytest.raises(TypeError, match=r"prb.decision.evaluate: quantity: got"):
         prb.decision.evaluate(posterior(), doubled, model=model)  # type: ignore[arg-type]
+
+
+def ends_beyond(limit: float) -> Any:
+    """Return a response that is infinite beyond a limit: the specimen has failed."""
+    return lambda x: np.where(x > limit, np.inf, x)
+
+
+def test_a_quantity_that_is_infinite_at_some_draws() -> None:
+    model, x = normal()
+    upper = np.quantile(at_draws(0.99), 0.94)
+    quantity = prb.decision.Quantile(ends_beyond(upper), x, probability=0.99)
+    table = prb.decision.evaluate(posterior(), quantity, model=model, prob=0.9)
+    assert float(table.upper) == np.inf
+    assert float(table.lower) == pytest.approx(np.quantile(at_draws(0.99), 0.05), rel=0.02)
+    after = prb.decision.Condition(ends_beyond(upper), x)
+    table = prb.population(posterior(), after, model=model, upper=True)
+    assert float(table.estimate.sel(quantity="A-basis").item()) == np.inf
+
+
+def test_the_spread_of_a_quantity_that_is_infinite_at_a_few_draws() -> None:
+    model, x = normal()
+    limit = np.quantile(at_draws(0.95), 0.998)
+    quantity = prb.decision.Quantile(ends_beyond(limit), x, probability=0.95)
+    table = prb.sensitivity(posterior(), quantity, model=model, n_points=64)
+    assert table.attrs["sd"] == np.inf
+    assert "infinite at some draws" in str(table)
+
+
+def at_draws(probability: float) -> Any:
+    """Return the quantile of the normal population at each draw."""
+    draws = posterior().posterior
+    return (draws["mu"] + ndtri(probability) * draws["sigma"]).values
