@@ -408,7 +408,7 @@ def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
 
 
 def standard_deviation(by_draw: Floats) -> float:
-    """Return that of a quantity, infinite if it is at a draw, as a quantile where specimens fail."""
+    """Return that of a quantity over draws; infinite if the quantity is infinite at one of them."""
     return np.inf if np.isinf(by_draw).any() else float(np.nanstd(by_draw))
 
 
