@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +37,25 @@ class Emulator:
     components: Floats | None  # (c, m): principal components; None if surfaces are of outputs
     surfaces: tuple[FittedSurface, ...]  # of each output or component
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
-        columns, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
-        values, jacobian = np.stack(columns, axis=1), np.stack(slopes, axis=1)
-        if self.components is not None:
+    def __call__(
+        self, z: Floats, columns: NDArray[np.intp] | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
+
+        Those of the outputs in ``columns``, (k, c), of each point.
+        """
+        parts, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
+        values, jacobian = np.stack(parts, axis=1), np.stack(slopes, axis=1)
+        if columns is None and self.components is not None:
             values = values @ self.components
             jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
-        return self.center + self.unit * values, self.unit[:, None] * jacobian
+        elif columns is not None:
+            of_outputs = np.eye(values.shape[1]) if self.components is None else self.components
+            chosen = of_outputs.T[columns]  # (k, c, components)
+            values = (chosen @ values[:, :, None])[:, :, 0]
+            jacobian = chosen @ jacobian
+        kept: Any = slice(None) if columns is None else columns
+        return self.center[kept] + self.unit[kept] * values, self.unit[kept, None] * jacobian
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m)."""

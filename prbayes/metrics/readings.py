@@ -74,6 +74,16 @@ class Readings:
             sd[few] = pooled.std()
         return np.where(sd > 0, sd, 1.0)
 
+    def relative_error(self, error: Floats) -> Floats:
+        """Return errors of an emulator, (m,), beside `robust_spread`.
+
+        That of outputs with less than eight readings is the root mean square of all of them.
+        """
+        count = self.is_measured.sum(axis=0)
+        few = (count > 0) & (count < min(8, len(self)))
+        pooled = np.sqrt((count[few] * error[few] ** 2).sum() / max(count[few].sum(), 1))
+        return np.where(few, pooled, error) / self.robust_spread()
+
     def robust_spread(self) -> Floats:
         """Return the standard deviation of each output by its quartiles, (m,).
 

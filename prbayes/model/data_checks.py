@@ -661,7 +661,7 @@ def emulator_findings(
     The largest error is in robust standard deviations of the readings. Jumps, poles and crossing
     modes with less have posterior means within .1 standard deviations (32 of 33 data sets).
     """
-    share = error / readings.robust_spread()
+    share = readings.relative_error(error)
     if not (share > largest).any():
         return []
     return [

@@ -184,9 +184,11 @@ def _with_unknown_error(
     The points are ``columns`` of all points.
     """
     result = np.empty((len(errors), len(rows)))
-    for k, log_p in enumerate(likelihood.density.at_points(parents, points)):
-        of_readings = _readings_log_density(likelihood, errors[k], np)[rows, columns]
-        result[k] = log_sum_exp(log_p + points.log_a + of_readings)
+    order = np.lexsort(errors.T)
+    of_readings = _reading_density(likelihood).at_errors(errors[order])
+    of_points = likelihood.density.at_points([p[order] for p in parents], points)
+    for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):
+        result[k] = log_sum_exp(log_p + points.log_a + of_error[rows, columns])
     return result
 
 
@@ -207,7 +209,7 @@ def log_likelihood_graph(
         errors.append(error + pt.zeros(m.rows.shape[1]))
     error = pt.concatenate(errors)
     if not likelihood.error_is_known:
-        terms = terms + _readings_log_density(likelihood, error, pt)
+        terms = terms + _reading_density(likelihood)(error, pt)
     result = logsumexp_finite(terms)
     if share is not None:
         result = result - _log_share(likelihood, params, share)
@@ -267,16 +269,14 @@ def _log_share(
     return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))[context]
 
 
-def _readings_log_density(likelihood: SpecimenLikelihood, error: Any, xp: Any) -> Any:
-    """Return the log-density of the readings at the points, (S, K), for an unknown error, (M,).
-
-    As an array or a graph.
-    """
+def _reading_density(likelihood: SpecimenLikelihood) -> ReadingDensity:
+    """Return the log-density of the readings at the points as a function of unknown errors."""
     if "reading density" not in likelihood.cache:
         preparation = prepared(likelihood)
         density = ReadingDensity.of(likelihood, preparation.points, preparation.emulation.error)
         likelihood.cache["reading density"] = density
-    return likelihood.cache["reading density"](error, xp)
+    result: ReadingDensity = likelihood.cache["reading density"]
+    return result
 
 
 def logsumexp_finite(terms: Any) -> TensorVariable:
@@ -325,7 +325,7 @@ def draw_inputs(
             density = likelihood.density.at([parent[k : k + 1] for parent in by_point], flat)
             log_weights = density(slice(None)).reshape(log_a[rows].shape) + log_a[rows]
             if not likelihood.error_is_known:
-                log_weights += _readings_log_density(likelihood, errors[k], np)[rows]
+                log_weights += _reading_density(likelihood)(errors[k], np)[rows]
             log_weights = np.where(np.isnan(log_weights), -np.inf, log_weights)
             totals = np.cumsum(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)), axis=1)
             limits = totals[:, -1:] * rng.random((len(rows), 1))

@@ -9,7 +9,7 @@ more than a sum of squares for each point,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -97,3 +97,31 @@ class ReadingDensity:
         by_output = error if self.columns is None else error[self.columns][:, None]
         variance = self.emulator_variance + (by_output * self.unit) ** 2
         return total + self.readings.symbolic_log_density(self.outputs, variance, xp)
+
+    def at_errors(self, errors: Floats, spacing: float = 0.05) -> Iterator[Floats]:
+        """Yield the log-density, (S, K), at errors (P, M), which ascend.
+
+        Between values of one unknown error whose logarithms differ by ``spacing`` a cubic
+        polynomial replaces the density where that takes fewer evaluations.
+        """
+        varies = np.ptp(errors, axis=0) > 0
+        columns = errors[:, varies].T
+        is_one = len(columns) > 0 and (columns == columns[0]).all() and (columns[0] > 0).all()
+        places = np.log(columns[0]) / spacing if is_one else np.zeros(len(errors))
+        cells = np.floor(places).astype(int)
+        if not is_one or 2 * np.unique(cells[:, None] + np.arange(-1, 3)).size > len(errors):
+            yield from (self(error, np) for error in errors)
+            return
+        at_nodes: dict[int, Floats] = {}
+        for place, cell in zip(places, cells, strict=True):
+            # Lagrange's polynomial through two nodes on each side.
+            nodes = range(cell - 1, cell + 3)
+            for node in nodes:
+                if node not in at_nodes:
+                    at_nodes[node] = self(np.where(varies, np.exp(spacing * node), errors[0]), np)
+            at_nodes = {node: at_nodes[node] for node in nodes}
+            u = place - cell
+            below, above = u * (u - 1) / 6, (u + 1) * (u - 2) / 2
+            weights = (-below * (u - 2), above * (u - 1), -above * u, below * (u + 1))
+            terms = [w * values for w, values in zip(weights, at_nodes.values(), strict=True)]
+            yield terms[0] + terms[1] + terms[2] + terms[3]

@@ -306,17 +306,20 @@ def error_and_bias(
     a = residuals.whitened(z)
     _, slopes = residuals.errors(specimens, a)
     sd = data.readings.comparison_sd(error)[specimens]
+    relative = np.stack([misfit / sd, np.where(np.isinf(sd), 0.0, error / sd)])
+    if residuals.columns is not None:
+        relative = np.take_along_axis(relative, residuals.columns[specimens][None], axis=2)
     # Shift of the inputs of a specimen that the error of the emulator causes.
     hessian = np.einsum("kmd,kme->kde", slopes, slopes) + np.eye(a.shape[1])
     gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
-    shift = -np.einsum("kdm,km->kd", gain, misfit / sd)
+    shift = -np.einsum("kdm,km->kd", gain, relative[0])
     bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
     # m readings identify m of d directions; the posterior is wider than the formula assumes.
     of_each = data.readings.is_measured.sum(axis=1).mean()
     bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
     # The comparison allows the error at each specimen; what the runs have overestimated of it is
     # missing in the population's variance.
-    by_error = gain * np.where(np.isinf(sd), 0.0, error / sd)[:, None]
+    by_error = gain * relative[1][:, None]
     narrowing = np.sqrt(len(data.readings) / 2) * (by_error**2).sum(axis=2).mean(axis=0).max()
     return error, float(max(bias, narrowing))
 
@@ -408,7 +411,7 @@ def audited(
 
 def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
     """Return whether the emulator's error is not small beside the scatter of the readings."""
-    return bool((emulation.error > largest * data.readings.robust_spread()).any())
+    return bool((data.readings.relative_error(emulation.error) > largest).any())
 
 
 def most_corrections(specimens: int, dimensions: int) -> int:

@@ -20,11 +20,14 @@ from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 
 
+type Columns = NDArray[np.intp] | None
+
+
 class Surface(Protocol):
     """Outputs (k, m) at coordinates (k, d) between runs, with their Jacobian (k, m, d)."""
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian."""
+    def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
+        """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
 
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""
@@ -45,15 +48,16 @@ class CompressedSurface:
     center: Floats  # (m,)
     unit: Floats  # (m,)
 
-    def expanded(self, u: Floats) -> Floats:
+    def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), of values of the surface."""
-        return np.asarray(self.center + self.unit * np.sinh(np.clip(u, -100, 100)))
+        return np.asarray(self.center[columns] + self.unit[columns] * np.sinh(np.clip(u, -100, 100)))
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian."""
-        u, jacobian = self.surface(z)
-        slopes = self.unit * np.cosh(np.clip(u, -100, 100))
-        return self.expanded(u), slopes[:, :, None] * jacobian
+    def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
+        """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
+        u, jacobian = self.surface(z, columns)
+        chosen: Any = slice(None) if columns is None else columns
+        slopes = self.unit[chosen] * np.cosh(np.clip(u, -100, 100))
+        return self.expanded(u, chosen), slopes[:, :, None] * jacobian
 
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""
@@ -72,15 +76,19 @@ class DifferencedResponse:
     values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
     step: float = 1e-5  # in units of the coordinates
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian."""
+    def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
+        """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
         k, d = z.shape
         axes = np.eye(d)
         shifts = self.step * np.concatenate([np.zeros((1, d)), axes, -axes])
         points = (z + shifts[:, None]).reshape(-1, d)
         values = self.values(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
-        return values[0], np.moveaxis(slopes, 0, -1)
+        outputs, jacobian = values[0], np.moveaxis(slopes, 0, -1)
+        if columns is None:
+            return outputs, jacobian
+        rows = np.arange(k)[:, None]
+        return outputs[rows, columns], jacobian[rows, columns]
 
     def variance(self, z: Floats) -> Floats:
         """Return zeros: the response has no error."""
@@ -111,9 +119,9 @@ class Emulation:
             return self.ends
         return np.stack([self.z.min(axis=0), self.z.max(axis=0)])
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
-        values, jacobian = self.surface(z)
+        values, jacobian = self.surface(z, columns)
         failed = self.fails(z)
         values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian

@@ -171,16 +171,13 @@ class SpecimenData:
         target = np.where(is_read, readings.values, 0.0)
         if emulation.offsets is not None:
             target = target - emulation.offsets
+        arrays = [target, np.broadcast_to(emulation.error, target.shape), error, relative]
+        columns, count = None, is_read.sum(axis=1).max()
+        if 2 * count <= is_read.shape[1]:
+            columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
+            arrays = [np.take_along_axis(values, columns, axis=1) for values in arrays]
         return Residuals(
-            emulation,
-            target,
-            emulation.error,
-            error,
-            relative,
-            population,
-            self.known,
-            self.box,
-            self.order,
+            emulation, *arrays, population, self.known, self.box, self.order, columns
         )
 
 
@@ -192,10 +189,13 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     """
     residuals = data.residuals(emulation, population)
     # Candidates are not chosen by an output that a reading error dominates.
-    error = np.median(data.readings.error_sd(residuals.target), axis=0)
+    target = np.where(data.readings.is_measured, data.readings.values, 0.0)
+    if emulation.offsets is not None:
+        target = target - emulation.offsets
+    error = np.median(data.readings.error_sd(target), axis=0)
     unit = np.hypot(data.readings.spread(), 10 * error)
     unit = np.where(data.readings.is_measured, unit, np.inf)
-    starts = _starts(data, emulation, residuals, unit)
+    starts = _starts(data, emulation, residuals, target, unit)
     parts = []
     for scale in sorted(data.scales, reverse=True):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
@@ -206,7 +206,12 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
 
 
 def _starts(
-    data: SpecimenData, emulation: Emulation, residuals: Residuals, unit: Floats, most: int = 512
+    data: SpecimenData,
+    emulation: Emulation,
+    residuals: Residuals,
+    target: Floats,
+    unit: Floats,
+    most: int = 512,
 ) -> Floats:
     """Return whitened starts of the search for modes, (N, S, free)."""
     from scipy.spatial import cKDTree
@@ -222,12 +227,12 @@ def _starts(
     with np.errstate(invalid="ignore", over="ignore"):
         if len(free) == data.known.shape[1]:
             values = emulation.values(residuals.coordinates(np.zeros(len(a), dtype=int), a))
-            for target, simulated, scale in zip(residuals.target.T, values.T, unit.T, strict=True):
-                distance += ((target[:, None] - simulated) / scale[:, None]) ** 2
+            for readings, simulated, scale in zip(target.T, values.T, unit.T, strict=True):
+                distance += ((readings[:, None] - simulated) / scale[:, None]) ** 2
         else:
             for i in range(n):
                 values = emulation.values(residuals.coordinates(np.full(len(a), i), a))
-                distance[i] = (((residuals.target[i] - values) / unit[i]) ** 2).sum(axis=1)
+                distance[i] = (((target[i] - values) / unit[i]) ** 2).sum(axis=1)
     distance = np.where(np.isnan(distance), np.inf, distance)
     is_minimum = np.ones(distance.shape, dtype=bool)
     for column in near[:, 1:].T:
@@ -422,7 +427,7 @@ def _half_difference(
     The second number has no contribution of the few populations that are narrower than the
     distances between points. The third is that of a constant.
     """
-    error, logs = proposals.residuals.emulator_error, []
+    error, logs = proposals.residuals.response.error, []
     for half in halves:
         by_scale = [at_scale(data, half, error, scale) for scale in scales]
         logs.append(np.concatenate([draws.log_likelihoods(p.z, p.log_a) for p in by_scale]))
@@ -469,7 +474,7 @@ def reliable_draws(
     narrows = False
     while True:
         halves = [draw_points(data, proposals, count // 2, seed + h) for h in (0, 1000)]
-        points = at_scale(data, joined(*halves), proposals.residuals.emulator_error, scale)
+        points = at_scale(data, joined(*halves), proposals.residuals.response.error, scale)
         if not narrows:
             draws = data.posterior(points.z, points.log_a, None)
             difference, *_ = _half_difference(data, proposals, halves, draws, (scale,))

@@ -64,7 +64,7 @@ class Residuals:
     # Coordinates (k, d) -> values (k, m) and Jacobian (k, m, d), NaN without a response.
     response: Any
     target: Floats  # (N, m): readings, any number where there is none
-    emulator_error: Floats  # (m,): standard deviation of the emulator's error
+    emulator_error: Floats  # (N, m): standard deviation of the emulator's error
     error: Floats  # (N, m): standard deviation of the reading; infinite where there is none
     relative: Floats  # (N, m): further error of the reading as a share of the output
     population: Normal  # of the reference, in coordinates z
@@ -73,6 +73,8 @@ class Residuals:
     box: Floats | None = None
     # (free,): the columns that are not known, those whose population may be narrow first.
     order: Indices | None = None
+    # (N, m): the outputs of the response that a specimen has; None for all.
+    columns: Indices | None = None
 
     @property
     def free(self) -> Indices:
@@ -90,7 +92,6 @@ class Residuals:
         centred = z[..., self.free] - self.population.mean
         return np.asarray(centred @ np.linalg.inv(self.population.root).T)
 
-    @np.errstate(all="ignore")
     def errors(
         self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
     ) -> tuple[Floats, Floats]:
@@ -98,28 +99,47 @@ class Residuals:
 
         ``scale`` is a factor of the readings' errors, a number or (k,). NaN without a response.
         """
-        count, m = len(a), self.target.shape[1]
-        factors = np.broadcast_to(np.square(scale), (count,))[:, None]
-        e, slopes = np.empty((count, m)), np.empty((count, m, a.shape[1]))
-        for block in _blocks(count, m * self.known.shape[1]):
+        scales = np.broadcast_to(scale, len(a))
+        e, slopes = np.empty((len(a), self.target.shape[1])), np.empty((len(a), *self.shape))
+        for block in _blocks(len(a), self.target.shape[1] * self.known.shape[1]):
             i = specimen[block]
-            z = self.coordinates(i, a[block])
-            values, jacobian = self.response(z)
-            # Differences beside inputs without a response have no slopes.
-            values[~np.isfinite(jacobian).all(axis=(1, 2))] = np.nan
-            if self.box is not None:
-                values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
-            is_read, factor = np.isfinite(self.error[i]), factors[block]
-            relative = factor * self.relative[i] ** 2
-            variance = self.emulator_error**2 + factor * self.error[i] ** 2
-            variance = variance + relative * values**2
-            residual, sd = self.target[i] - values, np.sqrt(variance)
-            # The error of a relative reading changes with the output.
-            by_output = (1 + residual * relative * values / variance) / sd
-            slope = jacobian[:, :, self.free] @ self.population.root
-            e[block] = np.where(is_read, residual / sd, 0.0)
-            slopes[block] = np.where(is_read[:, :, None], by_output[:, :, None] * slope, 0.0)
+            e[block], slopes[block] = self.standardised(
+                i, *self.simulated(i, a[block]), scales[block]
+            )
         return e, slopes
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The shape of G of a point."""
+        return self.target.shape[1], len(self.free)
+
+    @np.errstate(all="ignore")
+    def simulated(self, specimen: Indices, a: Floats) -> tuple[Floats, Floats]:
+        """Return outputs, (k, m), and their Jacobian by a, (k, m, free); NaN without a response."""
+        z = self.coordinates(specimen, a)
+        columns = None if self.columns is None else self.columns[specimen]
+        values, jacobian = self.response(z) if columns is None else self.response(z, columns)
+        # Differences beside inputs without a response have no slopes.
+        values[~np.isfinite(jacobian).all(axis=(1, 2))] = np.nan
+        if self.box is not None:
+            values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
+        return values, jacobian[:, :, self.free] @ self.population.root
+
+    @np.errstate(all="ignore")
+    def standardised(
+        self, specimen: Indices, values: Floats, jacobian: Floats, scale: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return e, (k, m), and G, (k, m, free), of outputs and their Jacobian."""
+        factor = np.square(scale)[:, None]
+        relative = factor * self.relative[specimen] ** 2
+        error = self.error[specimen]
+        variance = self.emulator_error[specimen] ** 2 + factor * error**2 + relative * values**2
+        residual, sd = self.target[specimen] - values, np.sqrt(variance)
+        # The error of a relative reading changes with the output.
+        by_output = (1 + residual * relative * values / variance) / sd
+        is_read = np.isfinite(error)
+        e = np.where(is_read, residual / sd, 0.0)
+        return e, np.where(is_read[:, :, None], by_output[:, :, None] * jacobian, 0.0)
 
 
 def _blocks(count: int, width: int) -> Iterator[slice]:
@@ -189,6 +209,7 @@ def find_modes(
     # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
     # the valley's lowest point with a larger error, then the readings themselves.
     change = 0.03 * _typical_change(residuals, starts)
+    change = change if residuals.columns is None else change[residuals.columns]
     soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
     a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
     a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
@@ -205,7 +226,7 @@ def _typical_change(residuals: Residuals, starts: Floats) -> Floats:
     values, _ = residuals.response(residuals.coordinates(np.resize(np.arange(len(starts)), 64), a))
     values = values[np.isfinite(values).all(axis=1)]
     low, high = np.quantile(values, [0.16, 0.84], axis=0) if len(values) > 1 else (0.0, 0.0)
-    return np.asarray(high - low) / 2 * np.ones(residuals.target.shape[1])
+    return np.asarray(high - low) / 2 * np.ones(values.shape[1])
 
 
 def _minimised(
@@ -415,7 +436,14 @@ class Proposals:
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
         modes = self.modes
-        e, slopes = self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
+        return self._of_errors(
+            mode, a, *self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
+        )
+
+    def _of_errors(
+        self, mode: Indices, a: Floats, e: Floats, slopes: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return xi and its Jacobian at points with standardised errors e and slopes G."""
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
         return xi, inputs + readings @ slopes
@@ -536,33 +564,42 @@ class Proposals:
         ``weights`` are of the modes, (R,). ``drawn`` has the mode that drew each point and the log
         of its density there, up to a constant, both (k,).
         """
-        modes = self.modes
-        # The only mode of a specimen at a scale of its errors reaches all points.
-        pairs = np.stack([modes.specimen, modes.scale], axis=1)
-        _, place, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-        is_alone = counts[place.ravel()] == 1
-        table = modes.table[specimen]
+        result = np.empty(len(a))
         with np.errstate(divide="ignore"):
             logs = np.log(weights)
-        largest = np.full(len(a), -np.inf)
-        terms = []
+        for block in _blocks(len(a), int(np.prod(self.residuals.shape))):
+            of_block = None if drawn is None else (drawn[0][block], drawn[1][block])
+            result[block] = self._log_mixture(specimen[block], a[block], logs, of_block)
+        return result
+
+    def _log_mixture(
+        self, specimen: Indices, a: Floats, logs: Floats, drawn: tuple[Indices, Floats] | None
+    ) -> Floats:
+        """Return `log_mixture` of points at once; ``logs`` are those of the weights."""
+        modes, table = self.modes, self.modes.table[specimen]
+        values, jacobian = self.residuals.simulated(specimen, a)
+        largest, terms = np.full(len(a), -np.inf), []
         if drawn is not None:
-            terms = [drawn[1] + logs[drawn[0]]]
-            largest = terms[0]
-        for slot in range(table.shape[1]):
-            at = table[:, slot]
-            rows = np.flatnonzero((at >= 0) & (weights[at] > 0))
+            largest = drawn[1] + logs[drawn[0]]
+            terms = [largest]
+        for slot, at in enumerate(table.T):
+            rows = np.flatnonzero((at >= 0) & (logs[at] > -np.inf))
             if drawn is not None:
                 rows = rows[at[rows] != drawn[0][rows]]
             term = np.full(len(a), -np.inf)
             if rows.size:
                 at = at[rows]
-                value, jacobian = self.mapped(at, a[rows])
-                sign, log_det = np.linalg.slogdet(jacobian)
+                errors = self.residuals.standardised(
+                    specimen[rows], values[rows], jacobian[rows], modes.scale[at]
+                )
+                value, slopes = self._of_errors(at, a[rows], *errors)
+                sign, log_det = np.linalg.slogdet(slopes)
                 density = log_det + self.log_density(at, value) + logs[at]
                 matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
                 rows, at, density = rows[matters], at[matters], density[matters]
-                is_reached = is_alone[at] & (drawn is not None)
+                is_reached = np.zeros(len(rows), dtype=bool)
+                if drawn is not None:
+                    is_reached = self._is_same_mode[drawn[0][rows], slot]
                 check = np.flatnonzero(~is_reached)
                 end, _, _, converged = self.solved(at[check], value[matters][check])
                 distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
@@ -570,6 +607,34 @@ class Proposals:
                 term[rows[is_reached]] = density[is_reached]
             terms.append(term)
         return log_sum_exp(np.stack(terms, axis=1))
+
+    @cached_property
+    def _is_same_mode(self) -> NDArray[np.bool_]:
+        """Whether a mode is that in a slot of its specimen for another error, (R, most).
+
+        Each is the nearest to the other among the modes for its error, in the map of the one for
+        the larger error. Points that one of them reaches are reached by the other.
+        """
+        modes, table = self.modes, self.modes.table
+        scale = np.where(table >= 0, modes.scale[table], np.nan)
+        # The Jacobian at a mode: D V' + D S U' G.
+        maps = self.inputs + self.readings @ modes.slopes
+        is_wide = scale[:, :, None] >= scale[:, None]
+        difference = modes.a[table][:, None] - modes.a[table][:, :, None]  # (N, most, most, free)
+        of_first = np.einsum("npij,npqj->npqi", maps[table], difference)
+        of_second = np.einsum("nqij,npqj->npqi", maps[table], difference)
+        distance = (np.where(is_wide[..., None], of_first, of_second) ** 2).sum(axis=3)
+        distance[np.isnan(scale)[:, None] | np.isnan(scale)[:, :, None]] = np.inf
+        is_nearest = np.zeros(distance.shape, dtype=bool)
+        for value in np.unique(modes.scale):
+            of_scale = np.where((scale == value)[:, None], distance, np.inf)
+            least = of_scale.min(axis=2, keepdims=True)
+            is_nearest |= np.isfinite(least) & (of_scale == least)
+        is_same = is_nearest & is_nearest.swapaxes(1, 2)
+        n, slot = np.nonzero(table >= 0)
+        result = np.zeros((len(modes.a), table.shape[1]), dtype=bool)
+        result[table[n, slot]] = is_same[n, slot]
+        return result
 
     def covering(self, starts: Floats, scale: float, most: int = 4) -> Proposals:
         """Return proposals with further ones where the fibre of a specimen is not covered.

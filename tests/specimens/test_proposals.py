@@ -47,7 +47,7 @@ def residuals_of(
     nothing = np.full((len(y), len(reference.mean)), np.nan)
     sd = np.broadcast_to(np.asarray(sd, dtype=float), y.shape)
     known = nothing if known is None else known
-    return Residuals(response, y, np.zeros(y.shape[1]), sd, np.zeros_like(y), reference, known)
+    return Residuals(response, y, np.zeros_like(y), sd, np.zeros_like(y), reference, known)
 
 
 def proposals_of(residuals: Residuals, scales: tuple[float, ...] = (1.0,)) -> Proposals:
