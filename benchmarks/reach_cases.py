@@ -671,8 +671,11 @@ def _own_times(number: int) -> Instance:
     return Instance(problem, data["readings"], reference, build=build)
 
 
-def own_times_log_likelihood(data: dict[str, Any], v: dict[str, Any], nodes: int = 7) -> Any:
-    """Return log L (S,) by adaptive Gauss-Hermite quadrature over the inputs of each subject."""
+def own_times_log_likelihood(data: dict[str, Any], v: dict[str, Any], nodes: int = 15) -> Any:
+    """Return log L (S,) by adaptive Gauss-Hermite quadrature over the inputs of each subject.
+
+    With seven nodes an input that a subject's readings leave open shifts a mean by 1.3 deviations.
+    """
     mean = np.stack([v["log_ka"], v["log_cl"], v["log_v"]], axis=1)[:, None]
     shift = v["beta"][:, None] * np.log(data["weight"] / 70)
     mean = mean + np.stack([0 * shift, 0 * shift, shift], axis=2)  # (S, N, 3)

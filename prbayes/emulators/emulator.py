@@ -37,9 +37,7 @@ class Emulator:
     components: Floats | None  # (c, m): principal components; None if surfaces are of outputs
     surfaces: tuple[FittedSurface, ...]  # of each output or component
 
-    def __call__(
-        self, z: Floats, columns: NDArray[np.intp] | None = None
-    ) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats, columns: NDArray[np.intp] | None = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
 
         Those of the outputs in ``columns``, (k, c), of each point.

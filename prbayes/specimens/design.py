@@ -146,7 +146,6 @@ def emulate(
         is_complete = batches >= enough or len(emulation.z) >= most
         if emulation.bias <= data.options.bias and is_complete:
             plausible = Plausible.of(data, emulation, wider(population))
-            surface = emulation.surface
             emulation = audited(run, data, emulation, plausible, rng)
             if emulation.bias <= 1.5 * data.options.bias:
                 is_open = plausible.proposals.is_open(plausible.scale)
@@ -156,8 +155,7 @@ def emulate(
                     and most_corrections(*data.known.shape)
                 ):
                     emulation = corrected(run, data, emulation, population)
-                if emulation.surface is not surface or emulation.offsets is not None:
-                    plausible = plausible.of_emulation(data, emulation)
+                plausible = plausible.of_emulation(data, emulation)
                 return emulation, *plausible.agreeing(data), plausible.draws
             likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
@@ -241,15 +239,23 @@ def joined(
     z, y = np.concatenate([emulation.z, fresh[is_new]]), np.concatenate([emulation.y, outputs])
     rows = _near_population(data, z, likely.population)
     surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
-    # The misfit is that of the emulator without these runs. Left-out errors at them show what
-    # they have improved.
-    at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
-    at_sampled = at_sampled[np.isfinite(at_sampled).all(axis=1)]
-    if np.isfinite(bias) and len(at_sampled):
-        improved = 2 * np.sqrt((at_sampled**2).mean(axis=0))
-        floor = data.options.floor * data.readings.spread()
-        error = np.maximum(np.minimum(error, improved), floor)
+    if np.isfinite(bias):
+        at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
+        error = _improved(data, error, at_sampled)
     return Emulation(z, y, surface, error, bias)
+
+
+def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
+    """Return errors, (m,), from misfits at runs and left-out errors, (k, m), at the same runs.
+
+    Misfits are those of the emulator without these runs. Left-out errors show what the runs have
+    improved.
+    """
+    left_out = left_out[np.isfinite(left_out).all(axis=1)]
+    if not len(left_out):
+        return error
+    improved = 2 * np.sqrt((left_out**2).mean(axis=0))
+    return np.maximum(np.minimum(error, improved), data.options.floor * data.readings.spread())
 
 
 def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
@@ -375,7 +381,8 @@ def audited(
 ) -> Emulation:
     """Return the emulation with runs at points that matter to the posterior, and their bias.
 
-    Its surface and error stay if the error at these runs is at most twice the stated one.
+    Its surface stays if the error at these runs is at most twice the stated one. That of left-out
+    runs, which are far from each other, is often too large: it decreases to what is measured here.
     """
     points = plausible.points
     population = normal_of(plausible.draws.specimens()[:, data.free], 1.2)
@@ -402,11 +409,21 @@ def audited(
     bias = max(bias, _bias_of_possible(data, at_possible))
     all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
     bias = max(bias, emulation.bias)
-    if (error <= 2 * emulation.error).all() and bias <= 1.5 * data.options.bias:
-        return replace(emulation, z=all_z, y=all_y, bias=bias)
+    pooled = data.readings.relative_error
+    if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
+        measured = np.sqrt(((error / emulation.error) ** 2).mean())
+        error = min(measured, 1.0) * emulation.error
+        return replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
     used = _near_population(data, all_z, population)
-    surface, _, _ = fit_surface(all_z, all_y, data.readings, data.name, emulation.surface, used)
-    return Emulation(all_z, all_y, surface, np.maximum(error, emulation.error), bias)
+    surface, left_out, _ = fit_surface(
+        all_z, all_y, data.readings, data.name, emulation.surface, used
+    )
+    if bias <= 1.5 * data.options.bias:
+        at_audited = left_out[len(emulation.z) :][: is_new[: len(specimens)].sum()]
+        error = _improved(data, error, at_audited)
+    else:  # specimens may be elsewhere
+        error = np.maximum(error, emulation.error)
+    return Emulation(all_z, all_y, surface, error, bias)
 
 
 def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:

@@ -19,7 +19,6 @@ from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 
-
 type Columns = NDArray[np.intp] | None
 
 
@@ -50,7 +49,9 @@ class CompressedSurface:
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), of values of the surface."""
-        return np.asarray(self.center[columns] + self.unit[columns] * np.sinh(np.clip(u, -100, 100)))
+        return np.asarray(
+            self.center[columns] + self.unit[columns] * np.sinh(np.clip(u, -100, 100))
+        )
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""

@@ -176,9 +176,7 @@ class SpecimenData:
         if 2 * count <= is_read.shape[1]:
             columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
             arrays = [np.take_along_axis(values, columns, axis=1) for values in arrays]
-        return Residuals(
-            emulation, *arrays, population, self.known, self.box, self.order, columns
-        )
+        return Residuals(emulation, *arrays, population, self.known, self.box, self.order, columns)
 
 
 def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:

@@ -284,3 +284,15 @@ def test_blocks_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
                 np.testing.assert_allclose(blocked, array, rtol=1e-7, atol=1e-7)
         assert [x.shape for x in emulator(points[:0])] == [(0, 2), (0, 2, 2)]
         assert emulator.variance(points[:0]).shape == (0, 2)
+
+
+@pytest.mark.parametrize("size", [4, 30], ids=["outputs", "components"])
+def test_outputs_of_each_point_alone(size: int) -> None:
+    z, elsewhere, t = design(40, 2), design(20, 2, seed=5), np.linspace(0, 1, size)
+    emulator = fit_emulator(z, np.exp(0.4 * z[:, :1] * t) + z[:, 1:])
+    columns = np.random.default_rng(0).integers(0, size, (20, 3))
+    values, jacobian = emulator(elsewhere)
+    own_values, own_jacobian = emulator(elsewhere, columns)
+    rows = np.arange(20)[:, None]
+    np.testing.assert_allclose(own_values, values[rows, columns], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(own_jacobian, jacobian[rows, columns], rtol=1e-9, atol=1e-12)

@@ -20,7 +20,11 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.specimen_likelihood import draw_readings, specimen_likelihoods
+from prbayes.model.specimen_likelihood import (
+    draw_readings,
+    log_likelihoods,
+    specimen_likelihoods,
+)
 from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
 
@@ -632,3 +636,22 @@ def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
         for place in ((10.0, 1.0), (11.0, 0.8), (9.5, 2.0)):
             got = float(log_likelihood({"mu": place[0], "sigma_log__": np.log(place[1])}))
             assert got == pytest.approx(expected(*place, limit), abs=0.4)
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_densities_between_values_of_an_unknown_error_are_interpolated(relative: bool) -> None:
+    with pm.Model() as model:
+        mu, sigma = priors()
+        metric = prb.LogLikelihood(error=pm.HalfNormal("error", 1.0), relative=relative)
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", Line(), x, observed=Y, metric=metric)
+    (likelihood,) = specimen_likelihoods(model).values()
+    error = np.exp(np.random.default_rng(0).uniform(np.log(0.02), np.log(3.0), 500))
+    values = {"mu": np.full(500, 0.9), "sigma": np.full(500, 0.4), "error": error}
+    together = log_likelihoods(likelihood, values)
+    single = [
+        log_likelihoods(likelihood, {name: v[k : k + 1] for name, v in values.items()})[0]
+        for k in range(0, 500, 25)
+    ]
+    np.testing.assert_allclose(together[::25].sum(axis=1), np.sum(single, axis=1), atol=0.01)
+    assert np.abs(together[::25] - single).max() > 0

@@ -370,3 +370,47 @@ def test_inputs_are_open_where_readings_say_less_than_the_population() -> None:
     for a, sd, expected in ((two, 0.01, False), (two, [0.01, 0.7], True), (one, 0.01, True)):
         y = np.zeros((3, len(a)))
         assert proposals_of(residuals_of(linear(a), y, sd, reference)).is_open() is expected
+
+
+def test_specimens_may_have_few_of_many_outputs() -> None:
+    """Errors, slopes and modes from the outputs that a specimen has are those from all of them."""
+    p = linear_problem(2, 3, 0.3)
+    rng = np.random.default_rng(0)
+    columns = np.sort([rng.permutation(3)[:2] for _ in p.y], axis=1)
+    sd = np.full(p.y.shape, np.inf)
+    np.put_along_axis(sd, columns, np.take_along_axis(np.tile(p.sd, (8, 1)), columns, 1), 1)
+    whole = residuals_of(p.response, p.y, sd, p.reference)
+
+    def of_columns(z: Floats, columns: Any = None) -> tuple[Floats, Floats]:
+        values, jacobian = p.response(z)
+        rows = np.arange(len(z))[:, None]
+        return (
+            (values, jacobian)
+            if columns is None
+            else (values[rows, columns], jacobian[rows, columns])
+        )
+
+    names = ("target", "emulator_error", "error", "relative")
+    parts = {n: np.take_along_axis(getattr(whole, n), columns, axis=1) for n in names}
+    few = replace(whole, response=of_columns, columns=columns, **parts)
+    specimen, a = np.arange(8), rng.standard_normal((8, 2))
+    for found, expected in zip(few.errors(specimen, a), whole.errors(specimen, a), strict=True):
+        at = columns if expected.ndim == 2 else columns[:, :, None]
+        np.testing.assert_allclose(found, np.take_along_axis(expected, at, axis=1), rtol=1e-12)
+    starts = np.tile(ndtri(sobol(16, 2, 0)), (8, 1, 1))
+    modes = [find_modes(r, starts).a for r in (few, whole)]
+    np.testing.assert_allclose(modes[0], modes[1], atol=1e-6)
+
+
+def test_modes_for_other_errors_are_the_same_if_they_are_the_nearest() -> None:
+    """y = a^2 has a mode on each side, for each error of the reading."""
+    response = differentiated(lambda z: z**2)
+    residuals = residuals_of(response, np.full((3, 1), 4.0), 0.05, independent([0.1], [1.0]))
+    proposals = proposals_of(residuals, (0.5, 1.0, 4.0))
+    modes, is_same = proposals.modes, proposals._is_same_mode
+    assert len(modes.a) == 18
+    for row in range(len(modes.a)):
+        others = modes.table[modes.specimen[row]]
+        np.testing.assert_array_equal(
+            is_same[row], np.sign(modes.a[others, 0]) == np.sign(modes.a[row, 0])
+        )
