@@ -81,8 +81,8 @@ class Readings:
         """
         count = self.is_measured.sum(axis=0)
         few = (count > 0) & (count < min(8, len(self)))
-        pooled = np.sqrt((count[few] * error[few] ** 2).sum() / max(count[few].sum(), 1))
-        return np.where(few, pooled, error) / self.robust_spread()
+        squares = (count[few] * error[few] ** 2).sum() / np.maximum(count[few].sum(), 1)
+        return np.where(few, np.sqrt(squares), error) / self.robust_spread()
 
     def robust_spread(self) -> Floats:
         """Return the standard deviation of each output by its quartiles, (m,).

@@ -255,7 +255,8 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
     if not len(left_out):
         return error
     improved = 2 * np.sqrt((left_out**2).mean(axis=0))
-    return np.maximum(np.minimum(error, improved), data.options.floor * data.readings.spread())
+    floor = data.options.floor * data.readings.spread()
+    return np.asarray(np.maximum(np.minimum(error, improved), floor))
 
 
 def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:

@@ -171,12 +171,26 @@ class SpecimenData:
         target = np.where(is_read, readings.values, 0.0)
         if emulation.offsets is not None:
             target = target - emulation.offsets
-        arrays = [target, np.broadcast_to(emulation.error, target.shape), error, relative]
-        columns, count = None, is_read.sum(axis=1).max()
+        of_emulator = np.broadcast_to(emulation.error, target.shape)
+        columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
         if 2 * count <= is_read.shape[1]:
             columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
-            arrays = [np.take_along_axis(values, columns, axis=1) for values in arrays]
-        return Residuals(emulation, *arrays, population, self.known, self.box, self.order, columns)
+            target, of_emulator, error, relative = (
+                np.take_along_axis(values, columns, axis=1)
+                for values in (target, of_emulator, error, relative)
+            )
+        return Residuals(
+            emulation,
+            target,
+            of_emulator,
+            error,
+            relative,
+            population,
+            self.known,
+            self.box,
+            self.order,
+            columns,
+        )
 
 
 def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:
