@@ -461,57 +461,94 @@ def _eight(number: int) -> Instance:
     return Instance(_problem(priors, inputs, outputs), y, reference)
 
 
-def fibre_nodes(y: Any, nodes: int, seed: int, starts: int = 7) -> tuple[Any, Any]:
+def fibre_nodes(y: Any, nodes: int, seed: int, charts: int = 6, starts: int = 3) -> tuple[Any, Any]:
     """Return inputs (N, K, 8) and log weights (N, K) of four readings of eight inputs.
 
-    Sobol points of a normal distribution in the null space of the Jacobian at a specimen's most
-    probable inputs, and Newton's method in its row space: from these points, and from others, so that
-    several roots of a node count.
+    A chart has Sobol points of a normal distribution in the null space of the Jacobian at a point of
+    the fibre, and Newton's method in its row space from fixed starts. A node counts with the density of
+    all charts in which Newton's method reaches it: a fold of one chart has no large weights, and a root
+    that one chart misses is found in another.
     """
-    center, scale, (n, m) = _EIGHT.mean, 1.2 * _EIGHT.sd, y.shape
+    rng = np.random.default_rng(seed)
+    fibres = [_fibre(target, y.std(axis=0), nodes, rng, charts, starts) for target in y]
+    longest = max(len(log_a) for _, log_a in fibres)
+    x = np.zeros((len(y), longest, 8))
+    log_a = np.full((len(y), longest), -np.inf)
+    for i, (points, logs) in enumerate(fibres):
+        x[i, : len(logs)], log_a[i, : len(logs)] = points, logs
+    return x, log_a
+
+
+def _fibre(
+    y: Any, spread: Any, nodes: int, rng: np.random.Generator, charts: int, starts: int
+) -> tuple[Any, Any]:
+    """Return inputs (K, 8) and log weights (K,) of the readings (4,) of a specimen."""
+    center, scale, sd = _EIGHT.mean, 1.2 * _EIGHT.sd, 1.1
+    m = len(y)
 
     def f(z: Any) -> Any:
         return _EIGHT.of_columns(*np.moveaxis(center + scale * z, -1, 0))
 
     def slopes(z: Any, directions: Any, step: float = 1e-5) -> Any:
-        both = [f(z + step * v) - f(z - step * v) for v in np.moveaxis(directions, -1, 0)]
+        both = [f(z + step * v) - f(z - step * v) for v in directions]
         return np.stack(both, axis=-1) / (2 * step)
 
-    z = np.zeros((n, 8))
-    for _ in range(60):  # Gauss-Newton on |z|^2 subject to f(z) = y
-        j = slopes(z, np.eye(8))
-        target = np.einsum("nmd,nd->nm", j, z) - f(z) + y
-        step = np.einsum("ndm,nm->nd", np.linalg.pinv(j), target) - z
-        z += step * np.minimum(1, 0.7 / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12))
-    basis = np.linalg.svd(slopes(z, np.eye(8)))[2]
-    rows, null = basis[:, :m], basis[:, m:]
-    xi = 1.2 * stats.norm.ppf(stats.qmc.Sobol(8 - m, seed=seed).random(nodes))
-    log_q = stats.norm.logpdf(xi, 0, 1.2).sum(axis=1) + np.log(nodes)
-    base = z[:, None] + np.einsum("nfd,kf->nkd", null, xi)
-    directions = np.swapaxes(np.broadcast_to(rows[:, None], (n, nodes, m, 8)), 2, 3)
-    rng = np.random.default_rng(seed)
-    roots: list[Any] = []
-    logs = []
-    for shift in np.arange(starts) > 0:
-        t = 1.5 * shift * rng.standard_normal((n, nodes, m))
-        for _ in range(18):
-            x = base + np.einsum("nkds,nks->nkd", directions, t)
-            value = f(x)
-            shifted = [f(x + 1e-6 * v) - value for v in np.moveaxis(directions, -1, 0)]
-            j = np.stack(shifted, axis=-1) / 1e-6 + 1e-9 * np.eye(m)
-            step = np.linalg.solve(j, (y[:, None] - value)[..., None])[..., 0]
-            t += step * np.minimum(1, 1 / np.linalg.norm(step, axis=2, keepdims=True).clip(1e-12))
-        x = base + np.einsum("nkds,nks->nkd", directions, t)
-        is_new = (np.abs(f(x) - y[:, None]) / y.std(axis=0)).max(axis=2) < 1e-7
-        for other in roots:
-            is_new &= np.abs(x - other).max(axis=2) > 1e-4
-        log_det = np.linalg.slogdet(slopes(x, directions))[1] - np.log(scale).sum()
-        roots.append(x)
-        logs.append(np.where(is_new, -log_det - log_q, -np.inf))
-    x, log_a = np.concatenate(roots, axis=1), np.concatenate(logs, axis=1)
-    order = np.argsort(-log_a, axis=1)[:, : np.isfinite(log_a).sum(axis=1).max()]
-    x = np.take_along_axis(x, order[..., None], axis=1)
-    return center + scale * x, np.take_along_axis(log_a, order, axis=1)
+    def roots(null: Any, rows: Any, eta: Any, start: Any) -> tuple[Any, Any]:
+        """Return the ends of Newton's method at coordinates (k, 4), and which are roots."""
+        base, t = eta @ null, np.tile(start, (len(eta), 1))
+        active = np.arange(len(eta))
+        for _ in range(25):
+            z = base[active] + t[active] @ rows
+            j = slopes(z, rows) + 1e-12 * np.eye(m)
+            step = np.linalg.solve(j, (y - f(z))[..., None])[..., 0]
+            step *= np.minimum(1, 1 / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12))
+            t[active] += step
+            active = active[np.abs(step).max(axis=1) > 1e-9]
+            if not active.size:
+                break
+        z = base + t @ rows
+        is_root = (np.abs(f(z) - y) / spread).max(axis=1) < 1e-7
+        is_root[active] = False
+        return z, is_root
+
+    # Charts at points of the fibre near random inputs.
+    origins = np.zeros((0, 8))
+    while len(origins) < charts:
+        z = rng.standard_normal((4 * charts, 8)) / 1.2
+        for _ in range(30):  # Gauss-Newton, the shortest step
+            step = np.einsum("ndm,nm->nd", np.linalg.pinv(slopes(z, np.eye(8))), y - f(z))
+            z += step * np.minimum(1, 0.7 / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12))
+        is_near = (np.abs(f(z) - y) < 1e-6 * spread).all(axis=1) & ((z**2).sum(axis=1) < 16)
+        origins = np.concatenate([origins, z[is_near]])
+    bases = np.linalg.svd(slopes(origins[:charts], np.eye(8)))[2]
+    all_starts = rng.standard_normal((charts, starts, m))
+    all_starts[:, 0] = np.einsum("cmd,cd->cm", bases[:, :m], origins[:charts])
+    found = []
+    for basis, of_chart in zip(bases, all_starts, strict=True):
+        sobol = stats.qmc.Sobol(8 - m, rng=rng).random(nodes)
+        eta = sd * stats.norm.ppf(np.clip(sobol, 1e-12, 1 - 1e-12))
+        before: list[Any] = []
+        for start in of_chart:
+            z, is_new = roots(basis[m:], basis[:m], eta, start)
+            for other, is_root in before:
+                is_new &= ~(is_root & (np.abs(z - other).max(axis=1) < 1e-4))
+            before.append((z, is_new))
+            found.append(z[is_new])
+    z = np.concatenate(found)
+    total = np.full(len(z), -np.inf)
+    for basis, of_chart in zip(bases, all_starts, strict=True):
+        eta, left = z @ basis[m:].T, np.arange(len(z))
+        log_q = stats.norm.logpdf(eta, 0, sd).sum(axis=1)
+        log_q = log_q + np.linalg.slogdet(slopes(z, basis[:m]))[1]
+        for start in of_chart:
+            end, is_root = roots(basis[m:], basis[:m], eta[left], start)
+            is_reached = is_root & (np.abs(end - z[left]).max(axis=1) < 1e-4)
+            rows = left[is_reached]
+            total[rows] = np.logaddexp(total[rows], log_q[rows])
+            left = left[~is_reached]
+    is_reached = np.isfinite(total)
+    log_a = np.log(scale).sum() - total[is_reached] - np.log(nodes)
+    return center + scale * z[is_reached], log_a
 
 
 def _virkler(number: int) -> Instance:

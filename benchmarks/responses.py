@@ -70,7 +70,7 @@ def eight(x: Any) -> Any:
     """Return four outputs of eight inputs: exponential, quadratic forms and products in a sine."""
     z = (x - 2) / 0.5
     exponentials = np.exp(0.35 * z @ _LINEAR.T)
-    forms = np.einsum("ni,kij,nj->nk", z, _QUADRATIC, z)
+    forms = np.einsum("kni,ni->nk", z @ _QUADRATIC, z)
     products = np.stack([z[:, k] * z[:, (k + 3) % 8] for k in range(4)], axis=-1)
     return exponentials + 0.3 * forms + 0.3 * np.sin(products)
 

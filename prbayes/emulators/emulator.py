@@ -18,9 +18,14 @@ from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
 from prbayes.numerics.threads import one_thread
 
-# Surfaces that compete; a Matern process is better for kinks and jumps.
-CANDIDATES: tuple[Surface, ...] = (GaussianProcess(), RadialBasis("quintic", degree="best"))
-ROUGH_CANDIDATES: tuple[Surface, ...] = (*CANDIDATES, GaussianProcess("matern"))
+# Surfaces that compete. Quadratic trends save runs of smooth responses with many inputs; a Matern
+# process is better for kinks and jumps.
+CANDIDATES: tuple[Surface, ...] = (GaussianProcess(degree=2), RadialBasis("quintic", degree="best"))
+ROUGH_CANDIDATES: tuple[Surface, ...] = (
+    GaussianProcess(),
+    GaussianProcess("matern"),
+    CANDIDATES[1],
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,9 +133,9 @@ class Kriging:
             steepness, *by_axis = factors @ slope
             values[rows] = steepness if value is slope else self.weights @ value
             jacobian[rows] = ((by_axis - points * steepness) / self.lengths[:, None]).T
-            single = self.polynomials.by_input(z[rows])
-            values[rows] += self.coefficients @ self.polynomials.terms(single)
-            self._add_slopes(single, jacobian[rows])
+            trend, slopes = self._trend(z[rows])
+            values[rows] += trend
+            jacobian[rows] += slopes
         return values, jacobian
 
     def values(self, z: Floats) -> Floats:
@@ -146,7 +146,7 @@ class Kriging:
         kernel, values = KERNELS[self.kernel], np.empty(len(z))
         for rows, _, square in self._distances(z):
             values[rows] = self.weights @ kernel(square)[0]
-            values[rows] += self.coefficients @ self.polynomials(z[rows])
+            values[rows] += self._trend(z[rows])[0]
         return values
 
     def variance(self, z: Floats) -> Floats:
@@ -217,18 +217,38 @@ class Kriging:
         pieces = [-comb(5, p) * (side * distances**p) @ weights for p in range(6)]
         return PPoly(np.stack(pieces), ends), self.coefficients
 
-    def _add_slopes(self, single: Floats, jacobian: Floats) -> None:
-        """Add the polynomial's slopes to a Jacobian, (k, d), from the polynomials of each input."""
+    def _trend(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values, (k,), and slopes, (k, d), of the polynomial at points, (k, d)."""
         polynomials = self.polynomials
-        if len(single) == 2:  # constant slopes
-            linear = self.coefficients[polynomials.powers.argmax(axis=0)]
-            jacobian += linear / polynomials.half_width
-            return
+        if self.degree <= 2:
+            # A quadratic form takes less time than products of polynomials.
+            constant, linear, hessian = self._quadratic_form
+            u = polynomials.scaled(z).T
+            slopes = u @ hessian + linear
+            values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
+            return values, slopes / polynomials.half_width
+        single = polynomials.by_input(z)
         derivative = legder(np.eye(len(single)))  # columns of Legendre series
+        slopes = np.empty(z.shape)
         for a, half_width in enumerate(polynomials.half_width):
             factors = single.copy()
             factors[:, a] = derivative.T @ single[:-1, a]
-            jacobian[:, a] += self.coefficients @ polynomials.terms(factors) / half_width
+            slopes[:, a] = self.coefficients @ polynomials.terms(factors) / half_width
+        return self.coefficients @ polynomials.terms(single), slopes
+
+    @cached_property
+    def _quadratic_form(self) -> tuple[float, Floats, Floats]:
+        """Constant, slopes, (d,), and second derivatives, (d, d), of a polynomial of degree two."""
+        powers, coefficients = self.polynomials.powers, self.coefficients
+        degrees = powers.sum(axis=1)
+        # Squares are of P_2(u) = (3 u^2 - 1) / 2.
+        is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
+        products = powers[is_product]
+        hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
+        of_squares = powers[is_square].T @ coefficients[is_square]
+        np.fill_diagonal(hessian, 1.5 * of_squares)
+        constant = coefficients[degrees == 0].sum() - 0.25 * of_squares.sum()
+        return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield rows of a block of points, the points (d, k) and squared distances to runs (n, k).

@@ -46,6 +46,24 @@ def test_lengths_are_those_of_inputs_that_matter_and_remain_without_runs() -> No
     np.testing.assert_allclose(without.values(at), same.through(x[~mask], y[~mask])(at), atol=1e-6)
 
 
+def test_a_quadratic_trend_is_taken_where_runs_determine_it() -> None:
+    x = np.random.default_rng(3).standard_normal((60, 6))
+    y = x[:, 0] * x[:, 1] + x[:, 2] ** 2 + 0.05 * np.sin(2 * x[:, 3] * x[:, 4])
+    at = np.random.default_rng(4).standard_normal((500, 6))
+    exact = at[:, 0] * at[:, 1] + at[:, 2] ** 2 + 0.05 * np.sin(2 * at[:, 3] * at[:, 4])
+    plane, quadratic, few = (
+        GaussianProcess(degree=degree).fit(x[:n], y[:n], np.full(n, 1 / n))
+        for degree, n in ((1, 60), (2, 60), (2, 40))
+    )
+    assert plane is not None
+    assert quadratic is not None
+    assert few is not None
+    # 28 coefficients need 56 runs.
+    assert (plane.degree, quadratic.degree, few.degree) == (1, 2, 1)
+    errors = [np.abs(surface.values(at) - exact).mean() for surface in (plane, quadratic)]
+    assert errors[1] < errors[0] / 2
+
+
 def test_nearly_equal_points_and_constant_responses() -> None:
     x, y = points()
     twice = np.concatenate([x, x + 1e-12])
