@@ -375,14 +375,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def row(name: str, number: int) -> dict[str, Any]:
     """Return the row of a data set."""
     problem = PROBLEMS[name]
-    return data_set(problem, base_likelihood(name), number)
+    return data_set(problem, base_likelihood(name)[1], number)
 
 
 @cache
-def base_likelihood(name: str) -> SpecimenLikelihood:
-    """Return the likelihood of a problem, whose first runs serve all data sets."""
-    _model, likelihood = likelihood_of(PROBLEMS[name])
-    return likelihood
+def base_likelihood(name: str) -> tuple[pm.Model, SpecimenLikelihood]:
+    """Return a model with the likelihood of a problem, whose first runs serve all data sets."""
+    return likelihood_of(PROBLEMS[name])
 
 
 STUDY = Study("likelihood_coverage", __doc__, PROBLEMS, row, 400, summary, has_rows=False)

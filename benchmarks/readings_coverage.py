@@ -17,6 +17,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytensor.tensor as pt
 from scipy.special import logsumexp, ndtr
 
@@ -391,14 +392,13 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def row(name: str, number: int) -> dict[str, Any]:
     """Return the row of a data set."""
-    return data_set(CASES[name], base_likelihood(name), number)
+    return data_set(CASES[name], base_likelihood(name)[1], number)
 
 
 @cache
-def base_likelihood(name: str) -> SpecimenLikelihood:
-    """Return the likelihood of a case, whose first runs serve all data sets."""
-    _model, likelihood = likelihood_of(CASES[name].problem, CASES[name].measurement)
-    return likelihood
+def base_likelihood(name: str) -> tuple[pm.Model, SpecimenLikelihood]:
+    """Return a model with the likelihood of a case, whose first runs serve all data sets."""
+    return likelihood_of(CASES[name].problem, CASES[name].measurement)
 
 
 STUDY = Study("readings_coverage", __doc__, CASES, row, 100, table, has_rows=False)

@@ -8,7 +8,7 @@ nothing is wrong) and power is likelihood_guards, sections 2.6 to 2.9.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -542,10 +542,11 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
 
 
 def refuse_unused_inputs(
-    name: str, z: Floats, outputs: Floats, inputs: Sequence[str], smallest: float = 1e-3
+    name: str, z: Floats, outputs: Floats, inputs: Mapping[int, str], smallest: float = 1e-3
 ) -> None:
     """Raise if the first runs, (n, d) -> (n, m), show a direction of the inputs without influence.
 
+    ``inputs`` are names by column of z; those of conditions, which are known, are not among them.
     The influence is relative to the direction with the largest, at the median run. Responses whose
     inputs all matter have .05 and more, others 1e-4 and less.
     """
@@ -555,11 +556,11 @@ def refuse_unused_inputs(
         return
     z, outputs = z[is_finite], outputs[is_finite]
     surface = fit_emulator(z, outputs)
-    _, jacobian = surface(z)
+    jacobian = surface(z)[1][:, :, list(inputs)]
     spread = outputs.std(axis=0)
     values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
-        raise _undetermined(name, m, directions, inputs)
+        raise _undetermined(name, m, directions, list(inputs.values()))
 
 
 def _singular(jacobian: Floats) -> tuple[Floats, Floats]:

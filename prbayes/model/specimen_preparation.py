@@ -183,7 +183,9 @@ class Runs:
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and not self.outputs:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
-            refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
+            names = dict(enumerate(_coordinate_names(likelihood)))
+            of_population = {k: names[k] for k in likelihood.coordinates.inputs_of_population}
+            refuse_unused_inputs(likelihood.name, z, values, of_population)
             if not any(
                 m.metric.error is not None or m.gross_errors is not False for m in measurements
             ):

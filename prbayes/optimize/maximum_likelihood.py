@@ -564,7 +564,7 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
         if likelihood.readings.is_censored.any():
             return f"readings of {likelihood.name} are censored, and new ones cannot be drawn"
         is_measured = likelihood.readings.is_measured
-        if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
+        if (is_measured.sum(axis=1) < len(likelihood.coordinates.inputs_of_population)).any():
             return f"specimens of {likelihood.name} have fewer readings than inputs"
         if not likelihood.error_is_known:
             return f"the error of the readings of {likelihood.name} is unknown"

@@ -202,10 +202,11 @@ def _population_obstacle(optimum: Optimum) -> str:
         return unknown
     for likelihood in evaluator.likelihoods:
         outputs = likelihood.readings.values.shape[1]
-        if likelihood.coordinates.size > outputs:
+        count = len(likelihood.coordinates.inputs_of_population)
+        if count > outputs:
             return (
-                f"{likelihood.name} has fewer outputs ({outputs}) than inputs "
-                f"({likelihood.coordinates.size}), with which the test has no power"
+                f"{likelihood.name} has fewer outputs ({outputs}) than inputs ({count}), with "
+                "which the test has no power"
             )
     return ""
 

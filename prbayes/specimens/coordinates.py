@@ -72,8 +72,13 @@ class Coordinates:
 
     @property
     def size(self) -> int:
-        """Number of aleatory numbers of a specimen, d."""
+        """Number of aleatory numbers of a specimen, d, with its conditions."""
         return len(self.center)
+
+    @property
+    def inputs_of_population(self) -> NDArray[np.intp]:
+        """The coordinates that are not known for each specimen."""
+        return np.flatnonzero(~self.is_condition)
 
     def inputs(self, z: Floats) -> list[Floats]:
         """Return the aleatory inputs, shapes (..., *event), of coordinates (..., d)."""

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import (
@@ -20,6 +21,7 @@ from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     specimen_likelihoods,
 )
+from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.propagation.resimulated import Resimulated
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ConditionRV, condition
@@ -194,6 +196,21 @@ def test_a_specimen_has_one_value_of_a_condition() -> None:
     conditions = likelihood.stacked.conditions
     assert conditions is not None
     assert len(conditions) == 6
+
+
+def test_conditions_are_no_inputs_of_the_population() -> None:
+    """Readings need not determine them, and data sets are drawn given them."""
+
+    def four_times(x: Any, load: Any) -> Any:
+        return np.asarray(load)[..., None] * np.exp(np.asarray(x)[..., None] - np.arange(4))
+
+    error = prb.LogLikelihood(error=0.05)
+    likelihood = likelihood_of(LOADS["linear"], four_times, metric=error)
+    logs = log_likelihoods(likelihood, {"mu": np.ones(1), "sigma": np.full(1, 0.2)})
+    assert np.isfinite(logs).all()
+    for response in (grown, four_times):
+        model = likelihood_of(LOADS["linear"], response, metric=error).cache["keep"]
+        assert simulation_obstacle(Evaluator.of(model)) is None
 
 
 def test_what_does_not_apply_is_refused() -> None:
