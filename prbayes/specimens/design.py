@@ -391,21 +391,24 @@ def audited(
     likely = Likely(plausible.proposals, points, population, weights)
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
-    # Among the quarter of them at which the emulator is the least certain.
+    # Half of the runs are among the quarter of them at which the emulator is the least certain.
     deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
     order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
-    scale = likely.scale(data)
-    runs = np.concatenate([emulation.z, sampled])
-    squares = np.min([(((candidates[order] - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
-    rows = order[farthest_rows(candidates[order] / scale, data.options.sampled // 2, squares)]
+    rows = rng.permutation(order)[: len(sampled)]
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
     z = np.concatenate([sampled, candidates[rows], possible])
-    is_new = _is_new(emulation.z, z, scale)
+    is_new = _is_new(emulation.z, z, likely.scale(data))
     outputs, misfit = _compared(run, emulation, z, is_new)
     at_audited, at_possible = np.split(misfit, [len(specimens)])
+    stratum = np.repeat([0.75, 0.25], len(sampled))
     error, bias = error_and_bias(
-        data, emulation, likely, z[: len(specimens)], specimens, at_audited
+        data,
+        emulation,
+        likely,
+        z[: len(specimens)],
+        specimens,
+        np.sqrt(2 * stratum)[:, None] * at_audited,
     )
     bias = max(bias, _bias_of_possible(data, at_possible))
     all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
