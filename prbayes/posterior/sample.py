@@ -251,7 +251,8 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    with evaluator.model:
+    # A step that overflows is a divergence.
+    with evaluator.model, np.errstate(over="ignore"):
         idata = pm.sample(
             settings.draws,
             chains=settings.chains,
