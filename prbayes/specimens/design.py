@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import chdtri, ndtri
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
@@ -119,8 +119,14 @@ class Likely:
         return data.scale(np.sqrt((self.population.root**2).sum(axis=1)))
 
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
-        """Return inputs, (count, d), that are likely under a population twice as wide."""
-        wide = Normal(self.population.mean, 2.0 * self.population.root)
+        """Return inputs, (count, d), that are likely under a wider population.
+
+        It is twice as wide with two inputs, and 1.5 times with eight: a typical specimen of it is
+        at the edge of the region that has 98 % of the population.
+        """
+        d = len(data.free)
+        width = np.sqrt(chdtri(d, 0.02) / d)
+        wide = Normal(self.population.mean, width * self.population.root)
         return self.sample(count, rng, likely_weights(data, self.points, wide))[0]
 
 
