@@ -445,7 +445,6 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         {"model": with_epsilon, "draws": 20},
         own="compile_kwargs evaluator log_likelihood start",
     ),
-    "posterior.Sampler": Row(function=(pm.sample, "sample", None), own="options"),
     "bootstrap": Row({"draws": 10}, draws=(1,)),
     "simulation_based_calibration": Row(
         n=(1,), draws=(5,), adjustment=(3, "affine"), own="adjustment"

@@ -68,7 +68,6 @@ MAKE: dict[str, Callable[[], Any]] = {
     "metrics.DensityEstimator": lambda: prb.Histogram(4),
     "metrics.Discrepancy": lambda: prb.AreaMetric().against(np.arange(9.0)),
     "metrics.Minimum": lambda: prb.metrics.Minimum.QUADRATIC,
-    "posterior.Sampler": lambda: prb.posterior.Sampler(prb.sample_smc, threshold=0.7),
     "propagation.DesignError": lambda: prb.propagation.DesignError("y: too thin"),
     "propagation.Propagation": lambda: prb.Fresh(16),
     "reports.Section": lambda: prb.reports.Section("A title"),
