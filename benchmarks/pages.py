@@ -367,11 +367,7 @@ def joint() -> Iterator[Row]:
     """Yield errors of joint calibration over those of maximum likelihood, by problem."""
     from benchmarks.joint import METHODS, PROBLEMS, grouped
 
-    schools = {
-        "joint": "`Joint`",
-        "correlation": "`MarginalCorrelation`",
-        "separate": "separate marginals",
-    }
+    schools = {"joint": "`Joint`", "separate": "separate marginals"}
     figures = summary("joint")
     for size, method in product((20, 50, 200), METHODS):
         cells = [figures.get(f"{problem}/{size}/{method}") for problem in PROBLEMS]

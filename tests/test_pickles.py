@@ -52,7 +52,6 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Joint": lambda: prb.Joint(prb.KullbackLeibler(), directions=5),
     "KullbackLeibler": prb.KullbackLeibler,
     "LogLikelihood": lambda: prb.LogLikelihood(density=prb.GaussianKDE()),
-    "MarginalCorrelation": lambda: prb.MarginalCorrelation(prb.AreaMetric(), weights=(1.0, 2.0)),
     "Metric": lambda: prb.ProbabilityResidual(density=prb.Histogram(4)),
     "Optimum": optimum,
     "ProbabilityResidual": prb.ProbabilityResidual,
