@@ -477,17 +477,6 @@ def at_a_fold() -> Iterator[Row]:
         yield [metric, *(f"{short(row['mu'])} / {short(row['sigma'])}" for row in rows)]
 
 
-def two_fidelities() -> Iterator[Row]:
-    """Yield errors with a coarse response and without."""
-    from benchmarks.two_fidelities import RUNS, WAYS
-
-    table = summary("two_fidelities")
-    for n in RUNS:
-        emulators = [short(table[f"emulator/{n}/{way}"]) for way in WAYS]
-        optima = [short(table[f"optimum/{n}/{way}"], 3) for way in WAYS]
-        yield [str(n), *emulators, *optima]
-
-
 def plans() -> Iterator[Row]:
     """Yield expected and found standard deviations."""
     labels = {
@@ -700,7 +689,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
-    "two fidelities": two_fidelities,
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,
