@@ -1,9 +1,9 @@
 """Several outputs calibrated jointly: errors of the estimates beside those of maximum likelihood.
 
 Each problem has a true population. Many data sets are drawn from it, and each is calibrated by
-separate marginals (a simulator an output), by `MarginalCorrelation` and by `Joint`, each under three
-metrics of one output, and by maximum likelihood. Bandwidths and whitening are chosen from each data
-set anew. The design is drawn near the truth, once for all data sets.
+separate marginals (a simulator an output) and by `Joint`, each under three metrics of one output, and
+by maximum likelihood. Bandwidths and whitening are chosen from each data set anew. The design is
+drawn near the truth, once for all data sets.
 
 Errors are those of means in units of the population's spread, of logarithms of standard deviations
 and of inverse hyperbolic tangents of correlations.
@@ -31,7 +31,7 @@ from prbayes.optimize.minimize import find_optimum
 from prbayes.optimize.objective import Minimisation
 
 SIZES = (20, 50, 200)
-SCHOOLS = ("joint", "correlation", "separate")
+SCHOOLS = ("joint", "separate")
 METHODS = tuple(f"{s} {metric}" for s, metric in product(SCHOOLS, ("PR", "KLD", "area")))
 _FEW = 8  # specimens of the data sets whose estimates are the populations of the design
 
@@ -237,8 +237,7 @@ def calibrated(name: str, size: int, method: str, x: Any) -> tuple[Evaluator, An
         data = {f"y{k}": outputs[:, k] for k in range(outputs.shape[1])}
         evaluator = base.observing(data, METRICS[metric])
     else:
-        lift = prb.MarginalCorrelation if school == "correlation" else prb.Joint
-        evaluator = base.observing({"y": outputs}, lift(METRICS[metric]))
+        evaluator = base.observing({"y": outputs}, prb.Joint(METRICS[metric]))
     free = {rv.name for rv in evaluator.model.free_RVs}
     truth = {k: value[0] for k, value in true_values(problem).items() if k in free}
     optimum = find_optimum(evaluator, Minimisation(starts=0, refine=False, start=truth))

@@ -367,11 +367,7 @@ def joint() -> Iterator[Row]:
     """Yield errors of joint calibration over those of maximum likelihood, by problem."""
     from benchmarks.joint import METHODS, PROBLEMS, grouped
 
-    schools = {
-        "joint": "`Joint`",
-        "correlation": "`MarginalCorrelation`",
-        "separate": "separate marginals",
-    }
+    schools = {"joint": "`Joint`", "separate": "separate marginals"}
     figures = summary("joint")
     for size, method in product((20, 50, 200), METHODS):
         cells = [figures.get(f"{problem}/{size}/{method}") for problem in PROBLEMS]
@@ -479,17 +475,6 @@ def at_a_fold() -> Iterator[Row]:
     for metric in COMPARED:
         rows = [table[f"{r}/{n}/{metric}"] for r, n in product(RESPONSES, (50, 200))]
         yield [metric, *(f"{short(row['mu'])} / {short(row['sigma'])}" for row in rows)]
-
-
-def two_fidelities() -> Iterator[Row]:
-    """Yield errors with a coarse response and without."""
-    from benchmarks.two_fidelities import RUNS, WAYS
-
-    table = summary("two_fidelities")
-    for n in RUNS:
-        emulators = [short(table[f"emulator/{n}/{way}"]) for way in WAYS]
-        optima = [short(table[f"optimum/{n}/{way}"], 3) for way in WAYS]
-        yield [str(n), *emulators, *optima]
 
 
 def plans() -> Iterator[Row]:
@@ -704,7 +689,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
-    "two fidelities": two_fidelities,
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from prbayes.emulators.surrogate import Surrogate as Surrogate
     from prbayes.metrics.area import AreaMetric as AreaMetric
     from prbayes.metrics.base import Metric as Metric
-    from prbayes.metrics.correlation import MarginalCorrelation as MarginalCorrelation
     from prbayes.metrics.custom import FunctionMetric as FunctionMetric
     from prbayes.metrics.density import GaussianKDE as GaussianKDE
     from prbayes.metrics.density import Histogram as Histogram
@@ -77,7 +76,6 @@ _NAMES = {
     "emulators.surrogate": ("Surrogate",),
     "metrics.area": ("AreaMetric",),
     "metrics.base": ("Metric",),
-    "metrics.correlation": ("MarginalCorrelation",),
     "metrics.custom": ("FunctionMetric",),
     "metrics.density": ("GaussianKDE", "Histogram"),
     "metrics.divergence": ("KullbackLeibler", "ProbabilityResidual"),

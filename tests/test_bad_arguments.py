@@ -387,10 +387,6 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         rounded=("a", -1.0),
     ),
     "Joint": Row(metric=JOINED),
-    "MarginalCorrelation": Row(
-        metric=JOINED,
-        weights=([1.0, 1.0], (1.0, "a"), (1.0, 0.0), (1.0,), (1.0, -2.0), (np.nan, 1.0)),
-    ),
     "GaussianKDE": Row(bandwidth=POSITIVE),
     "Histogram": Row(bins=([3.0, 2.0, 1.0],)),
     "a metric": Row(
@@ -445,7 +441,6 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         {"model": with_epsilon, "draws": 20},
         own="compile_kwargs evaluator log_likelihood start",
     ),
-    "posterior.Sampler": Row(function=(pm.sample, "sample", None), own="options"),
     "bootstrap": Row({"draws": 10}, draws=(1,)),
     "simulation_based_calibration": Row(
         n=(1,), draws=(5,), adjustment=(3, "affine"), own="adjustment"

@@ -226,7 +226,7 @@ def continued(runs: Runs, *inputs: ArrayLike) -> Any:
     inner = np.clip(unit, 0, 1)
     values = surrogate._at(domain.at(inner))
     rows = np.flatnonzero(domain.outside(columns).any(axis=1))
-    _, jacobian = surrogate._surface.emulator.alone(inner[rows])
+    _, jacobian = surrogate._surface.emulator(inner[rows])
     change = np.einsum("kmd,kd->km", jacobian, unit[rows] - inner[rows])
     values[rows] += change.reshape(values[rows].shape)
     return labelled(surrogate, values, batch)

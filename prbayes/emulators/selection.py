@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from prbayes._display import without_constructor
 from prbayes._validate import Floats
-from prbayes.emulators.following import FollowingEmulator, fit_following
+from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
 
@@ -94,7 +94,6 @@ class Runs:
     y: Floats  # (n, m): outputs; a run that is not finite in one of them has none
     importance: Floats  # (n,): mean weights in the relevant populations; they sum to one
     blocks: NDArray[np.intp]  # (n,): block of each run; each block is spread over all runs
-    coarse: Floats | None = None  # (n, m): outputs of a coarse response; as y, if not finite
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
@@ -122,7 +121,7 @@ class Runs:
         """The runs of each block, (B, n)."""
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
-    def fit(self, tried: Sequence[Surface]) -> FollowingEmulator:
+    def fit(self, tried: Sequence[Surface]) -> Emulator:
         """Return the emulator with the smallest left-out errors, weighted by importance.
 
         Raises numpy.linalg.LinAlgError if no surface can be fitted.
@@ -131,28 +130,21 @@ class Runs:
         usable = [model for model in tried if 2 * len(rows) >= 3 * model.terms(d)]
         # Part of the importance is uniform: the errors of a few runs alone would be noise.
         near = self.importance[rows] + 0.1 / len(self.y)
-        coarse = None if self.coarse is None else self.coarse[rows]
-        x, y = self.scaled(self.x[rows]), self.y[rows]
-        return fit_following(x, y, coarse, near, tried=usable)
+        return fit_emulator(self.scaled(self.x[rows]), self.y[rows], near, tried=usable)
 
     def predict(
-        self,
-        emulator: FollowingEmulator,
-        at: Floats,
-        coarse: Floats | None = None,
-        without: NDArray[np.bool_] | None = None,
+        self, emulator: Emulator, at: Floats, without: NDArray[np.bool_] | None = None
     ) -> Floats:
         """Return outputs at points, (k, d) -> (k, m), by an emulator without some runs, (n,).
 
         Where the nearest run failed, the outputs are those of that run. Predictions are at most one
-        range of the runs' outputs beyond them. ``coarse``, (k, m), is a coarse response at the
-        points.
+        range of the runs' outputs beyond them.
         """
         mask = np.ones(len(self.x), dtype=bool) if without is None else ~without
         y, points = self.y[mask & self.good], self.scaled(at)
         lowest, highest = y.min(axis=0), y.max(axis=0)
         reach = highest - lowest
-        values = np.clip(emulator.values(points, coarse), lowest - reach, highest + reach)
+        values = np.clip(emulator.values(points), lowest - reach, highest + reach)
         if not self.good[mask].all():
             from scipy.spatial import cKDTree
 
@@ -162,18 +154,16 @@ class Runs:
             values[failed] = self.y[nearest[failed]]
         return values
 
-    def predict_without_blocks(
-        self, emulator: FollowingEmulator, at: Floats, coarse: Floats | None = None
-    ) -> Iterator[Floats]:
+    def predict_without_blocks(self, emulator: Emulator, at: Floats) -> Iterator[Floats]:
         """Yield the predictions, (k, m), of emulators without each block of the runs."""
         emulators = emulator.without_each(self.block_masks[:, self.rows])
         for block, without in zip(self.block_masks, emulators, strict=True):
-            yield self.predict(without, at, coarse, block)
+            yield self.predict(without, at, block)
 
-    def left_out_predictions(self, emulator: FollowingEmulator) -> Floats:
+    def left_out_predictions(self, emulator: Emulator) -> Floats:
         """Return the predictions at the runs, (n, m), of emulators without the block of each."""
         values = np.empty_like(self.y)
-        predictions = self.predict_without_blocks(emulator, self.x, self.coarse)
+        predictions = self.predict_without_blocks(emulator, self.x)
         for block, at_runs in zip(self.block_masks, predictions, strict=True):
             values[block] = at_runs[block]
         return values

@@ -26,8 +26,8 @@ from prbayes._validate import (
     seed_number,
     share,
 )
-from prbayes.emulators.emulator import ROUGH_CANDIDATES
-from prbayes.emulators.following import FollowingEmulator, fit_following
+from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator, fit_emulator
+from prbayes.emulators.following import Follower, fit_follower
 from prbayes.emulators.io import read, write
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
@@ -57,8 +57,10 @@ class FittedSurface:
     unit: Floats  # (n, d): the design in the unit cube
     usable: NDArray[np.bool_]  # (n,): which runs have only finite outputs
     event: tuple[int, ...]  # shape of a response
-    emulator: FollowingEmulator  # fitted in the unit cube
-    coarse: Callable[..., Any] | None  # the coarse response that it follows
+    emulator: Emulator  # fitted in the unit cube
+    # The coarse response that the surface follows, and the emulator that does so.
+    coarse: Callable[..., Any] | None = None
+    follower: Follower | None = None
 
     @classmethod
     def of(
@@ -74,23 +76,30 @@ class FittedSurface:
         """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller."""
         unit, usable = domain.scaled(points), _usable(responses)
         x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
-        of_usable = None
-        if coarse_values is not None:
-            # Fixed parts are left out, so that a file of the surrogate follows in the same way.
-            of_usable, seed = coarse_values[usable, None], 0
-        emulator = fit_following(x, y, of_usable, tried=[as_surface(model)], seed=seed)
-        is_followed = any(follower is not None for follower in emulator.following)
-        event = responses.shape[1:]
-        return cls(domain, unit, usable, event, emulator, coarse if is_followed else None)
+        # Beside a coarse response fixed parts are left out, so that a file of the surrogate follows
+        # in the same way.
+        seed = seed if coarse_values is None else 0
+        surface = as_surface(model)
+        emulator = fit_emulator(x, y, tried=[surface], seed=seed)
+        fitted = cls(domain, unit, usable, responses.shape[1:], emulator)
+        if coarse_values is None:
+            return fitted
+        left_out = emulator.left_out[:, 0]
+        follower = fit_follower(x, y[:, 0], coarse_values[usable], left_out, surface)
+        if follower is None:
+            return fitted
+        return replace(fitted, coarse=coarse, follower=follower)
 
     def __call__(self, columns: Floats) -> Floats:
         """Return values at rows inside the ranges, (n,) or (n, m)."""
         # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
-        if self.coarse is None:
-            return self.emulator.values(unit).reshape(-1, *self.event)
+        values = self.emulator.values(unit).reshape(-1, *self.event)
+        if self.coarse is None or self.follower is None:
+            return values
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
-        n_lost = (~np.isfinite(coarse)).sum()
+        is_finite = np.isfinite(coarse)
+        n_lost = (~is_finite).sum()
         if n_lost:
             report(
                 Finding(
@@ -100,13 +109,17 @@ class FittedSurface:
                     "many.",
                 )
             )
-        return self.emulator.values(unit, coarse[:, None])[:, 0]
+        values[is_finite] = self.follower.values(unit[is_finite], coarse[is_finite])
+        return values
 
     @property
     def left_out(self) -> Floats:
         """Left-out errors, (n,) or (n, m); NaN without a response."""
         left_out = np.full((len(self.usable), *self.event), np.nan)
-        left_out[self.usable] = self.emulator.left_out.reshape(-1, *self.event)
+        errors = self.emulator.left_out.copy()
+        if self.follower is not None:
+            errors[self.follower.rows] = self.follower.emulator.left_out
+        left_out[self.usable] = errors.reshape(-1, *self.event)
         return left_out
 
     def probes(self) -> Floats:
@@ -243,8 +256,7 @@ class Surrogate(Shown):
         coarse : callable, optional
             A cheap approximation of a response of one output, such as that of a coarser mesh. The
             surrogate follows, and calls, it if that reduces the cross-validated error. Where it
-            raises, or is not finite, the surface continues without it, with a warning. Several
-            outputs follow one under ``prb.Reweighted(coarse=)``.
+            raises, or is not finite, the surface continues without it, with a warning.
         outside : OnFailure, optional
             `Replace` (default): points outside the ranges give its value, NaN, with a warning. A
             simulator with `Reweighted` reports them as lost mass, and refuses an answer that
@@ -693,8 +705,8 @@ def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool
     if has_coarse and responses.ndim > 1:
         raise ResponseError(
             f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
-            "outputs, expected a response of one; leave coarse= out, or use "
-            "prb.Reweighted(n, coarse=)"
+            "outputs, expected a response of one; leave coarse= out, or fit a surrogate to each "
+            "output"
         )
 
 

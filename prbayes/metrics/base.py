@@ -33,13 +33,12 @@ from prbayes.metrics.grid import product
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Some of the outputs less a center: a linear combination of them, or all in their units."""
+    """A linear combination of some of the outputs less a center."""
 
     outputs: NDArray[np.intp]  # (p,): indices
     caps: Floats  # (p,): the value of a specimen that failed
     center: Floats  # (p,); projections with the same array have the same outputs and caps
-    direction: Floats | None = None  # (p,): of the combination
-    unit: Floats | None = None  # (p,): of the outputs without a direction
+    direction: Floats  # (p,): coefficients of the combination
 
     def centered(self, simulated: Any, xp: Any = np) -> Any:
         """Return the outputs less the center, (..., n, p), a failure as the cap; NaN stays."""
@@ -47,18 +46,12 @@ class Projection:
         return xp.where(outputs >= np.inf, self.caps, outputs) - self.center
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the combination, (..., n), or the outputs in their units, (..., n, p)."""
-        outputs = self.centered(simulated, xp)
-        return outputs / self.unit if self.direction is None else outputs @ self.direction
+        """Return the combination, (..., n, m) -> (..., n)."""
+        return self.centered(simulated, xp) @ self.direction
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the projection of observed values, and the rows that have it.
-
-        A combination needs all outputs; without a direction all rows count.
-        """
-        index = np.arange(len(values))
-        if self.direction is not None:
-            index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
+        """Return the projection of observed values, and the rows that have all its outputs."""
+        index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
         return self.of(values[index]), index
 
 
@@ -294,8 +287,8 @@ def projected(
     outputs: Any = None
     for part in parts:
         view = part.projection
-        if view is None or view.direction is None:
-            yield part.target, part.of(simulated, xp)
+        if view is None:
+            yield part.target, simulated
             continue
         if view.center is not center:  # outputs are centred once for many directions
             center = view.center

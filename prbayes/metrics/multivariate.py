@@ -1,8 +1,7 @@
-"""Metrics of several outputs: sums of a metric of one number over projections, and `Joint`."""
+"""A metric of several outputs: the mean of a metric of one number over projections."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
@@ -20,7 +19,6 @@ from prbayes.metrics.base import (
     PartSum,
     Projection,
     StoredBasis,
-    joined,
 )
 from prbayes.metrics.whitening import (
     LEFT_OUT,
@@ -94,39 +92,23 @@ class CompositeDiscrepancy(Discrepancy):
         return replace(super().rows(index), members=parts)
 
     @cached_property
-    def _sums(self) -> list[tuple[list[int], PartSum]]:
-        """Components that are evaluated together, with their places; the last have one number."""
-        single = []
-        sums = []
-        for k, part in enumerate(self.members):
-            if part.target.event:
-                sums.append(([k], PartSum((part,))))
-            else:
-                single.append(k)
-        if single:
-            parts = tuple(self.members[k] for k in single)
-            sums.append((single, parts[0].target.together(parts)))
-        return sums
+    def _sum(self) -> PartSum:
+        """The components, evaluated together."""
+        return self.members[0].target.together(self.members)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the features of the components."""
-        return sum((terms.features(simulated, weights, xp) for _, terms in self._sums), ())
+        return self._sum.features(simulated, weights, xp)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the map from weights of stored values, (n, m), to features."""
         if not self.metric.symbolic:
             return StoredBasis((simulated,), self)
-        return joined([terms.basis(simulated, most) for _, terms in self._sums])
+        return self._sum.basis(simulated, most)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of the components, each times its share."""
-        total: Any = 0.0
-        last = len(self._sums) - 1
-        for i, (places, terms) in enumerate(self._sums):
-            # A component of several outputs has one feature; the others are of the last sum.
-            terms_features = features[i:] if i == last else features[i : i + 1]
-            total = total + terms.outer(terms_features, self.shares[..., places], xp)
-        return total
+        return self._sum.outer(features, self.shares, xp)
 
 
 def components_of(target: Discrepancy) -> tuple[Components, ...]:
@@ -137,66 +119,6 @@ def components_of(target: Discrepancy) -> tuple[Components, ...]:
 def components_summary(target: Discrepancy) -> str:
     """Return what principal components leave out."""
     return "; ".join(c.summary for c in components_of(target))
-
-
-# What a metric of several outputs declares as its metric of one output does.
-_DECLARED = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
-
-
-@dataclass(frozen=True)
-class LiftedMetric(Metric):
-    """A metric of several outputs, made of a metric of one, whose properties it has."""
-
-    metric: Metric
-    counts_failures: ClassVar[bool] = True
-    takes_outputs: ClassVar[bool] = True
-    additive = False
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
-            raise TypeError(
-                f"metric: got {called(self.metric)}, expected a metric of one output, such as "
-                "prb.ProbabilityResidual()"
-            )
-        for name in _DECLARED:
-            object.__setattr__(self, name, getattr(self.metric, name))
-
-    def like(self, metric: Metric) -> Metric:
-        """Return the same comparison of outputs by another metric of one."""
-        return replace(self, metric=metric)
-
-    def against(self, observed: ArrayLike, weights: ArrayLike | None = None) -> Discrepancy:
-        """Prepare the observed side.
-
-        Parameters
-        ----------
-        observed : array_like, shape (N, m)
-            Measured responses, a row for each specimen. NaN, or a mask, is an output that was not
-            measured, +inf a specimen that failed. The metric of one output takes shape (N,).
-        weights : array_like, shape (N,), optional
-            Weights of the specimens; equal by default.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the observed values are not real, if a specimen has no output, an output no specimen,
-            or too few for a comparison.
-        """
-        if real_array(observed, "observed").ndim < 2:
-            return self.metric.against(observed, weights)
-        return super().against(observed, weights)
-
-    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        if observed.shape[1] > 1:
-            return self._prepare_outputs(observed, weights)
-        target = self.metric.against(observed[:, 0], weights)
-        view = Projection(np.array([0]), np.array([np.inf]), np.zeros(1), np.ones(1))
-        parts = (Part(target, 1.0, "output", view),)
-        return CompositeDiscrepancy(self, observed, weights, parts, np.ones(1))
-
-    @abstractmethod
-    def _prepare_outputs(self, observed: Floats, weights: Floats) -> Discrepancy:
-        """Return the discrepancy of at least two outputs."""
 
 
 def failure_caps(observed: Floats) -> Floats:
@@ -257,8 +179,12 @@ def repelled(u: Floats, steps: int = 2000) -> Floats:
     return u
 
 
+# Attributes of a metric of one output that are those of its `Joint` metric too.
+_DECLARED = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
+
+
 @dataclass(frozen=True)
-class Joint(LiftedMetric):
+class Joint(Metric):
     r"""Several outputs of a specimen: the mean of a metric of one output over directions.
 
     The outputs are whitened: robust location and scatter of the observed values, t distribution
@@ -327,18 +253,61 @@ class Joint(LiftedMetric):
     True
     """
 
+    metric: Metric
     _: KW_ONLY
     directions: int | None = None
     components: int | None = None
     random_seed: int = 0
+    counts_failures: ClassVar[bool] = True
+    takes_outputs: ClassVar[bool] = True
+    additive = False
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
+            raise TypeError(
+                f"metric: got {called(self.metric)}, expected a metric of one output, such as "
+                "prb.ProbabilityResidual()"
+            )
+        for name in _DECLARED:
+            object.__setattr__(self, name, getattr(self.metric, name))
         if self.directions is not None:
             positive_integer(self.directions, "directions")
         if self.components is not None:
             positive_integer(self.components, "components")
         positive_integer(self.random_seed, "random_seed", minimum=0)
+
+    def like(self, metric: Metric) -> Metric:
+        """Return the same comparison of outputs by another metric of one."""
+        return replace(self, metric=metric)
+
+    def against(self, observed: ArrayLike, weights: ArrayLike | None = None) -> Discrepancy:
+        """Prepare the observed side.
+
+        Parameters
+        ----------
+        observed : array_like, shape (N, m)
+            Measured responses, a row for each specimen. NaN, or a mask, is an output that was not
+            measured, +inf a specimen that failed. The metric of one output takes shape (N,).
+        weights : array_like, shape (N,), optional
+            Weights of the specimens; equal by default.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the observed values are not real, if a specimen has no output, an output no specimen,
+            or too few for a comparison.
+        """
+        if real_array(observed, "observed").ndim < 2:
+            return self.metric.against(observed, weights)
+        return super().against(observed, weights)
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        if observed.shape[1] > 1:
+            return self._prepare_outputs(observed, weights)
+        target = self.metric.against(observed[:, 0], weights)
+        view = Projection(np.array([0]), np.array([np.inf]), np.zeros(1), np.ones(1))
+        parts = (Part(target, 1.0, "output", view),)
+        return CompositeDiscrepancy(self, observed, weights, parts, np.ones(1))
 
     def for_inputs(self, target: Discrepancy, n_inputs: int) -> Discrepancy:
         """Return the discrepancy of outputs of fewer inputs, which are on a surface."""

@@ -70,8 +70,7 @@ class Components:
         if self.left_out > LEFT_OUT and population > LEFT_OUT:
             return (
                 f"{self.summary}: noise that the model also has, whose size is estimated from few "
-                "directions; leave metric= out, for the log-likelihood by specimen, or use "
-                "prb.MarginalCorrelation(metric)"
+                "directions; leave metric= out, for the log-likelihood by specimen"
             )
         # Components of few data leave out more of a population than of the data.
         if population > 3 * LEFT_OUT:
@@ -170,8 +169,8 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
         transposed = "" if n > max(m, 3) else "; rows are specimens: is it transposed?"
         raise ValueError(
             f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
-            f"expected at least {m + 2} for {m} outputs; leave outputs out, or compare them by "
-            f"prb.MarginalCorrelation(metric){transposed}"
+            f"expected at least {m + 2} for {m} outputs; leave outputs out, or leave metric= out, "
+            f"for the log-likelihood by specimen{transposed}"
         )
     center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit

@@ -383,7 +383,8 @@ def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     designs = [bound.design for bound in evaluator.reweighted.values()]
     runs = max(len(design.runs) for design in designs)
     advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
-    if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
+    n_emulated = [0 if d.emulated is None else len(d.emulated[0]) for d in designs]
+    if min(n_emulated) >= SIZES.largest:
         advice = (
             f"the {runs} runs have the largest number of emulated points, {SIZES.largest}: more "
             "runs reduce only the part of the error that is due to the emulator, stated in "

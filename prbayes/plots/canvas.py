@@ -169,18 +169,13 @@ METRIC_LABELS = {
     "LogLikelihood": "log-likelihood",
     "ProbabilityResidual": "probability residual",
 }
-# Metrics of several outputs that are made of a metric of one.
-_LIFTED_LABELS = {
-    "Joint": "joint {}",
-    "MarginalCorrelation": "{} of marginals, with correlations",
-}
 
 
 def metric_label(representation: str) -> str:
     """Return the label of a metric by its representation, such as 'Joint(AreaMetric())'."""
-    lifted = re.match(r"(\w+)\((?:metric=)?(\w+)\(", representation)
-    if lifted and lifted[1] in _LIFTED_LABELS:
-        return _LIFTED_LABELS[lifted[1]].format(METRIC_LABELS.get(lifted[2], lifted[2]))
+    joint = re.match(r"Joint\((?:metric=)?(\w+)\(", representation)
+    if joint:
+        return f"joint {METRIC_LABELS.get(joint[1], joint[1])}"
     name = representation.partition("(")[0]
     return METRIC_LABELS.get(name, name)
 

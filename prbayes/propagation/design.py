@@ -17,9 +17,7 @@ from prbayes._validate import Floats
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.propagation.importance import (
     SIZES,
-    CoarseResponse,
     DesignEmulator,
-    EmulatedPoints,
     Mixture,
     MixtureSampler,
     Sample,
@@ -48,9 +46,8 @@ class Design:
     groups: tuple[tuple[Floats, ...], ...]
     # The points that have weights: the runs, or emulated points with or without the runs.
     sample: Sample
-    coarse: Floats | None = None  # (n, m): a coarse response at the runs
-    # The first points of the sample, if their responses are emulated.
-    emulated: EmulatedPoints | None = None
+    # The first points of the sample, (M, *event) by input, if their responses are emulated.
+    emulated: tuple[Floats, ...] | None = None
     emulator: DesignEmulator | None = None
     n_emulated_samples: int = 0  # number of times that emulated points were drawn
     emulated_size: int = SIZES.first  # number of points of the next emulated sample
@@ -81,7 +78,7 @@ class Design:
         """Return the responses by emulators without one block of runs each; none without one."""
         if self.emulated is None or self.emulator is None:
             return []
-        n_emulated = len(self.emulated)
+        n_emulated = len(self.emulated[0])
         at_runs = self.sample.values[n_emulated:]
         by_block = self.emulator.without_each_block(self.emulated)
         return [np.concatenate([values, at_runs]) for values in by_block]
@@ -107,17 +104,10 @@ class Design:
         """Return the number of runs, and how responses between them are emulated, as a sentence."""
         if self.emulator is None:
             return f"{name}: {len(self.runs)} runs."
-        text = (
+        return (
             f"{name}: {len(self.runs)} runs, and {len(self.sample)} emulated points between them. "
             f"At runs that were left out the emulator has an error of {self.emulator.error_text}."
         )
-        if self.coarse is None:
-            return text
-        following, outputs = self.emulator.n_following, self.emulator.runs.y.shape[1]
-        if not following:
-            return f"{text} It does not follow the coarse response, which adds no information."
-        share = f" in {following} of {outputs} outputs" if following < outputs else ""
-        return f"{text} It follows the coarse response{share}."
 
 
 @dataclass(eq=False)
@@ -127,7 +117,6 @@ class DesignSampler:
     mixtures: MixtureSampler
     random_seed: int
     emulator: Any
-    coarse: CoarseResponse | None
     _log_weights: Any = None  # the compiled function, if the support of an input moves
 
     def with_runs(
@@ -143,8 +132,6 @@ class DesignSampler:
         on_line = is_scalar and first.dtype.startswith("float")
         draw = self.mixtures.equal_mass if on_line else self.mixtures.draw
         points, mixture = draw(components, n, seed)
-        # Before the runs: its errors then cost none.
-        coarse = None if self.coarse is None else self.coarse(points)
         # Responses that are known to this or another design are reused.
         values = responses.runs.at(points)
         if values is not None:
@@ -163,8 +150,6 @@ class DesignSampler:
             pairs = zip(design.runs.points, points, strict=True)
             points = tuple(np.concatenate([a, b]) for a, b in pairs)
             values = np.concatenate([design.runs.values, values])
-            if design.coarse is not None and coarse is not None:
-                coarse = np.concatenate([design.coarse, coarse])
             mixture = design.mixture.joined(mixture)
             batch_sizes = (*design.batch_sizes, n)
         # The mixture is that of all batches: its density changes at the old points, too.
@@ -175,13 +160,9 @@ class DesignSampler:
             blocks = np.concatenate([np.arange(size) * N_BLOCKS // size for size in batch_sizes])
         runs = Sample(points, values, log_g, blocks)
         if design is None:
-            grown = Design(
-                runs, mixture, batch_sizes, (), runs, coarse, moving=moving, on_line=on_line
-            )
+            grown = Design(runs, mixture, batch_sizes, (), runs, moving=moving, on_line=on_line)
         else:
-            grown = replace(
-                design, runs=runs, mixture=mixture, batch_sizes=batch_sizes, coarse=coarse
-            )
+            grown = replace(design, runs=runs, mixture=mixture, batch_sizes=batch_sizes)
         return self.resampled(grown, components, None)
 
     def resampled(
@@ -197,7 +178,7 @@ class DesignSampler:
         # 32 populations determine the mixing weight of the emulator.
         weights = self.weights(runs, spread_over(components, 32))
         if emulator is None:
-            emulator = fit_emulator(self.emulator, runs, weights, design.coarse)
+            emulator = fit_emulator(self.emulator, runs, weights)
         else:
             emulator = emulator.for_populations(weights)
         if emulator is None:
@@ -207,14 +188,10 @@ class DesignSampler:
         populations, shares = mixture_of(groups, design.emulated_size)
         points, mixture = self.mixtures.draw(populations, design.emulated_size, seed, shares)
         log_g = self.mixtures.log_density(mixture, points)
-        coarse = None
-        if self.coarse is not None and emulator.n_following:
-            coarse = self.coarse(points)
-        emulated = EmulatedPoints(points, coarse)
         return replace(
             design,
-            sample=emulator.joined(emulated, log_g, runs),
-            emulated=emulated,
+            sample=emulator.joined(points, log_g, runs),
+            emulated=points,
             emulator=emulator,
             n_emulated_samples=design.n_emulated_samples + 1,
         )

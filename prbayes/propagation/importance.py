@@ -5,7 +5,7 @@ Between stored runs a sample may have points with emulated responses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,8 +15,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.emulators.emulator import ROUGH_CANDIDATES
-from prbayes.emulators.following import FollowingEmulator
+from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator
 from prbayes.emulators.selection import Runs, weight_of_runs
 from prbayes.emulators.surfaces import as_surface
 from prbayes.numerics.points import base_points, inside
@@ -24,12 +23,9 @@ from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.propagation.moving_support import refuse_moving_atoms
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.response.budget import unlimited
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
-from prbayes.response.failures import Replace, ResponseError
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Responses
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,22 +239,11 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class EmulatedPoints:
-    """Points between the runs, with a coarse response if emulators follow one."""
-
-    inputs: tuple[Floats, ...]  # (M, *event), by aleatory input
-    coarse: Floats | None = None  # (M, m)
-
-    def __len__(self) -> int:
-        return len(self.inputs[0])
-
-
-@dataclass(frozen=True, eq=False)
 class DesignEmulator:
     """An emulator of one response, fitted to the runs of a design."""
 
     runs: Runs
-    emulator: FollowingEmulator
+    emulator: Emulator
     left_out: Floats  # (n, m): predictions of runs that were left out
     event: tuple[int, ...]  # shape of one response: () or (m,)
     weights: Floats  # (T, n): of the runs in the populations that matter
@@ -298,36 +283,28 @@ class DesignEmulator:
             name = f"output {self.worst_output} of {self.event[0]} (counted from 0)"
         return f"{self.error:.2g} standard deviations of {name}"
 
-    @property
-    def n_following(self) -> int:
-        """Number of outputs that follow a coarse response."""
-        return sum(pair is not None for pair in self.emulator.following)
+    @one_thread()
+    def at(self, points: Sequence[Floats]) -> Floats:
+        """Return the responses at points, (M, *event) by input -> (M,) or (M, m)."""
+        return self.runs.predict(self.emulator, columns(points)).reshape(-1, *self.event)
 
     @one_thread()
-    def at(self, points: EmulatedPoints) -> Floats:
-        """Return the responses at points, (M,) or (M, m)."""
-        x = columns(points.inputs)
-        values = self.runs.predict(self.emulator, x, points.coarse)
-        return values.reshape(-1, *self.event)
-
-    @one_thread()
-    def without_each_block(self, points: EmulatedPoints) -> list[Floats]:
+    def without_each_block(self, points: Sequence[Floats]) -> list[Floats]:
         """Return the responses by emulators that were fitted without one block of the runs."""
-        x = columns(points.inputs)
-        by_block = self.runs.predict_without_blocks(self.emulator, x, points.coarse)
+        by_block = self.runs.predict_without_blocks(self.emulator, columns(points))
         return [values.reshape(-1, *self.event) for values in by_block]
 
-    def joined(self, points: EmulatedPoints, log_density: Floats, runs: Sample) -> Sample:
+    def joined(self, points: tuple[Floats, ...], log_density: Floats, runs: Sample) -> Sample:
         """Return emulated points and runs as one sample, in which runs have their share."""
-        m, n = len(points), len(runs)
+        m, n = len(points[0]), len(runs)
         values = self.at(points)
         blocks = np.arange(m) * N_BLOCKS // m
         if not self.run_share:
-            return Sample(points.inputs, values, log_density, blocks)
+            return Sample(points, values, log_density, blocks)
         # Weights are p / g: the mean over all points together is one.
         of_points = log_density - np.log((1 - self.run_share) * (m + n) / m)
         of_runs = runs.log_density - np.log(self.run_share * (m + n) / n)
-        pairs = zip(points.inputs, runs.points, strict=True)
+        pairs = zip(points, runs.points, strict=True)
         return Sample(
             points=tuple(np.concatenate([a, b]) for a, b in pairs),
             values=np.concatenate([values, runs.values]),
@@ -337,18 +314,15 @@ class DesignEmulator:
 
 
 @one_thread()
-def fit_emulator(
-    emulator: Any, runs: Sample, weights: Floats, coarse: Floats | None = None
-) -> DesignEmulator | None:
+def fit_emulator(emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator | None:
     """Fit an emulator to runs; None where the runs alone are as good.
 
     ``emulator`` is a surface or a regressor, or a text for the best of several. ``weights``,
-    (T, n), are those of the runs in the populations that matter. ``coarse``, (n, m), is a coarse
-    response at the runs.
+    (T, n), are those of the runs in the populations that matter.
     """
     x = columns(runs.points)
     y = runs.values.reshape(len(runs), -1)
-    fitted = Runs(x, y, weights.mean(axis=0), runs.blocks, coarse)
+    fitted = Runs(x, y, weights.mean(axis=0), runs.blocks)
     try:
         best = fitted.fit(ROUGH_CANDIDATES if isinstance(emulator, str) else [as_surface(emulator)])
         left_out = fitted.left_out_predictions(best)
@@ -356,34 +330,6 @@ def fit_emulator(
         return None
     fit = DesignEmulator(fitted, best, left_out, runs.values.shape[1:], weights)
     return fit.for_populations(weights)
-
-
-class CoarseResponse:
-    """A coarse response, which costs no run; NaN where it raises, which is logged."""
-
-    def __init__(self, function: Callable[..., Any], expensive: Responses, executor: Any) -> None:
-        self._responses = Responses(
-            f"{expensive.name}: coarse",
-            function,
-            expensive.inputs,
-            executor=executor,
-            on_failure=Replace(),
-            outputs=expensive.outputs,
-        )
-        self._has_values = False
-
-    def __call__(self, points: Sequence[Floats]) -> Floats:
-        """Return the outputs at points, (n, m); raise ResponseError if none is ever a number."""
-        with unlimited():  # the user limits the expensive response
-            values = self._responses(points, [])
-        self._has_values = self._has_values or bool(np.isfinite(values).any())
-        if not self._has_values:
-            reason = next((failure.reason for failure in self._responses.failed), "it is infinite")
-            raise ResponseError(
-                f"{self._responses.name}: got no number at any of {len(values)} runs ({reason}), "
-                "expected a response of the same inputs; repair it, or leave coarse= out"
-            )
-        return values.reshape(len(values), -1)
 
 
 def columns(points: Sequence[Floats]) -> Floats:

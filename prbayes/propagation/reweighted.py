@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Literal, Self
@@ -17,7 +17,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding, counted, report
+from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
 from prbayes.emulators.kriging import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
@@ -36,9 +36,7 @@ from prbayes.propagation.base import (
 from prbayes.propagation.design import Design, DesignSampler, log_weight_graph
 from prbayes.propagation.importance import (
     SIZES,
-    CoarseResponse,
     DesignEmulator,
-    EmulatedPoints,
     MixtureSampler,
     Sample,
     fit_emulator,
@@ -52,8 +50,6 @@ from prbayes.response.outputs import is_missing
 from prbayes.response.response import (
     Responses,
     deduplicated_responses,
-    refuse_misfit,
-    refuse_uncallable,
 )
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
@@ -83,12 +79,6 @@ class Reweighted(Propagation):
         errors require. With one input, discrete ones, or an n above 2000 it uses the runs alone, as
         None does. Or a surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and
         ``predict(X)``.
-    coarse : callable, optional
-        A cheap response of the same inputs and outputs that approximates the expensive one, such as
-        that of a coarser mesh. The emulator then models the difference of the two, for each output
-        where that makes errors at left-out runs smaller. It is called at all runs, and at thousands
-        of points between them, on the same executor; its calls are neither counted nor stored.
-        Where it raises, or is not finite, the emulator does without it, which is logged.
     executor : Executor, optional
         Where the response is computed: threads, processes, loky,
         ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
@@ -127,7 +117,7 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator='auto', coarse=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator='auto')
     """
 
     n: int = 1024
@@ -136,7 +126,6 @@ class Reweighted(Propagation):
     max_lost: float = MAX_LOST
     max_points: int | None = None
     emulator: Any = "auto"
-    coarse: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         check_arguments(self, 16)
@@ -153,13 +142,6 @@ class Reweighted(Propagation):
             if not is_regressor:
                 got = type(emulator).__name__
                 raise TypeError(f"Reweighted: emulator: got {got}, {expected}")
-        if self.coarse is not None:
-            refuse_uncallable("Reweighted", self.coarse, "coarse")
-            if emulator is None:
-                raise ValueError(
-                    "Reweighted: coarse: got a coarse response and no emulator to follow it, "
-                    'expected emulator="auto", or a surface, beside it'
-                )
         if self.max_points is not None:
             positive_integer(self.max_points, "Reweighted: max_points", minimum=self.n)
 
@@ -213,19 +195,10 @@ class Reweighted(Propagation):
                 f"({kinds}), expected several continuous numbers for each specimen: one number or "
                 "discrete ones need no emulator; leave emulator= out"
             )
-        if self.coarse is not None:
-            if not self.emulates(inputs):
-                raise TypeError(
-                    f"{name}: coarse: got a coarse response for "
-                    f"{counted(inputs.dimensions, 'aleatory number')} and n = {self.n}, expected "
-                    f"several continuous numbers for each specimen and at most {MOST_RUNS} runs, "
-                    "so that there is an emulator to support; leave coarse= out"
-                )
-            refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 
     def check_likelihood(self, name: str) -> None:
         """Refuse options that the log-likelihood by specimen, with its own emulator, lacks."""
-        for option, default in (("emulator", "auto"), ("coarse", None), ("max_points", None)):
+        for option, default in (("emulator", "auto"), ("max_points", None)):
             value = getattr(self, option)
             if value != default:
                 raise TypeError(
@@ -272,12 +245,9 @@ class ReweightedBound(Bound):
         super().__init__(name, inputs, target, responses)
         self.config = config
         self.max_lost = config.max_lost
-        coarse = None
-        if config.coarse is not None:
-            coarse = CoarseResponse(config.coarse, responses, config.executor)
         emulator = config.emulator if config.emulates(inputs) else None
         mixtures = MixtureSampler(name, inputs, PopulationDensity(inputs))
-        self._sampler = DesignSampler(mixtures, config.random_seed, emulator, coarse)
+        self._sampler = DesignSampler(mixtures, config.random_seed, emulator)
         self._data = {key: np.array(data.get_value()) for key, data in inputs.data.items()}
         # Arrays of PyMC's graphs, once there is one.
         self._shared: list[Any] = []
@@ -405,13 +375,9 @@ class ReweightedBound(Bound):
         emulator = self._design.emulator
         if emulator is None:
             return []
-        coarse = None
         if not responses.same_as(self.responses):
             emulator = self._emulator_of(self._at_runs(responses))
-        elif self._sampler.coarse is not None and emulator.n_following:
-            coarse = self._sampler.coarse(points)
-        emulated = EmulatedPoints(tuple(points), coarse)
-        return [emulator.at(emulated), *emulator.without_each_block(emulated)]
+        return [emulator.at(points), *emulator.without_each_block(points)]
 
     def _at_runs(self, responses: Responses) -> Floats:
         """Return another response at the runs, (n,) or (n, m)."""

@@ -113,7 +113,7 @@ def test_a_run_that_is_left_out_has_no_influence(model: Surface) -> None:
 
 def test_each_output_has_the_surface_that_is_best_for_it() -> None:
     known = runs(lambda x: np.stack([x[:, 0] ** 2, np.abs(x[:, 1]) + (x[:, 0] > 0)], axis=1))
-    quadratic, rough = known.fit([Polynomial(2), GaussianProcess("matern")]).alone.surfaces
+    quadratic, rough = known.fit([Polynomial(2), GaussianProcess("matern")]).surfaces
     assert getattr(quadratic, "model", None) == Polynomial(2)
     assert getattr(rough, "kernel", None) == "matern"
 
@@ -141,7 +141,7 @@ def test_of_too_many_runs_some_far_ones_are_kept(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("prbayes.emulators.kriging.MOST_RUNS", 20)
     importance = np.linspace(0, 1, 64)
     known = runs(two, importance=importance / importance.sum())
-    (surface, _) = known.fit([RadialBasis()]).alone.surfaces
+    (surface, _) = known.fit([RadialBasis()]).surfaces
     rows = getattr(surface, "rows", None)
     assert rows is not None
     assert (rows.size, (rows >= 54).sum(), rows.min()) == (20, 10, 0)
@@ -168,7 +168,7 @@ def test_predictions_without_a_block_are_those_of_the_remaining_runs(
     at = np.random.default_rng(4).standard_normal((50, 2))
     blocks = list(known.predict_without_blocks(emulator, at))
     assert len(blocks) == 8
-    (surface,) = emulator.alone.surfaces
+    (surface,) = emulator.surfaces
     if isinstance(model, GaussianProcess):
         model = replace(
             model,

@@ -13,12 +13,11 @@ from sklearn.gaussian_process.kernels import RBF
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.emulators.emulator import ROUGH_CANDIDATES, fit_emulator
-from prbayes.emulators.following import FollowingEmulator, fit_follower
+from prbayes.emulators.emulator import fit_emulator
+from prbayes.emulators.following import Follower, fit_follower
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
-from prbayes.emulators.selection import Runs
-from prbayes.emulators.surfaces import Following, Polynomial, Surface
+from prbayes.emulators.surfaces import Polynomial, Surface
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 FRESH = np.random.default_rng(3).uniform([0, 1], [3, 2], (500, 2)).T
@@ -119,7 +118,7 @@ def test_settings() -> None:
             make()
 
 
-# -- two fidelities --------------------------------------------------------------------------------
+# -- a coarse response -----------------------------------------------------------------------------
 
 X = np.random.default_rng(3).standard_normal((64, 2))
 AT = np.random.default_rng(4).standard_normal((500, 2))
@@ -133,108 +132,50 @@ def fine(x: Floats) -> Floats:
     return 2 - 3 * rough(x) + 0.5 * x[:, 0] + 0.2 * x[:, 1] ** 2
 
 
-def runs(function: Any = fine, coarse: Any = rough) -> Runs:
-    n = len(X)
-    y = np.asarray(function(X)).reshape(n, -1)
-    of_coarse = None if coarse is None else coarse(X).reshape(n, -1)
-    return Runs(X, y, np.full(n, 1 / n), np.arange(n) * 8 // n, of_coarse)
-
-
-def error(
-    emulator: FollowingEmulator, known: Runs, function: Any = fine, coarse: Any = rough
-) -> float:
-    """Return the error at fresh points, in standard deviations of the response."""
-    at = None if coarse is None else coarse(AT).reshape(len(AT), -1)
-    predictions = known.predict(emulator, AT, at)[:, 0]
-    return float(np.std(predictions - function(AT)) / np.std(function(AT)))
+def follower(
+    y: Floats, coarse: Floats, model: Surface, left_out: float = np.inf
+) -> Follower | None:
+    """Return an emulator of outputs at the runs; left-out errors without it are equal numbers."""
+    return fit_follower(X, y, coarse, np.full(64, left_out), model)
 
 
 @pytest.mark.parametrize(
     "model",
     [
-        *(GaussianProcess("matern"), Following(GaussianProcess("matern"))),
-        *(Polynomial(2), Following(Polynomial(2)), Following(RadialBasis())),
+        GaussianProcess("matern"),
+        GaussianProcess("matern", lengths=(2.0, 2.0), nugget=1e-8),
+        *(Polynomial(2), RadialBasis()),
     ],
     ids=str,
 )
 def test_a_coarse_response_is_followed_with_its_sign(model: Surface) -> None:
-    follower = fit_follower(X, fine(X), rough(X), np.ones(64), tried=[model])
-    assert follower is not None
-    assert (follower.values(AT, rough(AT)) - fine(AT)).std() < 0.15 * fine(AT).std()
-    again = pickle.loads(pickle.dumps(follower))
-    np.testing.assert_array_equal(again.values(AT, rough(AT)), follower.values(AT, rough(AT)))
+    found = follower(fine(X), rough(X), model)
+    assert found is not None
+    assert (found.values(AT, rough(AT)) - fine(AT)).std() < 0.15 * fine(AT).std()
+    again = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(again.values(AT, rough(AT)), found.values(AT, rough(AT)))
     # A constant one, as an input, has no spread.
-    constant = fit_follower(X, fine(X), np.full(64, 3.0), np.ones(64), tried=[model])
+    constant = follower(fine(X), np.full(64, 3.0), model)
     assert constant is not None
     assert np.isfinite(constant.values(AT, np.full(500, 3.0))).all()
-
-
-@pytest.mark.parametrize("model", [Following(RadialBasis()), RadialBasis()], ids=str)
-def test_what_follows_is_that_of_the_runs_that_are_kept(model: Surface) -> None:
-    block = np.arange(64) % 8 == 3
-    others = [fine(X), np.where(block, 70.0, fine(X))]
-    values = []
-    for y in others:
-        follower = fit_follower(X, y, rough(X), np.ones(64), tried=[model])
-        assert follower is not None
-        (without,) = FollowingEmulator(follower.emulator, (follower,)).without_each(block[None])
-        (part,) = without.following
-        assert part is not None
-        values.append(part.values(X[block], rough(X[block])))
-    np.testing.assert_allclose(values[0], values[1], atol=1e-8)
-    assert np.abs(values[0] - fine(X[block])).max() < 0.5 * np.ptp(fine(X))
+    # In any unit.
+    other = follower(1e-3 * fine(X), 1e6 + 1e3 * rough(X), model)
+    assert other is not None
+    off = 1e3 * other.values(AT, 1e6 + 1e3 * rough(AT)) - fine(AT)
+    assert off.std() < 0.15 * fine(AT).std()
 
 
 def test_the_remainder_may_depend_on_the_coarse_response() -> None:
     def scaled(x: Floats) -> Floats:
         return np.exp(0.3 * x[:, 0]) * rough(x)
 
-    known = runs(scaled)
-    assert error(known.fit(ROUGH_CANDIDATES), known, scaled) < 0.2
+    found = follower(scaled(X), rough(X), GaussianProcess())
+    assert found is not None
+    assert np.std(found.values(AT, rough(AT)) - scaled(AT)) < 0.2 * np.std(scaled(AT))
 
 
-def test_an_unrelated_coarse_response_changes_hardly_anything() -> None:
-    def unrelated(x: Floats) -> Floats:
-        return np.cos(40 * x[:, 0] + 30 * x[:, 1])
-
-    def smooth(x: Floats) -> Floats:
-        return np.sin(3 * x[:, 0]) * x[:, 1]
-
-    known, alone = runs(smooth, unrelated), runs(smooth, None)
-    expected = error(alone.fit(ROUGH_CANDIDATES), alone, smooth, None)
-    found = error(known.fit(ROUGH_CANDIDATES), known, smooth, unrelated)
-    assert found < 1.1 * expected
-
-
-def test_each_output_has_its_factor() -> None:
-    known = runs(
-        lambda x: np.stack([fine(x), x[:, 0]], axis=1),
-        lambda x: np.stack([1e6 + 1e3 * rough(x), rough(x)], axis=1),
-    )
-    emulator = known.fit(ROUGH_CANDIDATES)
-    assert emulator.following[0] is not None
-    coarse = np.stack([1e6 + 1e3 * rough(AT), np.full(len(AT), 1e9)], axis=1)
-    found = known.predict(emulator, AT, coarse)
-    assert np.std(found[:, 0] - fine(AT)) < 0.05 * fine(AT).std()
-    # Without it the errors are far larger.
-    alone = runs(coarse=None)
-    assert error(alone.fit(ROUGH_CANDIDATES), alone, coarse=None) > 0.5
-
-
-def test_without_a_coarse_response_at_a_point_the_surface_of_the_response_serves() -> None:
-    def partly(x: Floats) -> Floats:
-        return np.where(x[:, 0] > 1, np.nan, rough(x))
-
-    known = runs(coarse=partly)
-    emulator = known.fit(ROUGH_CANDIDATES)
-    assert emulator.following[0] is not None
-    found = known.predict(emulator, AT, partly(AT)[:, None])
-    without = AT[:, 0] > 1
-    alone = known.predict(FollowingEmulator(emulator.alone), AT)
-    np.testing.assert_allclose(found[without], alone[without], rtol=1e-9)
-    assert np.std(found[~without, 0] - fine(AT[~without])) < 0.1 * fine(AT).std()
-
-
-def test_too_few_coarse_responses_are_none() -> None:
-    known = runs(coarse=lambda x: np.where(np.arange(len(x)) < 60, np.nan, rough(x)))
-    assert known.fit([Polynomial(2)]).following == (None,)
+def test_nothing_is_followed_that_saves_no_error() -> None:
+    few = np.where(np.arange(64) < 60, np.nan, rough(X))
+    assert follower(fine(X), few, Polynomial(2)) is None
+    assert follower(fine(X), rough(X), RadialBasis(), left_out=1e-6) is None
+    assert follower(fine(X), rough(X), RadialBasis(), left_out=0.0) is None

@@ -260,7 +260,7 @@ def test_an_unrelated_coarse_response_is_not_followed(surrogate: prb.Surrogate) 
     assert found.coarse is None
     assert found(1.0, 1.5) == surrogate(1.0, 1.5)
     np.testing.assert_array_equal(found.error.residuals, surrogate.error.residuals)
-    with pytest.raises(ResponseError, match=r"beside a response of 2 outputs.*Reweighted"):
+    with pytest.raises(ResponseError, match=r"beside a response of 2 outputs.*to each output"):
         prb.Surrogate.fit(two, BOX, 48, coarse=bent)
 
 

@@ -54,7 +54,6 @@ METRICS = [
     prb.AreaMetric(),
     prb.FunctionMetric(mean_difference, weighted=True),
     prb.Joint(prb.KullbackLeibler()),
-    prb.MarginalCorrelation(prb.AreaMetric()),
 ]
 
 

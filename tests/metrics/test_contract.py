@@ -16,7 +16,6 @@ from pytensor.graph.traversal import ancestors
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
-from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.custom import FunctionMetric
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, Histogram, overlap
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
@@ -71,12 +70,9 @@ INNER: dict[str, Metric] = {
     "absolute": Absolute(),
     "means": MeanMetric(),
 }
-# Of several outputs, one sum over all cells, areas side by side, and features one after another.
-LINED_UP = (ProbabilityResidual, AreaMetric, MeanMetric)
 LIFT: dict[str, Callable[[Metric], Metric]] = {
     "single": lambda metric: metric,
     "joint": Joint,
-    "marginal": MarginalCorrelation,
 }
 
 
@@ -155,8 +151,6 @@ def test_it_is_the_sum_of_its_parts_for_other_observed_values_too(case: Case) ->
 
 def test_the_graph_has_the_same_value_and_the_exact_gradient(case: Case) -> None:
     d, x, w, _ = case
-    if isinstance(d.metric, MarginalCorrelation) and not isinstance(d.metric.metric, LINED_UP):
-        return  # the graph of its outputs is that of a single one
     basis = d.basis(x)
     in_graph = replace(basis, arrays=tuple(map(pytensor.shared, basis.arrays)))
     symbol = pt.vector()
@@ -182,13 +176,12 @@ def test_a_point_without_a_response_counts_nowhere(case: Case) -> None:
     np.testing.assert_allclose(by_basis(d, w, d.basis(gone)), expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("lift", [Joint, MarginalCorrelation])
-def test_projections_and_features_are_written_for_graphs_too(lift: Any) -> None:
+def test_projections_and_features_are_written_for_graphs_too() -> None:
     x, w, z, u = outputs()
     x[3, 1] = np.inf
     x[5, 0] = NAN
     symbol = pt.matrix()
-    d = lift(AreaMetric()).against(z, u)
+    d = Joint(AreaMetric()).against(z, u)
     for part in d.parts[:: len(d.parts) - 1]:
         projected = pytensor.function([symbol], part.of(symbol, pt), mode=PYTHON)(x)
         np.testing.assert_allclose(projected, part.of(x), rtol=1e-12, atol=1e-12)
@@ -225,8 +218,7 @@ def mean_difference(simulated: Any, observed: Any, weights: Any = None) -> Any:
     return np.abs(np.average(simulated, axis=-1, weights=weights) - observed.mean())
 
 
-@pytest.mark.parametrize(("lift", "number"), [(Joint, 10), (MarginalCorrelation, 3)])
-def test_a_function_is_called_with_the_projections(lift: Any, number: int) -> None:
+def test_a_function_is_called_with_the_projections() -> None:
     x, _, z, _ = outputs()
     z = z[8:]
     calls: list[tuple[Any, ...]] = []
@@ -235,11 +227,11 @@ def test_a_function_is_called_with_the_projections(lift: Any, number: int) -> No
         calls.append((simulated.shape, observed.shape))
         return np.asarray(mean_difference(simulated, observed))
 
-    d = lift(FunctionMetric(apart)).against(z)
+    d = Joint(FunctionMetric(apart)).against(z)
     equal = np.full((2, 30), 1 / 30)
     np.testing.assert_allclose(by_basis(d, equal, d.basis(x)), d(x), rtol=1e-12)
     assert (d.metric.symbolic, d.metric.takes_weights) == (False, False)
-    assert calls[:number] == [((2, 30), (17,))] * number
+    assert calls[:10] == [((2, 30), (17,))] * 10
     several = d.with_observed(z, np.full((2, 1, 17), 1 / 17))
     found = by_basis(several, equal[:, None], several.basis(x))
     np.testing.assert_allclose(found[:, 0], d(x), rtol=1e-12)

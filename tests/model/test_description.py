@@ -153,7 +153,7 @@ def observed_outputs(**observed: Any) -> xr.Dataset:
     """Return the observed responses of a model with simulators of several outputs."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        metric = prb.MarginalCorrelation(prb.ProbabilityResidual())
+        metric = prb.Joint(prb.ProbabilityResidual())
         for name, values in observed.items():
             powers = np.arange(1, np.shape(values)[1] + 1)
 
@@ -183,7 +183,7 @@ def test_outputs_keep_dimension_names_and_units_in_a_file(tmp_path: Path, units:
 
 
 def test_simulators_with_different_outputs_have_their_own_dimensions() -> None:
-    three = np.column_stack([TWO[:, 0], [1.0, 0.0, 4.0, 5.0], [0.0, 2.0, 1.0, 3.0]])
+    three = np.random.default_rng(0).normal(size=(6, 3))
     data = observed_outputs(one=TWO, other=three, same=TWO[::-1])
     assert [data[name].dims[1] for name in data] == ["output", "other_output", "output"]
     assert data["output"].values.tolist() == [0, 1]

@@ -679,7 +679,7 @@ def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.Mo
     ],
 )  # fmt: skip
 def test_a_large_error_of_the_design_is_reported(sizes: list[int | None], advice: str) -> None:
-    emulated = [None if size is None else range(size) for size in sizes]
+    emulated = [None if size is None else (range(size),) for size in sizes]
     designs = [SimpleNamespace(runs=range(300), emulated=points) for points in emulated]
     bounds = {f"y{k}": SimpleNamespace(design=design) for k, design in enumerate(designs)}
     evaluator: Any = SimpleNamespace(nodes=(), reweighted=bounds)

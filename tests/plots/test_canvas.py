@@ -137,6 +137,4 @@ def test_elements_take_the_label_of_their_variable() -> None:
 def test_metrics_of_several_outputs_are_called_by_that_of_one() -> None:
     assert metric_label(repr(prb.AreaMetric())) == "area metric"
     assert metric_label(repr(prb.Joint(prb.AreaMetric()))) == "joint area metric"
-    label = metric_label(repr(prb.MarginalCorrelation(prb.KullbackLeibler())))
-    assert label == "Kullback-Leibler divergence of marginals, with correlations"
     assert metric_label("Mine(Other(3))") == "Mine"

@@ -71,7 +71,7 @@ def several() -> SimpleNamespace:
         dims=("i", "hour"),
         coords={"hour": np.arange(12) / 2},
     )
-    metric = prb.MarginalCorrelation(prb.AreaMetric())
+    metric = prb.Joint(prb.AreaMetric(), components=2)
     how: dict[str, Any] = {"metric": metric, "propagation": prb.Resimulated(64)}
     with pm.Model() as model:
         m = pm.Normal("m", 0, 1)

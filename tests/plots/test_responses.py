@@ -277,7 +277,7 @@ def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) 
     frame = xr.DataArray(data, dims=("i", "gauge"), coords={"gauge": names})
     with pm.Model() as model:
         a, b = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0), pm.Normal.dist(0.0, 1.0)
-        given: Any = {"metric": prb.MarginalCorrelation(prb.AreaMetric()), "observed": frame}
+        given: Any = {"metric": prb.Joint(prb.AreaMetric()), "observed": frame}
         response = lambda a, b: (a[..., None] + b[..., None] * np.arange(9)) * unit  # noqa: E731
         prb.Simulator("strain", response, a, b, propagation=prb.Resimulated(64), **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((1, 8)))})

@@ -148,7 +148,7 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
     """
     parts: dict[tuple[int, ...], list[Part]] = {}
     for part in target.parts:
-        if part.projection is not None and part.projection.direction is not None:
+        if part.projection is not None:
             parts.setdefault(tuple(part.projection.outputs.tolist()), []).append(part)
     findings: list[Finding] = []
     for outputs, members in parts.items():
@@ -165,7 +165,7 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
                 "that happens to scatter little counts too much, so that spreads are "
                 "underestimated, by 5 to 15% with two thirds of these specimens and by 10 to 40% "
                 "with a third, and by more where a combination hardly scatters; leave metric= "
-                "out, for the log-likelihood by specimen, or use prb.MarginalCorrelation(metric)."
+                "out, for the log-likelihood by specimen."
             )
             findings.append(Finding("few-for-whitening", text, _ADVICE))
     return findings
