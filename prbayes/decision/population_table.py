@@ -204,8 +204,8 @@ def _mean(draws: Floats) -> Floats:
 
 def _defined(row: Floats, is_left_out: Any) -> Floats:
     """Return the other numbers of populations; NaN where most populations are left out."""
-    others = row[~is_left_out]
-    return others if others.size > 0.5 * row.size else np.array([np.nan])
+    numbers = row[~is_left_out]
+    return numbers if numbers.size > 0.5 * row.size else np.array([np.nan])
 
 
 class PopulationTable(Table):

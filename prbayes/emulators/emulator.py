@@ -54,11 +54,12 @@ class Emulator:
             jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
         elif columns is not None:
             of_outputs = np.eye(values.shape[1]) if self.components is None else self.components
-            chosen = of_outputs.T[columns]  # (k, c, components)
-            values = (chosen @ values[:, :, None])[:, :, 0]
-            jacobian = chosen @ jacobian
-        kept: Any = slice(None) if columns is None else columns
-        return self.center[kept] + self.unit[kept] * values, self.unit[kept, None] * jacobian
+            loadings = of_outputs.T[columns]  # (k, c, components)
+            values = (loadings @ values[:, :, None])[:, :, 0]
+            jacobian = loadings @ jacobian
+        place: Any = slice(None) if columns is None else columns
+        center, unit = self.center[place], self.unit[place]
+        return center + unit * values, unit[..., None] * jacobian
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m)."""

@@ -120,8 +120,12 @@ class ReadingDensity:
                 if node not in at_nodes:
                     at_nodes[node] = self(np.where(varies, np.exp(spacing * node), errors[0]), np)
             at_nodes = {node: at_nodes[node] for node in nodes}
+            first, second, third, fourth = at_nodes.values()
             u = place - cell
-            below, above = u * (u - 1) / 6, (u + 1) * (u - 2) / 2
-            weights = (-below * (u - 2), above * (u - 1), -above * u, below * (u + 1))
-            terms = [w * values for w, values in zip(weights, at_nodes.values(), strict=True)]
-            yield terms[0] + terms[1] + terms[2] + terms[3]
+            outer = u * (u - 1) / 6
+            inner = (u + 1) * (u - 2) / 2
+            result = -outer * (u - 2) * first
+            result += inner * (u - 1) * second
+            result -= inner * u * third
+            result += outer * (u + 1) * fourth
+            yield result

@@ -56,9 +56,9 @@ class CompressedSurface:
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
         u, jacobian = self.surface(z, columns)
-        chosen: Any = slice(None) if columns is None else columns
-        slopes = self.unit[chosen] * np.cosh(np.clip(u, -100, 100))
-        return self.expanded(u, chosen), slopes[:, :, None] * jacobian
+        place: Any = slice(None) if columns is None else columns
+        slopes = self.unit[place] * np.cosh(np.clip(u, -100, 100))
+        return self.expanded(u, place), slopes[:, :, None] * jacobian
 
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""

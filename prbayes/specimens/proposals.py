@@ -100,18 +100,14 @@ class Residuals:
         ``scale`` is a factor of the readings' errors, a number or (k,). NaN without a response.
         """
         scales = np.broadcast_to(scale, len(a))
-        e, slopes = np.empty((len(a), self.target.shape[1])), np.empty((len(a), *self.shape))
-        for block in _blocks(len(a), self.target.shape[1] * self.known.shape[1]):
+        m = self.target.shape[1]
+        e, slopes = np.empty((len(a), m)), np.empty((len(a), m, a.shape[1]))
+        for block in _blocks(len(a), m * self.known.shape[1]):
             i = specimen[block]
             e[block], slopes[block] = self.standardised(
                 i, *self.simulated(i, a[block]), scales[block]
             )
         return e, slopes
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """The shape of G of a point."""
-        return self.target.shape[1], len(self.free)
 
     @np.errstate(all="ignore")
     def simulated(self, specimen: Indices, a: Floats) -> tuple[Floats, Floats]:
@@ -564,18 +560,16 @@ class Proposals:
         ``weights`` are of the modes, (R,). ``drawn`` has the mode that drew each point and the log
         of its density there, up to a constant, both (k,).
         """
-        result = np.empty(len(a))
+        m, d = self.residuals.target.shape[1], self.modes.a.shape[1]
+        blocks = list(_blocks(len(a), m * d))
+        if len(blocks) > 1:
+            parts = []
+            for block in blocks:
+                of_block = None if drawn is None else (drawn[0][block], drawn[1][block])
+                parts.append(self.log_mixture(specimen[block], a[block], weights, of_block))
+            return np.concatenate(parts)
         with np.errstate(divide="ignore"):
             logs = np.log(weights)
-        for block in _blocks(len(a), int(np.prod(self.residuals.shape))):
-            of_block = None if drawn is None else (drawn[0][block], drawn[1][block])
-            result[block] = self._log_mixture(specimen[block], a[block], logs, of_block)
-        return result
-
-    def _log_mixture(
-        self, specimen: Indices, a: Floats, logs: Floats, drawn: tuple[Indices, Floats] | None
-    ) -> Floats:
-        """Return `log_mixture` of points at once; ``logs`` are those of the weights."""
         modes, table = self.modes, self.modes.table[specimen]
         values, jacobian = self.residuals.simulated(specimen, a)
         largest, terms = np.full(len(a), -np.inf), []
