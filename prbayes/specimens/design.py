@@ -389,7 +389,8 @@ def audited(
     """Return the emulation with runs at points that matter to the posterior, and their bias.
 
     Its surface stays if the error at these runs is at most twice the stated one. That of left-out
-    runs, which are far from each other, is often too large: it decreases to what is measured here.
+    runs, which are far from each other, is often too large: it decreases towards what is measured
+    here.
     """
     points = plausible.points
     population = normal_of(plausible.draws.specimens()[:, data.free], 1.2)
@@ -421,8 +422,9 @@ def audited(
     bias = max(bias, emulation.bias)
     pooled = data.readings.relative_error
     if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
+        # Eight runs may miss where the emulator is wrong: halfway between both, in logarithms.
         measured = np.sqrt(((error / emulation.error) ** 2).mean())
-        error = min(measured, 1.0) * emulation.error
+        error = np.sqrt(min(measured, 1.0)) * emulation.error
         return replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
     used = _near_population(data, all_z, population)
     surface, left_out, _ = fit_surface(
