@@ -118,6 +118,15 @@ class Likely:
         """Return the unit of distances between inputs, (d,): the population's deviation."""
         return data.scale(np.sqrt((self.population.root**2).sum(axis=1)))
 
+    def is_known(self, largest: float = 0.3) -> bool:
+        """Return whether the inputs of each specimen are in one place, beside the population."""
+        a = self.proposals.residuals.whitened(self.points.z)
+        mean = np.einsum("nk,nkd->nd", self.weights, a)
+        variance = np.einsum("nk,nkd->nd", self.weights, (a - mean[:, None]) ** 2)
+        reference = self.proposals.residuals.population
+        sd = np.sqrt((np.linalg.solve(reference.root, self.population.root) ** 2).sum(axis=1))
+        return bool((np.sqrt(variance) <= largest * sd).all())
+
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
         """Return inputs, (count, d), that are likely under a wider population.
 
@@ -453,19 +462,17 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
     A kink or a jump between runs leaves an error that more runs hardly decrease. The output less
     that of the surface, at the best mode of a specimen, is added to the surface; the mode moves,
-    and the change in the next round is the error that is left. The error stays where specimens
-    have several likely modes, or no inputs reproduce most of them.
+    and the change in the next round is the error that is left. The error stays where inputs of
+    specimens are not known, or no inputs reproduce most of them.
     """
     uncorrected = emulation
     offsets = np.zeros(data.readings.values.shape)
     for seed in range(most_corrections(*data.known.shape) // len(offsets)):
         likely = Likely.of(data, emulation, population, seed)
         modes = likely.proposals.modes
-        mass = np.zeros(len(modes.specimen))
-        np.add.at(mass, likely.points.mode.ravel(), likely.weights.ravel())
-        if (np.bincount(modes.specimen[mass > 0.01]) > 1).any():
+        if seed == 0 and not likely.is_known():
             return uncorrected
-        order = np.lexsort((-mass, modes.specimen))
+        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
         rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
         z = likely.proposals.residuals.coordinates(modes.specimen[rows], modes.a[rows])
         outputs = run(z)

@@ -633,18 +633,28 @@ class Proposals:
     def covering(self, starts: Floats, scale: float, most: int = 4) -> Proposals:
         """Return proposals with further ones where the fibre of a specimen is not covered.
 
-        A proposal ends at folds. Points at which the readings are met, nearest to starts
-        (N, S, free), are not covered if their importance under a wide population is more than
+        A proposal ends at folds. Candidates are points at which the readings are met, nearest to
+        starts (N, S, free), and points around each mode: an inaccurate reading may have both sides
+        of a fold. They are not covered if their importance under a wide population is more than
         three times that of the modes; the most important one gets a proposal.
         """
         residuals, result = self.residuals, self
         n, count, d = starts.shape
         specimen = np.repeat(np.arange(n), count)
-        a, _, e, slopes = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)
+        met = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)[0]
+        g = self.modes.slopes
+        precision = np.einsum("kmd,kme->kde", g, g) + 0.25 * np.eye(d)
+        roots = np.linalg.inv(np.linalg.cholesky(precision))
+        around = self.modes.a[:, None] + ndtri(sobol(8, d, 1)) @ roots
+        specimen = np.concatenate([specimen, np.repeat(self.modes.specimen, 8)])
+        a = np.concatenate([met, around.reshape(-1, d)])
+        e, slopes = residuals.errors(specimen, a, scale)
         misfit = (e**2).sum(axis=1) / 2
         least = np.full(n, np.inf)
         np.minimum.at(least, self.modes.specimen, self.modes.misfit)
-        rows = np.flatnonzero(misfit <= least[specimen] + 10.0)
+        is_near = misfit <= least[specimen] + np.where(np.arange(len(a)) < len(met), 10.0, 3.0)
+        rows = np.flatnonzero(is_near)
+        rows = rows[np.argsort(specimen[rows], kind="stable")]
         points = Modes(
             specimen[rows], a[rows], misfit[rows], e[rows], slopes[rows], np.full(len(rows), scale)
         )

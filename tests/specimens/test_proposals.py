@@ -414,3 +414,19 @@ def test_modes_for_other_errors_are_the_same_if_they_are_the_nearest() -> None:
         np.testing.assert_array_equal(
             is_same[row], np.sign(modes.a[others, 0]) == np.sign(modes.a[row, 0])
         )
+
+
+@pytest.mark.parametrize("mean", [-0.8, 0.2, 0.8])
+def test_an_inaccurate_reading_at_a_turning_point(mean: float) -> None:
+    """y = a^2 with an error as large as the outputs of both sides: points are on both."""
+    y, sd = np.array([[-0.1], [0.0], [0.1], [0.3]]), 0.15
+    reference, population = independent([0.5], [0.9]), independent([mean], [0.4])
+    residuals = residuals_of(differentiated(lambda z: z**2), y, sd, reference)
+    starts = np.tile(1.5 * ndtri(sobol(16, 1, 0)), (len(y), 1, 1))
+    modes = find_modes(residuals, starts)
+    proposals = Proposals.at_modes(residuals, modes).without_covered().covering(starts, 1.0)
+    grid = np.linspace(-4, 4, 20_001)
+    density = norm(mean, 0.4).pdf(grid) * norm(0, sd).pdf(y - grid**2)
+    exact = np.log(density.sum(axis=1) * (grid[1] - grid[0]))
+    error = log_likelihoods(proposals, population, 512) - exact
+    assert np.abs(error).max() < 0.05
