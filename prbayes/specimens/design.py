@@ -97,6 +97,11 @@ class Likely:
         has_point = np.isfinite(points.log_a).any(axis=1)
         if data.gross_errors:
             has_point &= typical_specimens(proposals.modes, len(has_point))
+        if not proposals.is_open(scale) and proposals.modes.table.shape[1] > 1:
+            # The prior decides which of several roots are those of one population.
+            draws = data.posterior(points.z, points.log_a, None)
+            population = normal_of(draws.specimens()[:, data.free])
+            return cls(proposals, points, population, likely_weights(data, points, population))
         z = points.z[has_point][..., data.free]
         # A few steps of EM: along inputs that the readings leave open a fit would collapse.
         start = None if not proposals.is_open(scale) else population

@@ -209,9 +209,14 @@ def find_modes(
     soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
     a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
     a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
-    rows = _distinct(specimen, a, value, slopes, precision, gap)
+    misfit = (e**2).sum(axis=1) / 2
+    # A mode far from the reference counts: another population may be the likely one.
+    least = np.full(n, np.inf)
+    np.minimum.at(least, specimen, np.where(np.isfinite(value), misfit, np.inf))
+    value = np.where(misfit <= least[specimen] + gap, value, np.inf)
+    rows = _distinct(specimen, a, value, slopes, precision)
     rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
-    misfit = (e[rows] ** 2).sum(axis=1) / 2
+    misfit = misfit[rows]
     scales = np.full(len(rows), scale)
     return Modes(specimen[rows], a[rows], misfit, e[rows], slopes[rows], scales)
 
@@ -273,12 +278,10 @@ def _minimised(
 
 
 def _distinct(
-    specimen: Indices, a: Floats, value: Floats, slopes: Floats, precision: float, gap: float
+    specimen: Indices, a: Floats, value: Floats, slopes: Floats, precision: float
 ) -> Indices:
-    """Return the rows of different modes within the gap of the specimen's best."""
-    least = np.full(specimen.max() + 1, np.inf)
-    np.minimum.at(least, specimen, value)
-    candidates = np.flatnonzero(np.isfinite(value) & (value <= least[specimen] + gap))
+    """Return the rows of different modes with a finite value, the best one of equal modes."""
+    candidates = np.flatnonzero(np.isfinite(value))
     candidates = candidates[np.lexsort((value[candidates], specimen[candidates]))]
     if not len(candidates):
         return candidates
