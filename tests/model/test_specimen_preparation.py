@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from scipy.stats import norm
+from scipy.stats import halfnorm, norm, truncnorm
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -132,3 +132,30 @@ def test_a_model_that_is_gone() -> None:
     gone = Populations(replace(populations.likelihood, model=lambda: None))
     with pytest.raises(RuntimeError, match="build the model again"):
         _ = gone.hyperparameters
+
+
+@pytest.mark.parametrize("number", [6, 9, 98])
+def test_a_mirror_population_that_the_prior_excludes(number: int) -> None:
+    """The second output has a root on both sides of b = 1, and the prior is on one of them."""
+    rng = np.random.default_rng([9, 20, number])
+    start = rng.standard_normal(4)
+    share = norm.cdf(start)
+    sd1, sd2 = halfnorm.ppf(share[[1, 3]], scale=0.5)
+    mean = truncnorm.ppf(share[2], -1 / 0.7, np.inf, 2.0, 0.7)
+    z = rng.standard_normal((20, 2))
+    a, b = start[0] + sd1 * z[:, 0], mean + sd2 * z[:, 1]
+
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([np.exp(0.3 * a + 0.1 * b), np.exp(b - 1) - (b - 1)], axis=-1)
+
+    with pm.Model() as model:
+        mu2 = pm.TruncatedNormal("mu2", 2.0, 0.7, lower=1.0)
+        inputs = [
+            pm.Normal.dist(pm.Normal("mu1", 0, 1), pm.HalfNormal("sd1", 0.5)),
+            pm.Normal.dist(mu2, pm.HalfNormal("sd2", 0.5)),
+        ]
+        prb.Simulator("y", response, *inputs, observed=response(a, b))
+    posterior = prb.sample(model=model, random_seed=1, progressbar=False).posterior
+    for name, x in (("mu1", a), ("mu2", b)):
+        off = float(posterior[name].mean()) - x.mean()
+        assert abs(off) < 0.5 * float(posterior[name].std())
