@@ -409,7 +409,9 @@ def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
 
 def standard_deviation(by_draw: Floats) -> float:
     """Return that of a quantity over draws; infinite if the quantity is infinite at one of them."""
-    return np.inf if np.isinf(by_draw).any() else float(np.nanstd(by_draw))
+    if np.isinf(by_draw).any():
+        return np.inf
+    return float(np.nanstd(by_draw))
 
 
 def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:

@@ -109,8 +109,10 @@ class ReadingDensity:
         is_one = len(columns) > 0 and (columns == columns[0]).all() and (columns[0] > 0).all()
         places = np.log(columns[0]) / spacing if is_one else np.zeros(len(errors))
         cells = np.floor(places).astype(int)
-        if not is_one or 2 * np.unique(cells[:, None] + np.arange(-1, 3)).size > len(errors):
-            yield from (self(error, np) for error in errors)
+        needed = np.unique(cells[:, None] + np.arange(-1, 3))
+        if not is_one or 2 * len(needed) > len(errors):
+            for error in errors:
+                yield self(error, np)
             return
         at_nodes: dict[int, Floats] = {}
         for place, cell in zip(places, cells, strict=True):
@@ -118,7 +120,8 @@ class ReadingDensity:
             nodes = range(cell - 1, cell + 3)
             for node in nodes:
                 if node not in at_nodes:
-                    at_nodes[node] = self(np.where(varies, np.exp(spacing * node), errors[0]), np)
+                    error = np.where(varies, np.exp(spacing * node), errors[0])
+                    at_nodes[node] = self(error, np)
             at_nodes = {node: at_nodes[node] for node in nodes}
             first, second, third, fourth = at_nodes.values()
             u = place - cell

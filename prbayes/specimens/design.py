@@ -97,7 +97,8 @@ class Likely:
         has_point = np.isfinite(points.log_a).any(axis=1)
         if data.gross_errors:
             has_point &= typical_specimens(proposals.modes, len(has_point))
-        if not proposals.is_open(scale) and proposals.modes.table.shape[1] > 1:
+        has_several = np.bincount(proposals.modes.specimen) > 1
+        if has_several.mean() > 0.1 and not proposals.is_open(scale):
             # The prior decides which of several roots are those of one population.
             draws = data.posterior(points.z, points.log_a, None)
             population = normal_of(draws.specimens()[:, data.free])
@@ -125,12 +126,14 @@ class Likely:
 
     def is_known(self, largest: float = 0.3) -> bool:
         """Return whether the inputs of each specimen are in one place, beside the population."""
-        a = self.proposals.residuals.whitened(self.points.z)
-        mean = np.einsum("nk,nkd->nd", self.weights, a)
-        variance = np.einsum("nk,nkd->nd", self.weights, (a - mean[:, None]) ** 2)
-        reference = self.proposals.residuals.population
-        sd = np.sqrt((np.linalg.solve(reference.root, self.population.root) ** 2).sum(axis=1))
-        return bool((np.sqrt(variance) <= largest * sd).all())
+        residuals = self.proposals.residuals
+        a = residuals.whitened(self.points.z)
+        weights = self.weights[:, :, None]
+        mean = (weights * a).sum(axis=1, keepdims=True)
+        variance = (weights * (a - mean) ** 2).sum(axis=1)
+        root = np.linalg.solve(residuals.population.root, self.population.root)
+        of_population = (root**2).sum(axis=1)
+        return bool((variance <= largest**2 * of_population).all())
 
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
         """Return inputs, (count, d), that are likely under a wider population.
@@ -423,14 +426,9 @@ def audited(
     outputs, misfit = _compared(run, emulation, z, is_new)
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
-    error, bias = error_and_bias(
-        data,
-        emulation,
-        likely,
-        z[: len(specimens)],
-        specimens,
-        np.sqrt(2 * stratum)[:, None] * at_audited,
-    )
+    weighted = np.sqrt(2 * stratum)[:, None] * at_audited
+    audited_z = z[: len(specimens)]
+    error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
     bias = max(bias, _bias_of_possible(data, at_possible))
     all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
     bias = max(bias, emulation.bias)
@@ -481,7 +479,8 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
         z = likely.proposals.residuals.coordinates(modes.specimen[rows], modes.a[rows])
         outputs = run(z)
-        misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
+        emulated = emulation.surface.values(z)
+        misfit = outputs - emulated - offsets[modes.specimen[rows]]
         offsets[modes.specimen[rows]] += np.nan_to_num(misfit)
         all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, outputs])
         error, bias = error_and_bias(data, emulation, likely, z, modes.specimen[rows], misfit)

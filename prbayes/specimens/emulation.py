@@ -89,7 +89,9 @@ class DifferencedResponse:
         if columns is None:
             return outputs, jacobian
         rows = np.arange(k)[:, None]
-        return outputs[rows, columns], jacobian[rows, columns]
+        outputs = outputs[rows, columns]
+        jacobian = jacobian[rows, columns]
+        return outputs, jacobian
 
     def variance(self, z: Floats) -> Floats:
         """Return zeros: the response has no error."""

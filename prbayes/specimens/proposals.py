@@ -617,11 +617,14 @@ class Proposals:
         # The Jacobian at a mode: D V' + D S U' G.
         maps = self.inputs + self.readings @ modes.slopes
         is_wide = scale[:, :, None] >= scale[:, None]
-        difference = modes.a[table][:, None] - modes.a[table][:, :, None]  # (N, most, most, free)
+        a = modes.a[table]
+        difference = a[:, None] - a[:, :, None]  # (N, most, most, free)
         of_first = np.einsum("npij,npqj->npqi", maps[table], difference)
         of_second = np.einsum("nqij,npqj->npqi", maps[table], difference)
-        distance = (np.where(is_wide[..., None], of_first, of_second) ** 2).sum(axis=3)
-        distance[np.isnan(scale)[:, None] | np.isnan(scale)[:, :, None]] = np.inf
+        of_wider = np.where(is_wide[..., None], of_first, of_second)
+        distance = (of_wider**2).sum(axis=3)
+        is_missing = table < 0
+        distance[is_missing[:, None] | is_missing[:, :, None]] = np.inf
         is_nearest = np.zeros(distance.shape, dtype=bool)
         for value in np.unique(modes.scale):
             of_scale = np.where((scale == value)[:, None], distance, np.inf)
@@ -656,11 +659,11 @@ class Proposals:
         least = np.full(n, np.inf)
         np.minimum.at(least, self.modes.specimen, self.modes.misfit)
         is_near = misfit <= least[specimen] + np.where(np.arange(len(a)) < len(met), 10.0, 3.0)
+        scales = np.full(len(a), scale)
+        points = Modes(specimen, a, misfit, e, slopes, scales)
         rows = np.flatnonzero(is_near)
         rows = rows[np.argsort(specimen[rows], kind="stable")]
-        points = Modes(
-            specimen[rows], a[rows], misfit[rows], e[rows], slopes[rows], np.full(len(rows), scale)
-        )
+        points = points.rows(rows)
 
         def importance(modes: Modes) -> Floats:
             log_q = result.log_mixture(modes.specimen, modes.a, result.share)
