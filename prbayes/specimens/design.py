@@ -472,12 +472,13 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
     offsets = np.zeros(data.readings.values.shape)
     for seed in range(most_corrections(*data.known.shape) // len(offsets)):
         likely = Likely.of(data, emulation, population, seed)
+        residuals = likely.proposals.residuals
         modes = likely.proposals.modes
         if seed == 0 and not likely.is_known():
             return uncorrected
         order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
         rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
-        z = likely.proposals.residuals.coordinates(modes.specimen[rows], modes.a[rows])
+        z = residuals.coordinates(modes.specimen[rows], modes.a[rows])
         outputs = run(z)
         emulated = emulation.surface.values(z)
         misfit = outputs - emulated - offsets[modes.specimen[rows]]

@@ -49,9 +49,9 @@ class CompressedSurface:
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), of values of the surface."""
-        return np.asarray(
-            self.center[columns] + self.unit[columns] * np.sinh(np.clip(u, -100, 100))
-        )
+        inside = np.clip(u, -100, 100)
+        scaled = self.unit[columns] * np.sinh(inside)
+        return np.asarray(self.center[columns] + scaled)
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
