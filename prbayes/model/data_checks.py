@@ -509,10 +509,11 @@ def unreached(outputs: Floats, readings: Readings) -> str:
     with np.errstate(invalid="ignore"):
         outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
     count = int(outside.any(axis=1).sum())
+    order = "the order of the outputs, " if finite.shape[1] > 1 else ""
     if 2 * count > len(readings):
         return (
             f"the readings of {count} of {len(readings)} specimens are outside the range of all "
-            "runs over the priors: check the response, the priors and the units, or pass "
+            f"runs over the priors: check {order}the response, the priors and the units, or pass "
             "prb.LogLikelihood(error=...)"
         )
     for pair in combinations(range(finite.shape[1]), 2):

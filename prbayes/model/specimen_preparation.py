@@ -157,6 +157,9 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             raise
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
         cause = unreached(outputs, likelihood.readings)
+        if not cause and runs.outputs:
+            # Later runs may be far from the priors.
+            cause = unreached(runs.outputs[0], likelihood.readings)
         if not cause:
             checked = _data_findings(likelihood, outputs, several_roots=False)
             cause = "".join(finding.text.removesuffix(".") for finding in checked[:1])
