@@ -169,8 +169,15 @@ def emulate(
         is_complete = batches >= enough or len(emulation.z) >= most
         if emulation.bias <= data.options.bias and is_complete:
             plausible = Plausible.of(data, emulation, wider(population))
+            before = emulation.surface
             emulation = audited(run, data, emulation, plausible, rng)
-            if emulation.bias <= 1.5 * data.options.bias:
+            is_good = emulation.bias <= 1.5 * data.options.bias
+            if is_good and emulation.surface is not before:
+                # Another population may be the likely one by the new surface.
+                earlier = plausible
+                plausible = Plausible.of(data, emulation, wider(population))
+                is_good = plausible.is_near(earlier) or len(emulation.z) >= most
+            if is_good:
                 is_open = plausible.proposals.is_open(plausible.scale)
                 if (
                     is_rough(data, emulation)
