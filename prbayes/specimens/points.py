@@ -321,11 +321,14 @@ class Plausible:
 
     def is_near(self, earlier: Plausible) -> bool:
         """Return whether specimens of the draws are those of earlier draws, nearly."""
-        first, second = (normal_of(draws.specimens()) for draws in (earlier.draws, self.draws))
+        first = normal_of(earlier.draws.specimens())
+        second = normal_of(self.draws.specimens())
         shift = np.linalg.solve(first.root, second.mean - first.mean)
         change = np.linalg.solve(first.root, second.root)
-        size = np.linalg.svd(change, compute_uv=False)
-        return bool(np.abs(shift).max() < 1.0 and size.min() > 0.3 and size.max() < 3.0)
+        sizes = np.linalg.svd(change, compute_uv=False)
+        if np.abs(shift).max() > 1.0:
+            return False
+        return bool(sizes.min() > 0.3 and sizes.max() < 3.0)
 
     def of_emulation(self, data: SpecimenData, emulation: Emulation) -> Plausible:
         """Return the same draws with proposals of a better emulator."""

@@ -18,6 +18,7 @@ from prbayes.propagation.population_density import fit_normal
 from prbayes.specimens.design import corrected, emulate, first_emulation, first_runs, most_runs
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import (
+    Plausible,
     SpecimenData,
     SpecimenOptions,
     SpecimenPoints,
@@ -277,3 +278,15 @@ def test_outputs_far_beyond_the_data_leave_the_digits_near_them() -> None:
     assert steep(run.z).max() > 100 * steep(x).std()
     misfit = emulation.values(x) - steep(x)
     assert np.abs(misfit).max() < 1e-3 * steep(x).std()
+
+
+@pytest.mark.parametrize(
+    ("shift", "width", "is_near"), [(0.3, 1.2, True), (2.0, 1.0, False), (0.0, 5.0, False)]
+)
+def test_another_population_is_not_near(shift: float, width: float, is_near: bool) -> None:
+    """In deviations of the earlier one, with any unit and in any direction."""
+    mean, sd = np.array([1.0, 2000.0]), np.array([0.1, 300.0])
+    draws = NormalDraws(mean, sd, 50), NormalDraws(mean + shift * sd, width * sd, 50)
+    nothing: Any = None
+    earlier, later = (Plausible(d, nothing, nothing, 1.0, 1) for d in draws)
+    assert later.is_near(earlier) is is_near
