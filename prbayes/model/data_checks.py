@@ -418,7 +418,7 @@ def data_findings(
         if len(values) < 3:
             continue
         steps[j] = step = float(resolution(values) if np.isnan(stated) else stated)
-        share = step / values.std(ddof=1) if step else 0.0
+        share = step / max(values.std(ddof=1), 1e-300) if step else 0.0
         if np.isnan(stated) and share > largest_step:
             rounded_outputs.append((label, step, share))
         sample = y[counted & np.isfinite(y[:, j]), j]
