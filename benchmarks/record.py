@@ -30,7 +30,7 @@ def _without_folders(argument: str) -> str:
 def about(packages: Iterable[str] = PACKAGES) -> dict[str, Any]:
     """Return how, on what and when this process runs, with the versions of packages."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    module = f"-m {spec.name}" if spec is not None else sys.argv[0]
+    module = f"-m {spec.name}" if spec is not None else _without_folders(sys.argv[0])
     # What the benchmarks themselves write is no change of what they measure.
     code = [".", ":!benchmarks/results", ":!docs"]
     status = _git("status", "--porcelain", "--untracked-files=no", "--", *code)

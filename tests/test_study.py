@@ -46,3 +46,9 @@ def test_an_error_that_is_no_result_stops_a_study(tmp_path: Path) -> None:
     study = Study("x", "A study.", ["bad"], row, 2)
     with pytest.raises(ValueError, match="no root"):
         study.complete(study.cells, 2, tmp_path / "x.json")
+
+
+def test_the_record_of_a_run_has_no_folder_of_its_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    monkeypatch.setattr(sys, "argv", ["/a/folder/table.py", "--out", "/a/folder/x.json"])
+    assert record.about(("numpy",))["command"] == "python table.py --out x.json"
