@@ -192,7 +192,7 @@ def emulate(
             if not likely.proposals.is_open() and most_corrections(*data.known.shape):
                 emulation = corrected(run, data, emulation, population)
             if emulation.bias > data.options.bias:
-                require_accurate(data, emulation)
+                require_accurate(data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population))
             return emulation, *plausible.agreeing(data), plausible.draws
         # Batches of half the runs there are, a quarter near the end; at most three times the first.
@@ -503,15 +503,21 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
     return emulation
 
 
-def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
-    """Raise: the emulator's error shifts populations."""
+def require_accurate(data: SpecimenData, emulation: Emulation, likely: Likely) -> None:
+    """Raise an error that names the output and the specimen at which the emulator is worst."""
     share = emulation.error / data.readings.spread()
-    worst = int(np.argmax(share))
-    output = f"output {worst}" if len(share) > 1 else "the output"
+    output = int(np.argmax(share))
+    best = likely.weights.argmax(axis=1)
+    z = likely.points.z[np.arange(len(best)), best]
+    variance = emulation.surface.variance(z)[:, output]
+    is_read = data.readings.is_measured[:, output]
+    specimen = int(np.argmax(np.where(is_read, variance, -1.0)))
+    name = data.output_names[output] if data.output_names else data.name
+    label = specimen if data.labels is None else data.labels[specimen]
     raise DesignError(
-        f"{data.name}: the response is not smooth enough for prb.LogLikelihood() in the range of "
-        f"the priors: got an emulator of {len(emulation.z)} runs whose error at the specimens is "
-        f"{share[worst]:.2g} times the scatter of {output} and would shift an estimate by "
+        f"{data.name}: the response is not smooth enough for prb.LogLikelihood(): got an emulator "
+        f"of {len(emulation.z)} runs whose error of {name} is {share[output]:.2g} times the "
+        f"scatter, the largest at specimen {label}, and would shift an estimate by "
         f"{emulation.bias:.2g} posterior standard deviations, expected at most "
         f"{data.options.bias}; narrow the priors, ask for more first runs with prb.Reweighted(n), "
         "or use metric=prb.ProbabilityResidual()"

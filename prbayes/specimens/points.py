@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +129,8 @@ class SpecimenData:
     gross_errors: bool = False  # whether readings of single specimens may be anything
     options: SpecimenOptions = SpecimenOptions()
     name: str = "response"
+    output_names: tuple[str, ...] = ()  # names of the m outputs in messages
+    labels: NDArray[Any] | None = None  # labels of the N specimens; None for row numbers
     seed: int = 0
 
     @property
