@@ -244,6 +244,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         populations.prior_specimens(),
         populations.posterior,
         coordinates.bounds,
+        coordinates.ends,
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
