@@ -44,12 +44,12 @@ class Coordinates:
         sampler = PopulationSampler(inputs) if sampler is None else sampler
         rng = np.random.default_rng([0, 11])
 
-        def draw(count: int) -> Floats:
-            drawn, _ = sampler(roots, count, rng)
-            flat = np.concatenate([x.reshape(populations * count, -1) for x in drawn], axis=1)
+        def draw(count: int, among: int) -> Floats:
+            drawn, _ = sampler([root[:among] for root in roots], count, rng)
+            flat = np.concatenate([x.reshape(among * count, -1) for x in drawn], axis=1)
             return flat[np.isfinite(flat).all(axis=1)]
 
-        flat = draw(1)
+        flat = draw(1, populations)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
         is_share = (flat <= 1).all(axis=0) & (high > 0.5)
@@ -64,15 +64,20 @@ class Coordinates:
             is_condition[column] = True
             scale = inputs.aleatory[place].owner.op.scale
             is_log[column], center[column], half_width[column] = scale
-        ends = []
-        # Specimens in blocks: memory stays constant.
-        block = max(1, 16 * AT_ONCE // (populations * len(center)))
-        for first in (0, *range(1, n, block)):
-            flat = draw(min(block, n - first)) if first else flat
+        extremes, drawn = [], 1
+        while True:
             z = (_logs(flat, is_log) - center) / half_width
             z = z[np.isfinite(z).all(axis=1)]
-            ends += [z.min(axis=0), z.max(axis=0)]
-        bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
+            extremes += [z.min(axis=0), z.max(axis=0)]
+            if drawn >= n:
+                break
+            # Large data sets are those of fewer populations, so that time grows slowly with n, and
+            # specimens are drawn in blocks, so that memory stays constant.
+            among = max(min(populations, 64), populations * 128 // max(drawn, 128))
+            block = min(n - drawn, max(1, 2 * AT_ONCE // (among * len(center))))
+            flat = draw(block, among)
+            drawn += block
+        bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
         ends = np.where(is_share & ~is_condition, range_, [[-np.inf], [np.inf]])
         return cls(inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition)

@@ -300,7 +300,9 @@ class Plausible:
         """
         options = data.options
         proposals = fit_proposals(data, emulation, population)
-        count = options.points * proposals.modes.table.shape[1]
+        # Few points of a specimen suffice among many specimens; the halves have to agree.
+        of_mode = min(options.points, max(2, 4096 // len(data.readings)))
+        count = of_mode * proposals.modes.table.shape[1]
         points = draw_points(data, proposals, 2 * count, data.seed)
         scale = likely_scale(data, points, emulation.error)
         if not proposals.is_open(scale):
