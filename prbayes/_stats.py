@@ -14,9 +14,9 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 
 # The order of equal values decides the last digit of a sum of weights, and nothing else. "stable"
 # keeps it on every processor; "quicksort" is seven times faster for 100 000 values.
@@ -40,23 +40,21 @@ def finite_sample(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return values[is_finite], w
 
 
-def ranked(
-    values: Floats, points: Floats, *, kind: Sorting = "stable"
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def ranked(values: Floats, points: Floats, *, kind: Sorting = "stable") -> tuple[Indices, Indices]:
     """Return the order of values, (n,), and how many of them are not above each point, (m,)."""
     order = np.argsort(values, kind=kind)
     below = np.searchsorted(values[order], points, side="right")
     return order, below
 
 
-def cumulated(weights: Floats, order: NDArray[np.intp]) -> Floats:
+def cumulated(weights: Floats, order: Indices) -> Floats:
     """Return sums of the first 0, 1, ... n weights in an order, (..., n), (n,) -> (..., n + 1)."""
     total = np.cumsum(weights[..., order], axis=-1)
     zero = np.zeros((*total.shape[:-1], 1))
     return np.concatenate([zero, total], axis=-1)
 
 
-def summed_below(weights: Any, order: NDArray[np.intp], below: Any, xp: Any = np) -> Any:
+def summed_below(weights: Any, order: Indices, below: Any, xp: Any = np) -> Any:
     """Return the sums of the first ``below`` weights in an order, (..., n), (n,), (m,) -> (..., m).
 
     ``cumulated(weights, order)[..., below]`` by operations that JAX differentiates too: no array is
@@ -109,7 +107,7 @@ def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats
 _row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n),(m)->(m)")
 
 
-def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> NDArray[np.intp]:
+def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> Indices:
     """Return the index at which the running sum of weights first reaches each level.
 
     Weights (..., n) and levels (..., m) give indices (..., m): the step-wise quantile of ascending

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
@@ -19,6 +18,7 @@ from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
     AT_ONCE,
+    Bools,
     Floats,
     Seed,
     finite_number,
@@ -431,9 +431,7 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
     return float(np.nanstd(by_draw, ddof=1) / np.sqrt(n)) if populations.are_draws else 0.0
 
 
-def _rough_finding(
-    response: Any, estimates: Sequence[_Estimate], is_rough: NDArray[np.bool_]
-) -> list[Finding]:
+def _rough_finding(response: Any, estimates: Sequence[_Estimate], is_rough: Bools) -> list[Finding]:
     """Return a finding if the error of a probability is too large."""
     rough = [estimate for estimate, bad in zip(estimates, is_rough, strict=True) if bad]
     if not rough:
@@ -579,7 +577,7 @@ def rare_event(
     )
 
 
-def weighted_share(weights: Floats, counts: NDArray[np.bool_]) -> tuple[Floats, float]:
+def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
     r"""Return shares of points that count, by rows of weights (k, n), and the first one's error.
 
     The mean of a weight is known to be one. With this as a control variate (Owen and Zhou 2000),

@@ -14,13 +14,13 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import AT_ONCE, Floats, positive_integer, share
+from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
@@ -209,7 +209,7 @@ class ResponseSample:
         ]
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
+    def _order(self) -> Indices:
         """The points that have a response, in ascending order of it."""
         values = self.select(self.outputs)
         order = np.argsort(values, kind="stable")
@@ -229,7 +229,7 @@ class ResponseSample:
         return self.design.n_runs
 
     @cached_property
-    def blocks(self) -> NDArray[np.intp]:
+    def blocks(self) -> Indices:
         """The block of the design that each of the values is in, (n,)."""
         return self.design.blocks[self._order]
 

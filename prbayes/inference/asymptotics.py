@@ -14,10 +14,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._stats import distribution_function, quantile, reached
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices
 from prbayes.inference.resampling import (
     SETS,
     DataSets,
@@ -69,7 +68,7 @@ class Stencil:
     is_wide: bool  # the nominal step is that for step functions
     values: Floats  # (s, n), or (s, n, m) of several outputs
     weights: Floats  # (s, n)
-    blocks: NDArray[np.intp]  # (n,): of the design's points, which may change afterwards
+    blocks: Indices  # (n,): of the design's points, which may change afterwards
     has_equal_values: bool  # the responses are the same at all points, as stored ones are
 
 
@@ -256,7 +255,7 @@ class Information:
         differences = hessian_of(self.discrepancies(*self._sides[1:]), step.size)
         return differences / np.outer(step, step)
 
-    def areas(self, sets: DataSets, subset: NDArray[np.bool_] | None = None) -> list[LinearArea]:
+    def areas(self, sets: DataSets, subset: Bools | None = None) -> list[LinearArea]:
         """Return a linear model of each area that the metric is a sum of, for data sets.
 
         ``subset`` are the points of the population that count; all by default.
@@ -536,7 +535,7 @@ def named_direction(direction: Floats, names: list[str]) -> str:
 
 def identified_by_curvature(
     hessian: Floats, noise: Floats, weakest: float = 1.0
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Bools]:
     """Return eigenvalues and eigenvectors of the Hessian, and which of them the data identify.
 
     H and J of the sandwich, (d, d), are in units of the prior's spread; ``weakest`` is an upper

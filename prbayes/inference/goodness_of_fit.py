@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
@@ -36,7 +35,7 @@ class FittedSets:
     center: Floats  # (r,): of the observed data, in coordinates
     sets: DataSets
     x: Floats  # (n_sets, r): of the data sets
-    converged: NDArray[np.bool_]  # (n_sets,)
+    converged: Bools  # (n_sets,)
     observed: DataSets  # the observed data, or these without rounding
 
     @classmethod

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS, Hyperparameters
 
@@ -30,11 +29,11 @@ class Continuation:
 
     lower: Floats  # (d,): ends a; NaN of elements without them
     upper: Floats  # (d,): ends b
-    below: NDArray[np.bool_]  # (d,): whether populations exist there
-    above: NDArray[np.bool_]
+    below: Bools  # (d,): whether populations exist there
+    above: Bools
 
     @property
-    def is_continued(self) -> NDArray[np.bool_]:
+    def is_continued(self) -> Bools:
         """Which elements continue beyond an end, (d,)."""
         return self.below | self.above
 

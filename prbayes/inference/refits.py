@@ -12,10 +12,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._progress import progress
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
 from prbayes.inference.asymptotics import (
     Information,
     Local,
@@ -134,7 +133,7 @@ def refit(
     start: Floats | None = None,
     *,
     is_rough: bool = False,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
     With stored responses by an exact minimisation from ``start``, the optimum by default, without a
@@ -178,7 +177,7 @@ def is_prepared_by_data(evaluator: Evaluator) -> bool:
 
 def refit_prepared(
     sampling: SamplingDistribution, sets: DataSets, minimisers: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimiser of the metric prepared for each data set, and which converged.
 
     The minimisers of the metric prepared for the observed data (`refit`) remain if the metric
@@ -249,7 +248,7 @@ def minimise_sets(
     objective: BatchObjective,
     descent: Descent,
     start: Floats | None = None,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimisers of data sets along the axes, by default from the optimum on."""
 
     def value(x: Floats, rows: Any) -> Floats:

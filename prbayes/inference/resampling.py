@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
@@ -46,7 +46,7 @@ class DataSets:
 # -- specimens in common ---------------------------------------------------------------------------
 
 
-def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.intp]], int]:
+def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[Indices], int]:
     """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     An observation without a label is a specimen of its own.
@@ -213,7 +213,7 @@ def sets_along(
         return sets, [csr_array(count.astype(np.float64)) for count in drawn_counts]
     numbers, total = specimens(nodes)
     size = (len(thetas), total)
-    points: dict[int, NDArray[np.intp]] = {}
+    points: dict[int, Indices] = {}
     counts = []
     for group in _aligned_groups(nodes):
         is_observable = _observable_by_all(evaluator, responses, group)
@@ -244,7 +244,7 @@ def simulated_points(
     seed: int,
     *,
     more: int = 0,
-) -> list[NDArray[np.intp]]:
+) -> list[Indices]:
     """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each.
 
     Populations are responses and weights by simulator, (1, n) each.
@@ -253,7 +253,7 @@ def simulated_points(
     rng = np.random.default_rng([seed, 1])
     size = specimens(nodes)[1] + more
     responses = [values[0] for values, _ in populations]
-    points: dict[int, NDArray[np.intp]] = {}
+    points: dict[int, Indices] = {}
     for group in _aligned_groups(nodes):
         # Simulators that share specimens have the same points, with the same weights.
         mass = populations[group[0]][1][0] * _observable_by_all(evaluator, responses, group)
@@ -264,15 +264,13 @@ def simulated_points(
     return [points[k] for k in range(len(nodes))]
 
 
-def _observable_by_all(
-    evaluator: Evaluator, responses: list[Floats], group: list[int]
-) -> NDArray[np.bool_]:
+def _observable_by_all(evaluator: Evaluator, responses: list[Floats], group: list[int]) -> Bools:
     """Return which points all simulators of a group can observe, (n,)."""
     columns = [observable(responses[k], evaluator.nodes[k].target) for k in group]
     return np.asarray(np.all(columns, axis=0))
 
 
-def _points_of(mass: Floats, uniform: Floats) -> NDArray[np.intp]:
+def _points_of(mass: Floats, uniform: Floats) -> Indices:
     """Return points of a population at levels of its cumulated weights, (n,), (...) -> (...)."""
     below = np.cumsum(mass / mass.sum())
     # On the right of equal sums, so that no point without weight is drawn.
@@ -280,9 +278,7 @@ def _points_of(mass: Floats, uniform: Floats) -> NDArray[np.intp]:
     return np.minimum(points, mass.size - 1)  # a product may be rounded up to the whole
 
 
-def sets_at(
-    evaluator: Evaluator, populations: list[Floats], points: list[NDArray[np.intp]]
-) -> DataSets:
+def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indices]) -> DataSets:
     """Return the data sets that are measured on specimens, given as points of responses (n,)."""
     numbers, _ = specimens(evaluator.nodes)
     values, weights = [], []
@@ -321,7 +317,7 @@ def _blocks(n_sets: int, size: int) -> Iterator[slice]:
         yield slice(first, min(first + step, n_sets))
 
 
-def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
+def observable(responses: Floats, target: Discrepancy) -> Bools:
     """Return which points can be observed, (n,) or (n, m) -> (n,).
 
     A failed specimen is observed as such, if the metric counts failures.

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 
 
 class Minima(NamedTuple):
@@ -22,7 +21,7 @@ class Minima(NamedTuple):
 
     x: Floats  # (B, r)
     values: Floats  # (B,)
-    converged: NDArray[np.bool_]  # (B,)
+    converged: Bools  # (B,)
 
 
 def descend(
@@ -99,7 +98,7 @@ def descend(
 
 def _by_differences(
     value: Callable[[Floats, Any], Floats], step: float, curvature: Floats, is_central: bool
-) -> Callable[[Floats, NDArray[np.intp]], tuple[Floats, Floats]]:
+) -> Callable[[Floats, Indices], tuple[Floats, Floats]]:
     """Return a function of points (A, r) and rows that returns values (A,) and gradients (A, r)."""
     r = len(curvature)
     # Axes, of a mean length of one, along which a typical function has equal curvature: along
@@ -114,7 +113,7 @@ def _by_differences(
     # Of one-sided differences for a function of typical curvature.
     bias = step * mean_curvature / 2
 
-    def problem(x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    def problem(x: Floats, rows: Indices) -> tuple[Floats, Floats]:
         values = value(x[:, None] + stencil, rows)
         center, up, down = np.split(values, [1, 1 + r], axis=1)
         with np.errstate(invalid="ignore"):
@@ -212,7 +211,7 @@ def _step(
     value: Callable[[Floats, Any], Floats],
     points: Floats,
     values: Floats,
-    rows: NDArray[np.intp],
+    rows: Indices,
 ) -> tuple[Floats, Floats]:
     """Replace the worst point of each sorted simplex, or shrink it towards the best."""
     # The factors of Gao and Han (2012) for r parameters, at least two.

@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 
 
 def inside(points: Floats) -> Floats:
@@ -28,7 +27,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     return inside(points)
 
 
-def lattice(place: NDArray[np.intp], count: NDArray[np.intp], dimensions: int) -> Floats:
+def lattice(place: Indices, count: Indices, dimensions: int) -> Floats:
     """Return points of lattices in the unit cube, (n, dimensions), at places 0 to count - 1.
 
     The first coordinates are place / count. The others are multiples of powers of the root of

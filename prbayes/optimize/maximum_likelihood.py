@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -158,7 +157,7 @@ _UNSUPPORTED = Finding(
 
 def _supported(
     evaluator: Evaluator, optima: Sequence[Mode], largest: float = 0.5, of_specimen: float = 0.1
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return which optima have a log-likelihood that is known to ``largest`` nats.
 
     Where points lie farther apart than a population is wide, a few points that lie close to each
@@ -498,9 +497,7 @@ def _findings(
     return findings
 
 
-def _too_small_errors(
-    hyperparameters: Hyperparameters, objective: _Objective, best: Mode
-) -> NDArray[np.bool_]:
+def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, best: Mode) -> Bools:
     """Return which standard errors, (d,), are less than a third as wide as the likelihood.
 
     The root of the profile likelihood ratio four standard errors away is compared with four, or
@@ -743,7 +740,7 @@ class SpecimenRefits:
                 theta, converged = self.fit()
             yield theta, converged, data
 
-    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.
 
         ``weights``, (S, n_k), are of the specimens of each of `Evaluator.emulated`, with any sum.

@@ -19,9 +19,8 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
@@ -110,7 +109,7 @@ class StoredScores:
     """Scores of the stored responses of simulators that share specimens."""
 
     simulator: int  # one of them
-    is_observable: NDArray[np.bool_]  # (M,): stored responses that all simulators can observe
+    is_observable: Bools  # (M,): stored responses that all simulators can observe
     values: Floats  # (M', d): scores of these
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)
@@ -390,7 +389,7 @@ class Cumulants(NamedTuple):
 
 
 # Tilts (A, r) and the rows (A,) that they belong to -> cumulant functions of these.
-CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
+CumulantFunction = Callable[[Floats, Indices], Cumulants]
 
 
 def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
@@ -464,7 +463,7 @@ def log_density(
         return result
     supported = [logs[is_supported] for logs in log_weights]
 
-    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+    def function(tilts: Floats, rows: Indices) -> Cumulants:
         return cumulants([logs[rows] for logs in supported], scores, tilts)
 
     shape = len(supported[0]), scores[0].values.shape[1]

@@ -18,13 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.special import ndtri
 
 from prbayes._finding import Finding
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
@@ -233,9 +232,7 @@ class RefitLikelihood:
         return result
 
 
-def nearest(
-    centers: Sequence[SamplingDistribution], thetas: Floats
-) -> tuple[NDArray[np.intp], Floats]:
+def nearest(centers: Sequence[SamplingDistribution], thetas: Floats) -> tuple[Indices, Floats]:
     """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
     x = np.stack([center.coordinates(thetas) for center in centers])
     index = np.linalg.norm(x, axis=2).argmin(axis=0)
@@ -271,7 +268,7 @@ def extended_log_density(
     distance = (mean * standardised).sum(axis=1)
     share = part * np.exp(-distance / options.tail)
 
-    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+    def function(tilts: Floats, rows: Indices) -> Cumulants:
         empirical = cumulants([log_weights[rows]], scores, tilts)
         center, within = mean[rows], covariance[rows]
         linear = np.einsum("skl,sl->sk", within, tilts)

@@ -6,11 +6,10 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
@@ -22,8 +21,6 @@ from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import cross
 from prbayes.response.discrepancy import has_discrepancy
-
-IntArray = NDArray[np.intp]
 
 
 def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
@@ -89,9 +86,7 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
     return findings
 
 
-def mixed_directions(
-    local: Local, coefficients: IntArray, inputs: IntArray, names: list[str]
-) -> str:
+def mixed_directions(local: Local, coefficients: Indices, inputs: Indices, names: list[str]) -> str:
     """Name unidentified directions of both blocks of elements; empty if there are none."""
     _, _, axes = np.linalg.svd(local.unidentified[coefficients])
     directions = [
@@ -105,7 +100,7 @@ def mixed_directions(
 
 
 def correlated_estimates(
-    local: Local, coefficients: IntArray, inputs: IntArray, names: list[str]
+    local: Local, coefficients: Indices, inputs: Indices, names: list[str]
 ) -> str:
     """Name the combinations with the largest correlation; empty if that is below .95.
 
@@ -124,7 +119,7 @@ def correlated_estimates(
 
 
 def canonical_correlation(
-    covariance: Floats, rows: IntArray, columns: IntArray
+    covariance: Floats, rows: Indices, columns: Indices
 ) -> tuple[float, Floats, Floats]:
     """Return the largest canonical correlation of two blocks, and the loadings in each."""
     first, second = (
@@ -141,7 +136,7 @@ def canonical_correlation(
     )
 
 
-def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[IntArray, IntArray]:
+def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indices]:
     """Return the elements of theta above the coefficients only, and above other inputs only."""
     if not has_discrepancy(node.bound.responses.function):
         return np.arange(0), np.arange(0)

@@ -11,11 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored, needs_refits
 from prbayes.inference.resampling import observed_set
@@ -64,7 +63,7 @@ def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
 def one_sided_bounds(
     evaluator: Evaluator,
     theta: Floats,
-    flat: NDArray[np.bool_],
+    flat: Bools,
     statistic: Callable[[Floats, int], float],
 ) -> list[OneSidedBound]:
     """Return the ``flat`` elements, (d,), that exceed a limit on one side of theta, but not both.

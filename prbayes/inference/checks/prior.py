@@ -14,10 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.model.evaluator import Evaluator, only_through_prior
@@ -39,7 +38,7 @@ class PriorEnd:
 def elements_at_prior_ends(
     evaluator: Evaluator,
     theta: Floats,
-    flat: NDArray[np.bool_],
+    flat: Bools,
     objective: Callable[[Floats], float],
     rise: float,
 ) -> list[PriorEnd]:

@@ -6,13 +6,12 @@ import contextlib
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
@@ -20,7 +19,7 @@ from prbayes.response.inputs import Inputs
 _PAGE = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
 
 
-def elements_above(evaluator: Evaluator) -> NDArray[np.bool_]:
+def elements_above(evaluator: Evaluator) -> Bools:
     """Return which elements of theta enter the population of each simulator, (K, d)."""
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
@@ -112,8 +111,8 @@ def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
 
 def _spread_in_common(
     evaluator: Evaluator,
-    enters: NDArray[np.bool_],
-    groups: NDArray[np.intp],
+    enters: Bools,
+    groups: Indices,
     counts: Sequence[float],
 ) -> list[Finding]:
     """Report a spread that populations with means of their own underestimate (Neyman and Scott).
