@@ -45,7 +45,8 @@ from prbayes.model.specimen_preparation import (
     prepared,
     specimen_data,
 )
-from prbayes.numerics.points import farthest_rows
+from prbayes.numerics.mixtures import normalised_weights
+from prbayes.numerics.modes import far_apart
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
@@ -195,8 +196,7 @@ def mode_weights(
         elif not is_unidentified.any():
             sign, log_det = np.linalg.slogdet(covariance)
             logs[k] += log_det / 2 if sign > 0 else 0.0
-    weights = np.exp(logs - logs.max())
-    return np.asarray(weights / weights.sum())
+    return normalised_weights(logs)
 
 
 class _Objective:
@@ -245,9 +245,8 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
         return [hyperparameters.initial], n_screened
     # The best one, and points of the better quarter that are far from each other.
     n_starts = 8 if settings.starts is None else max(1, settings.starts)
-    candidates = thetas[order[: max(n_starts, order.size // 4)]] / hyperparameters.prior_sd
-    rows = farthest_rows(candidates, min(n_starts, len(candidates)))
-    return list(candidates[rows] * hyperparameters.prior_sd), n_screened
+    candidates = thetas[order[: max(n_starts, order.size // 4)]]
+    return list(far_apart(candidates, n_starts, hyperparameters.prior_sd)), n_screened
 
 
 def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:

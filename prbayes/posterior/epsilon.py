@@ -27,6 +27,7 @@ from prbayes.model.fingerprint import Identity, identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import AnySimulator, simulators
 from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
+from prbayes.numerics.mixtures import normalised_weights
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 _log = logging.getLogger("prbayes")
@@ -226,8 +227,7 @@ def _by_coverage(information: Information) -> float | None:
     for _ in range(40):  # to rounding
         middle = float(np.sqrt(low * high))
         logs = -distances / middle - log_proposal
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-        weights /= weights.sum(axis=1, keepdims=True)
+        weights = normalised_weights(logs)
         # The posterior probability below the optimum, which is at zero, by axis and data set.
         below = np.stack([(weights * (column < 0)).sum(axis=1) for column in z.T])
         coverage = float(np.mean(np.abs(below - 0.5) < INTERVAL / 2))

@@ -24,7 +24,7 @@ from prbayes._validate import Floats, called, positive_integer, real_array, shar
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
 from prbayes.model.parameters import Hyperparameters
-from prbayes.posterior.importance import LogDensity
+from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
 from prbayes.response.store import StoreError, replace_files

@@ -34,12 +34,12 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
 from prbayes.model.specimen_preparation import prepared
+from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
-from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.results import (
     Chains,

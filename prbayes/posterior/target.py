@@ -31,10 +31,11 @@ from prbayes.inference.resampling import groups, observable, observed_set, sets_
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.points import farthest_rows, sobol
+from prbayes.numerics.modes import LogDensity, far_apart, laplace
+from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, optima_of
-from prbayes.posterior.importance import LogDensity, importance_sample, laplace
+from prbayes.posterior.importance import importance_sample
 from prbayes.posterior.saddlepoint import (
     Cumulants,
     EstimateLikelihood,
@@ -69,8 +70,7 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
     thetas = evaluator.hyperparameters.prior_points(1024, 0)
     order = np.argsort(-target.log_posterior(thetas), kind="stable")
-    candidates = thetas[order[: len(thetas) // 4]] / prior_sd
-    return replace(target, starts=candidates[farthest_rows(candidates, 8)] * prior_sd)
+    return replace(target, starts=far_apart(thetas[order[: len(thetas) // 4]], 8, prior_sd))
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
