@@ -116,24 +116,20 @@ def _stencil_around(
 # -- H and J ---------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
 class Information:
     """Information about theta in one simulator's data, if they are drawn from the model there."""
 
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        k: int,
-        theta: Floats,
-        n_sets: int = SETS,
-        widened: float = 1.0,
-    ) -> None:
-        self.evaluator = evaluator
-        self.k = k  # index of the simulator
-        self.theta = theta  # (d,)
-        self.prior_sd = evaluator.hyperparameters.prior_sd  # (d,)
-        self.n_sets = n_sets  # number of simulated data sets, each of the observed size
-        # Factor of the step where the discrepancy is a step function of theta, or jumps.
-        self.widened = widened
+    evaluator: Evaluator
+    k: int  # index of the simulator
+    theta: Floats  # (d,)
+    n_sets: int = SETS  # number of simulated data sets, each of the observed size
+    widened: float = 1.0  # factor of the step where the discrepancy jumps, or has steps in theta
+
+    @property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each element, (d,)."""
+        return self.evaluator.hyperparameters.prior_sd
 
     @property
     def node(self) -> Node:
@@ -280,7 +276,7 @@ class Information:
             knots = np.unique(occurring[np.isfinite(occurring)])
             knots = knots[np.unique(np.linspace(0, knots.size - 1, 400).astype(int))]
             # Responses that are the same at all points of the stencil are sorted once.
-            if np.array_equal(values[0], values[-1], equal_nan=True):
+            if around.has_equal_values:
                 values = values[0]
             simulated = distribution_function(values, weights, knots, kind="quicksort")
             measured = distribution_function(part_observed, w, knots, kind="quicksort")
@@ -319,30 +315,30 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
     spread = information.prior_sd[:, None]
     sets, blocks = information.data_sets, information.stencil.blocks
     areas = information.areas(sets)
-    gram: Any = 0
-    for area in areas:
-        scaled = np.asarray(area.slopes * spread)
-        gram = gram + (scaled * area.lengths) @ scaled.T
+    lengths = [area.lengths for area in areas]
+    scaled = [area.slopes * spread for area in areas]
+    pairs = zip(scaled, lengths, strict=True)
+    gram = sum((slopes * length) @ slopes.T for slopes, length in pairs)
     _, vectors = np.linalg.eigh(gram)
     # The change of the area over one prior standard deviation along each direction.
-    change: Any = 0
-    for area in areas:
-        changes = np.abs(vectors.T @ np.asarray(area.slopes * spread))
-        change = change + (changes * area.lengths).sum(axis=-1)
+    pairs = zip(scaled, lengths, strict=True)
+    change = sum((np.abs(vectors.T @ x) * length).sum(axis=-1) for x, length in pairs)
     is_identified = weakest * change > 0.5 * information.noise_floor
     if blocks.size >= 256:
-        even_areas = information.areas(sets, blocks % 2 == 0)
-        odd_areas = information.areas(sets, blocks % 2 == 1)
-        product = even_square = odd_square = np.zeros(vectors.shape[1])
-        for even, odd in zip(even_areas, odd_areas, strict=True):
-            even_change = vectors.T @ np.asarray(even.slopes * spread)
-            odd_change = vectors.T @ np.asarray(odd.slopes * spread)
-            lengths = even.lengths  # both halves have the same knots
-            product = product + (even_change * odd_change * lengths).sum(axis=-1)
-            even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
-            odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
+        even, odd = (
+            [vectors.T @ (area.slopes * spread) for area in information.areas(sets, half)]
+            for half in (blocks % 2 == 0, blocks % 2 == 1)
+        )
+
+        def product(first: list[Floats], second: list[Floats]) -> Any:
+            # Both halves have the knots of the whole.
+            changes = zip(first, second, lengths, strict=True)
+            return sum((a * b * length).sum(axis=-1) for a, b, length in changes)
+
         # Correlation of the changes on both sides of theta.
-        is_identified &= product > 0.35 * np.sqrt(even_square * odd_square)
+        is_identified &= product(even, odd) > 0.35 * np.sqrt(
+            product(even, even) * product(odd, odd)
+        )
     return np.asarray(vectors[:, is_identified])
 
 
@@ -442,20 +438,18 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
         return _area_covariance(information, scales, weakest)
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    is_dependent = dependent(information[0].evaluator.nodes)
-    hessian, noise, gradients = (np.zeros(()) for _ in range(3))
-    for item, scale in zip(information, scales, strict=True):
-        hessian = hessian + item.hessian / scale
-        if is_dependent:
-            sets = information[0].data_sets
-            observed, weights = sets.values[item.k], sets.weights[item.k]
-            gradients = gradients + item.gradients(observed, weights) / scale
-        else:
-            noise = noise + item.sampling_covariance / scale**2
-    if is_dependent:
+    pairs = list(zip(information, scales, strict=True))
+    hessian = unit * sum(item.hessian / scale for item, scale in pairs)
+    if dependent(information[0].evaluator.nodes):
         # Gradients of simulators that share specimens depend on each other.
-        noise = np.atleast_2d(np.cov(gradients, rowvar=False))
-    hessian, noise = unit * hessian, unit * noise
+        sets = information[0].data_sets
+        gradients = sum(
+            item.gradients(sets.values[item.k], sets.weights[item.k]) / scale
+            for item, scale in pairs
+        )
+        noise = unit * np.atleast_2d(np.cov(gradients, rowvar=False))
+    else:
+        noise = unit * sum(item.sampling_covariance / scale**2 for item, scale in pairs)
     values, vectors, is_identified = identified_by_curvature(hessian, noise, weakest)
     identified = vectors[:, is_identified]
     inverse = identified / values[is_identified]

@@ -23,7 +23,7 @@ from prbayes.metrics.density import overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
-from prbayes.optimize.objective import Method, Objective, Ridge, SpentError, StalledError
+from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
 
 # Relative gain that no longer counts: far below the noise of any data, which is 1 / N.
@@ -111,26 +111,24 @@ class Search:
 
     evaluator: Evaluator
     prior_sd: Floats  # (d,): unit of the parameters
-    method: Method
-    prior: bool  # whether minus the log prior is added
-    tolerance: float  # of the standardised problem
-    max_evaluations: int  # in all
-    ridge: Ridge | None = None  # added to the objective
+    settings: Minimisation
+    ridge: Ridge | None = None  # penalty that is added to the objective
     uses_gradient: bool = field(init=False)  # whether the method receives gradients
     has_kinks: bool = field(init=False)  # gradients jump: line searches end in ever smaller steps
 
     def __post_init__(self) -> None:
         nodes = self.evaluator.nodes
         random = [node.name for node in nodes if node.bound.random]
-        if random and self.method.gradient and isinstance(self.method.method, str):
+        method = self.settings.method
+        if random and method.gradient and isinstance(method.method, str):
             raise TypeError(
                 f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-                f"{self.method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
+                f"{method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
                 "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
-        object.__setattr__(self, "uses_gradient", self.method.gradient and not random)
+        object.__setattr__(self, "uses_gradient", method.gradient and not random)
         object.__setattr__(self, "has_kinks", has_kinks)
 
     def size(self, theta: Floats, scales: Floats) -> float:
@@ -151,10 +149,10 @@ class Search:
         if gradient:
             # The response, or an inverse distribution function, may have no gradient.
             with suppress(NotImplementedError, NullTypeGradError):
-                exact = self.evaluator.objective(prior=self.prior, gradient=True)
+                exact = self.evaluator.objective(prior=self.settings.prior, gradient=True)
 
         def values(thetas: Floats) -> Floats:
-            if not self.prior:
+            if not self.settings.prior:
                 return self.evaluator.total(thetas, scales)  # needs no compilation
             single = self.evaluator.objective(prior=True, gradient=False)
             return np.array([float(single(theta, scales)[0]) for theta in thetas])
@@ -175,7 +173,7 @@ class Search:
             self.prior_sd,
             size,
             gradient=gradient,
-            max_evaluations=self.max_evaluations - spent,
+            max_evaluations=self.settings.max_evaluations - spent,
             ridge=self.ridge,
         )
 
@@ -190,7 +188,8 @@ def minimise(
     size = search.size(theta, scales)
     gradient = search.uses_gradient
     objective = search.objective(theta, scales, size, trace.count, gradient=gradient)
-    if str(search.method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
+    method = search.settings.method
+    if str(method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
         # Successful line searches take fewer evaluations without progress.
         objective.patience = 15
         if search.has_kinks and not patient:
@@ -201,8 +200,8 @@ def minimise(
         objective,
         np.zeros_like(theta),
         jac=gradient or None,
-        method=search.method.method,
-        options=search.method.settings(search.tolerance, theta.size),
+        method=method.method,
+        options=method.settings(search.settings.tolerance, theta.size),
     )
     return Fit(
         theta=objective.best,
@@ -228,7 +227,7 @@ def _run_scipy(
         with progress("evaluations") as objective.report:
             outcome = scipy_minimize(objective, start, **settings)
     except SpentError:
-        return Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."
+        return Result.MAX_EVALUATIONS, f"max_evaluations = {search.settings.max_evaluations}."
     except BudgetError:
         if not np.isfinite(objective.lowest):
             raise
@@ -248,7 +247,7 @@ def settle(search: Search, fit: Fit) -> Fit:
     It has if gradients around its end promise next to nothing, or else if a simplex gains nothing,
     after a more patient line search if the first was stopped soon.
     """
-    most = search.max_evaluations
+    most = search.settings.max_evaluations
     if fit.result.converged or fit.trace.count >= most or not search.uses_gradient:
         return fit
     is_jumping = _loses_responses(search, fit.theta)
@@ -334,8 +333,9 @@ def _follow_gradients(search: Search, fit: Fit) -> Fit:
         if np.isfinite(promise):
             details = f"By gradients, a better value would be lower by {promise:.1e} of it."
     except SpentError:
-        if spent + objective.count >= search.max_evaluations:
-            result, details = Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."
+        most = search.settings.max_evaluations
+        if spent + objective.count >= most:
+            result, details = Result.MAX_EVALUATIONS, f"max_evaluations = {most}."
     except BudgetError:
         result = Result.STOPPED
     return replace(
@@ -384,7 +384,6 @@ def approach(
     search: Search,
     theta: Floats,
     scales: Floats,
-    seed: int,
     trace: Trace,
     least: float = OVERLAP,
 ) -> tuple[Floats, Trace]:
@@ -405,7 +404,8 @@ def approach(
             return theta, trace
     guide = AreaGuide(evaluator, scales)
     if not evaluator.responses_per_theta:
-        candidates = np.vstack([theta, evaluator.hyperparameters.prior_points(THETAS, seed)])
+        points = evaluator.hyperparameters.prior_points(THETAS, search.settings.random_seed)
+        candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
     objective = Objective(
         differences(guide, _STEP * search.prior_sd),
@@ -413,7 +413,7 @@ def approach(
         search.prior_sd,
         len(evaluator.nodes),
         gradient=True,
-        max_evaluations=search.max_evaluations - trace.count,
+        max_evaluations=search.settings.max_evaluations - trace.count,
     )
 
     def stop_with_overlap(t: Floats) -> None:

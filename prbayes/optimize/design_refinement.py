@@ -58,7 +58,7 @@ class Restart:
 
 
 def refine_designs(
-    search: Search, fit: Fit, round_: int, seed: int, advance: Callable[[int, str], None]
+    search: Search, fit: Fit, round_: int, advance: Callable[[int, str], None]
 ) -> tuple[Fit, Restart | None]:
     """Add points where designs are too small for a fit; return it with the design's error.
 
@@ -68,7 +68,7 @@ def refine_designs(
     evaluator = search.evaluator
     if not evaluator.reweighted:
         return fit, None
-    nearby = neighbourhood(evaluator, fit, seed)
+    nearby = neighbourhood(evaluator, fit, search.settings.random_seed)
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
         # A minimiser follows what is not identified until no design supports it.
@@ -77,12 +77,12 @@ def refine_designs(
             names = unidentified_names(evaluator, fit.sampling.local)
         refuse(short, evaluator, names)
     if short:
-        return fit, _cover(search, fit, nearby, seed)
+        return fit, _cover(search, fit, nearby)
     overlap = stored_overlap(evaluator, fit.theta)
     is_apart = overlap < OVERLAP
     if round_ < MAX_ROUNDS and overlap < OVERLAP_ENOUGH:
         # The design supports this point, but the fit is poor: continue along the area metric.
-        theta, _ = approach(search, fit.theta, fit.scales, seed, fit.trace, OVERLAP_ENOUGH)
+        theta, _ = approach(search, fit.theta, fit.scales, fit.trace, OVERLAP_ENOUGH)
         if refine_at(evaluator, theta[None]):
             alternative = None if is_apart else fit.theta
             return fit, Restart(theta, fit.pilot, fit.ridge, alternative)
@@ -130,12 +130,12 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     return np.asarray(thetas[hyperparameters.in_support(thetas)])
 
 
-def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
+def _cover(search: Search, fit: Fit, nearby: Floats) -> Restart:
     """Add points to designs that do not support a fit, around a pilot and its optimum."""
     evaluator, thetas = search.evaluator, fit.pilot
     if thetas is None:
-        thetas = nearby = pilot(evaluator, fit.scales, seed=seed)
-    elif (ridge := _ridge(search, fit, thetas, seed)) is not None:
+        thetas = nearby = pilot(evaluator, fit.scales, seed=search.settings.random_seed)
+    elif (ridge := _ridge(search, fit, thetas)) is not None:
         refine_at(evaluator, ridge.center[None] if fit.ridge is None else nearby)
         return Restart(ridge.center, thetas, ridge)
     elif not refine_at(evaluator, nearby):
@@ -144,7 +144,7 @@ def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
     return Restart(theta, thetas, fit.ridge)
 
 
-def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge | None:
+def _ridge(search: Search, fit: Fit, pilot_thetas: Floats) -> Ridge | None:
     """Return a penalty on directions that are not identified, or None if there are none.
 
     Along them a minimiser follows the error of the design, which grows with the distance. The
@@ -156,7 +156,7 @@ def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge |
     def noise(theta: Floats) -> float:
         return float((noise_floors(evaluator, theta, FEW_SETS) / fit.scales).sum())
 
-    if search.prior:
+    if search.settings.prior:
         return None
     center = fit.theta
     if fit.ridge is None or shortcomings(evaluator, center[None]):
@@ -164,7 +164,9 @@ def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge |
         values = evaluator.total(pilot_thetas, fit.scales)
         is_as_good = values <= values.min() + noise(pilot_thetas[np.argmin(values)])
         candidates = pilot_thetas[is_as_good]
-        median = np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
+        median = np.median(
+            hyperparameters.prior_thetas(THETAS, search.settings.random_seed), axis=0
+        )
         distances = (((candidates - median) / hyperparameters.prior_sd) ** 2).sum(axis=1)
         center = np.asarray(candidates[np.argmin(distances)])
     sampling = sampling_distribution(evaluator, center, fit.scales)

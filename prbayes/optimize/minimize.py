@@ -297,7 +297,6 @@ class _Problem:
     """What is minimised, and the fits so far."""
 
     search: Search
-    settings: Minimisation
     advance: Callable[[int, str], None]  # of the progress bar: number of runs, and a note
     n_previous: int  # responses computed before, without those of designs
     record: SearchRecord  # of the start
@@ -312,14 +311,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
     hyperparameters = evaluator.hyperparameters
-    search = Search(
-        evaluator,
-        hyperparameters.prior_sd,
-        settings.method,
-        settings.prior,
-        settings.tolerance,
-        settings.max_evaluations,
-    )
+    search = Search(evaluator, hyperparameters.prior_sd, settings)
     n_previous = evaluator.n_responses - n_design_runs(evaluator)
     n_screened, details = 0, ""
     with progress("runs") as advance:
@@ -333,14 +325,14 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
             candidates = np.concatenate([theta[None], points])
             theta = np.asarray(candidates[np.argmin(evaluator.total(candidates, scales))])
             n_screened = len(candidates)
-        theta, trace = approach(search, theta, scales, settings.random_seed, Trace())
+        theta, trace = approach(search, theta, scales, Trace())
         if trace.count:
             details = (
                 "At the start hardly any simulated response was near the data: the area metric "
                 f"was minimised first, in {trace.count} evaluations."
             )
         record = SearchRecord(Result.STOPPED, details, settings.prior, n_screened=n_screened)
-        problem = _Problem(search, settings, advance, n_previous, record)
+        problem = _Problem(search, advance, n_previous, record)
         try:
             fit, optima = _optimise(problem, theta, scales, trace)
             optimum = _report(problem, fit, optima)
@@ -368,15 +360,14 @@ def _optimise(
     problem: _Problem, theta: Floats, scales: Floats, trace: Trace
 ) -> tuple[Fit, list[LocalOptimum]]:
     """Minimise on designs that grow until they support the minimum, then compare local optima."""
-    search, settings = problem.search, problem.settings
-    evaluator, seed = search.evaluator, settings.random_seed
+    search, evaluator = problem.search, problem.search.evaluator
     fit = _fit(problem, theta, scales, trace)
-    for round_ in count() if settings.refine else ():
-        fit, restart = refine_designs(search, fit, round_, seed, problem.advance)
+    for round_ in count() if search.settings.refine else ():
+        fit, restart = refine_designs(search, fit, round_, problem.advance)
         if restart is None:
             break
         pilot, ridge = restart.pilot, restart.ridge
-        theta, trace = approach(search, restart.theta, fit.scales, seed, fit.trace)
+        theta, trace = approach(search, restart.theta, fit.scales, fit.trace)
         fit = _fit(problem, theta, fit.scales, trace, pilot, ridge)
         if restart.alternative is not None:
             # An earlier minimum may be better on the grown designs.
@@ -425,7 +416,7 @@ def _fit(
 
 def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum]]:
     """Search for other optima; move to a better one."""
-    evaluator, settings = problem.search.evaluator, problem.settings
+    evaluator, settings = problem.search.evaluator, problem.search.settings
     n_starts = settings.starts
     if n_starts is None:
         n_starts = _starts_by_cost(problem.search, fit)
@@ -455,7 +446,11 @@ def _starts_by_cost(search: Search, fit: Fit) -> int:
     evaluator = search.evaluator
     if not evaluator.responses_per_theta:
         return 32
-    if fit.sampling is None or search.prior or not is_far_from_data(fit.sampling, fit.lowest):
+    if (
+        fit.sampling is None
+        or search.settings.prior
+        or not is_far_from_data(fit.sampling, fit.lowest)
+    ):
         return 0
     evaluator.total(fit.theta[None], fit.scales)  # the first call compiles
     start = time.perf_counter()
@@ -470,7 +465,7 @@ def _settle(problem: _Problem, fit: Fit) -> Fit:
     search = replace(problem.search, ridge=fit.ridge)
     evaluator = search.evaluator
     end = settle(search, fit)
-    if problem.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
+    if search.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
         # A simplex may move to where few points have a lower value by accident.
         end = settle(search, fit)
         if shortcomings(evaluator, end.theta[None]):
@@ -504,8 +499,8 @@ def _report(
             fit.theta,
             fit.scales,
             size=search.size(fit.theta, fit.scales),
-            tolerance=search.tolerance,
-            seed=problem.settings.random_seed,
+            tolerance=search.settings.tolerance,
+            seed=search.settings.random_seed,
         )
         at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
@@ -572,7 +567,7 @@ def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     indirect = names[only_through_prior(evaluator)]
-    if indirect.size and not search.prior:
+    if indirect.size and not search.settings.prior:
         sentences.append(
             f"The data inform {', '.join(indirect)} only through other hyperparameters and the "
             "prior, which is not minimised: their values are arbitrary; use prb.sample_smc."

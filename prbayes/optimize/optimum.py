@@ -391,12 +391,12 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.AT_EDGE
     elif is_flat:
         result = Result.NO_INFORMATION
-    elif is_affordable and not search.prior and stored_overlap(evaluator, theta) < OVERLAP:
+    elif is_affordable and not search.settings.prior and stored_overlap(evaluator, theta) < OVERLAP:
         # Such a minimum is one of the mass beyond the grid, and no fit.
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.prior or evaluator.other_terms:
+    elif len(scales) > 1 or search.settings.prior or evaluator.other_terms:
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales
@@ -409,7 +409,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         if node.reweighted is None and is_affordable:
             support[node.name] = missing_mass(evaluator, theta, k)
     names = [node.name for node in evaluator.nodes]
-    identity = identity_of(evaluator, prior_minimised=search.prior)
+    identity = identity_of(evaluator, prior_minimised=search.settings.prior)
     return Optimum(
         point=point,
         stderr=stderr,
