@@ -578,37 +578,62 @@ def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
 # -- storage ---------------------------------------------------------------------------------------
 
 
+def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
+    """Return name, settings and runs of each simulator, log-likelihoods by specimen last."""
+    records = [
+        {
+            "simulator": node.name,
+            "metric": without_addresses(node.metric),
+            "compared": components_summary(node.target),
+            "is_likelihood": 0,
+            "n_runs": node.bound.n_runs,
+        }
+        for node in evaluator.nodes
+    ]
+    for measurement in evaluator.measurements:
+        emulation = prepared(likelihood_of(evaluator, measurement)).emulation
+        record = {
+            "simulator": measurement.name,
+            "metric": without_addresses(measurement.metric),
+            "compared": "",
+            "is_likelihood": 1,
+            "n_runs": len(emulation.z),
+        }
+        records.append(record)
+    return records
+
+
+def by_simulator(records: list[dict[str, Any]]) -> xr.Dataset:
+    """Return records as variables of one dimension, NaN where a simulator has no number."""
+    keys = dict.fromkeys(key for record in records for key in record)
+    return xr.Dataset(
+        {key: ("simulator", [record.get(key, np.nan) for record in records]) for key in keys}
+    )
+
+
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
-    evaluator = optimum.evaluator
-    nodes, measurements = evaluator.nodes, evaluator.measurements
-    names = [node.name for node in nodes] + [m.name for m in measurements]
+    """Return the figures of the simulators at the optimum, and its covariance."""
+    evaluator, records = optimum.evaluator, simulator_records(optimum.evaluator)
     likelihoods = specimen_log_likelihoods(evaluator, optimum.theta[None])
-    discrepancies = {name: -float(v.sum()) for name, v in likelihoods.items()}
-    discrepancies |= optimum.discrepancies
-    n_runs = [node.bound.n_runs for node in nodes]
-    n_runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
-    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
-    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
-    by_simulator: dict[str, list[Any]] = {
-        "discrepancy": [discrepancies[name] for name in names],
-        "scale": [optimum.scales.get(name, 1.0) for name in names],
-        "metric": [without_addresses(metric) for metric in metrics],
-        "compared": compared,
-        "is_likelihood": [0] * len(nodes) + [1] * len(measurements),
-        "n_runs": n_runs,
-    }
-    for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
-        by_simulator[key] = [
-            optimum.search.support.get(name, {}).get(key, np.nan) for name in names
-        ]
     failing = failing_share(evaluator, optimum.theta)
-    by_simulator["failing_share"] = [failing.get(name, np.nan) for name in names]
-    variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
-    variables["theta"] = ("element", optimum.theta)
-    variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    names_of_elements = evaluator.hyperparameters.names
-    elements = {"element": names_of_elements, "other_element": names_of_elements}
-    return xr.Dataset(variables, coords={"simulator": names, **elements})
+    for record in records:
+        name = record["simulator"]
+        if name in optimum.discrepancies:
+            discrepancy = optimum.discrepancies[name]
+        else:
+            discrepancy = -float(likelihoods[name].sum())
+        support = optimum.search.support.get(name, {})
+        record |= {"discrepancy": discrepancy, "scale": optimum.scales.get(name, 1.0)}
+        for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
+            record[key] = support.get(key, np.nan)
+        record["failing_share"] = failing.get(name, np.nan)
+    names = evaluator.hyperparameters.names
+    variables = {
+        "theta": ("element", optimum.theta),
+        "covariance": (["element", "other_element"], optimum.covariance),
+    }
+    figures = by_simulator(records).assign_coords(element=names, other_element=names)
+    return figures.assign(variables)
 
 
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:

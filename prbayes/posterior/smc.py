@@ -42,6 +42,7 @@ from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.results import (
+    AT_BEST,
     Chains,
     arviz_groups,
     as_multitrace,
@@ -392,7 +393,7 @@ def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
     shares = {}
     findings = []
     for k, node in enumerate(evaluator.nodes):
-        shares[node.name] = chains.at_best.get(node.name, {}).get("lost_mass", 0.0)
+        shares[node.name] = chains.at_best.get(node.name, {}).get("lost_mass_at_best", 0.0)
         if np.isnan(lost[:, :, k]).all():
             continue
         shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
@@ -460,7 +461,8 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
         for k, node in enumerate(evaluator.nodes):
             error = discrepancy_error(node.bound, evaluator.parents(best[None], k))
             masses = missing_mass(evaluator, best, k)
-            at_best[node.name] = {"discrepancy_error": error, **masses}
+            numbers = (error, masses["lost_mass"], masses["failed_mass"])
+            at_best[node.name] = dict(zip(AT_BEST, numbers, strict=True))
     except BudgetError as spent:
         return replace(chains, stopped=chains.stopped or str(spent))
     return replace(chains, at_best=at_best)
