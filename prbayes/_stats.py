@@ -107,6 +107,11 @@ def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats
 _row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n),(m)->(m)")
 
 
+def tail_levels(prob: float) -> list[float]:
+    """Return the probabilities of the ends of an interval with equal tails."""
+    return [(1 - prob) / 2, (1 + prob) / 2]
+
+
 def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> Indices:
     """Return the index at which the running sum of weights first reaches each level.
 

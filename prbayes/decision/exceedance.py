@@ -14,8 +14,8 @@ import xarray as xr
 from scipy.special import logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, from_json, report
-from prbayes._stats import INTERVAL
+from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     Bools,
@@ -198,8 +198,7 @@ def exceedance(
     n_searched = 0
     if len(places) > 1:
         respond = CentralSpecimens(populations, response, output, n_points or estimates[0].runs)
-        sign = -1.0 if below else 1.0
-        extremes = extreme_places(inputs, places, lambda x: sign * respond(x), [sign * limit])
+        extremes = extreme_places(inputs, places, respond, [limit])
         places += extremes
         estimates += [question.estimate(place, n_points) for place in extremes]
         n_searched = respond.count
@@ -270,7 +269,7 @@ class ExceedanceTable(Table):
         rows = [["standard error of the computation", *errors]]
         if len(values) > 1:
             rows.append(["intervals at", *map(str, attrs["at"])])
-        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        sentences = sentences_of(attrs)
         if "requirement" in attrs:
             sentences.insert(
                 0, f"At most {attrs['requirement']:g} is required: {attrs['verdict']}."
@@ -311,7 +310,7 @@ class _Estimate:
 
     def of_populations(self, prob: float) -> Floats:
         """Return the interval over populations."""
-        return np.asarray(np.nanquantile(self.by_draw, [(1 - prob) / 2, (1 + prob) / 2]))
+        return np.asarray(np.nanquantile(self.by_draw, tail_levels(prob)))
 
     def interval(self, prob: float) -> Floats:
         """Return the interval over populations; if all or no points count, with its bound."""
@@ -372,7 +371,7 @@ class _Question:
 
 def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estimate:
     """Return the probabilities of each population from stored or emulated responses."""
-    by_draw = sample.evaluate(quantity, sample.populations.thetas)
+    by_draw = sample.evaluate(quantity.of, sample.populations.thetas)
     error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
     error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
     kind = "stored" if sample.emulator is None else "emulated"

@@ -218,7 +218,7 @@ def _evaluation_points(samples: list[ResponseSample]) -> Floats:
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
     """Return the distribution functions of all valid populations at y, (k, m)."""
-    batches = sample.weight_batches(sample.populations.thetas)
-    parts = [distribution_function(sample.values, weights, y) for weights in batches]
-    functions = np.concatenate(parts)
+    functions = sample.evaluate(
+        lambda values, weights: distribution_function(values, weights, y), sample.populations.thetas
+    )
     return functions[np.isfinite(functions).all(axis=1)]

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, counted, from_json
+from prbayes._finding import Finding, as_json, counted, sentences_of
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
@@ -243,7 +243,7 @@ class PlanTable(Table):
                 rows.append([str(name), str(candidate), *cells])
         header = ["", "condition", "now", *(f"{k} more" for k in self["k"].values)]
         header += ["needed for the target"] if "specimens" in self else []
-        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        sentences = sentences_of(self.attrs)
         if "quantity" in self.attrs:
             sentences.append(f"quantity: {self.attrs['quantity']}.")
         heading = "Expected standard deviations after more specimens"
@@ -310,7 +310,7 @@ class _Forecast:
         """Return the standard deviation of the quantity."""
         assert self.quantity is not None
         assert self.sample is not None
-        return standard_deviation(self.sample.evaluate(self.quantity, thetas))
+        return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
     def needed(self, information: Floats, name: str, target: float | None) -> float:
         """Return the smallest number of specimens that reaches a target; inf, NaN without one."""
@@ -456,8 +456,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     unit = evaluator.hyperparameters.prior_sd
     step = 1e-3 * unit
     thetas = cross(sample.populations.center, step)
-    parents = evaluator.parents(thetas, sample.k)
-    _, weights = sample.design.populations(parents)
+    weights = sample.masses(thetas)
     outputs = sample.outputs
     if sample.emulator is None:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
@@ -525,12 +524,10 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
 
 def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
     """Return n specimens at equal steps of probability of the central population."""
-    evaluator = sample.populations.evaluator
-    parents = evaluator.parents(sample.populations.center[None], sample.k)
-    _, weights = sample.design.populations(parents)
-    is_observable = observable(sample.outputs, evaluator.nodes[sample.k].target)
+    node = sample.populations.evaluator.nodes[sample.k]
+    is_observable = observable(sample.outputs, node.target)
     values = sample.outputs[is_observable]
-    mass = weights[0][is_observable]
+    mass = sample.masses(sample.populations.center[None])[0, is_observable]
     order = np.argsort(values.reshape(len(values), -1)[:, 0])
     steps = (np.arange(n) + 0.5) / n
     return np.asarray(values[order][reached(mass[order], steps, normalized=True)])

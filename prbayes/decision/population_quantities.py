@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -140,13 +140,10 @@ class PopulationReader:
         for column, label in enumerate(labels):
             output = replace(sample, column=column if several else None)
             findings, _ = output.checked_quantity(by_level[-1])
-            functionals = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
+            quantities = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
-            numbers[0, :, -len(functionals) :] = np.concatenate(
-                [
-                    np.stack([f.of(output.values, weights) for f in functionals], axis=-1)
-                    for weights in output.weight_batches(self._thetas)
-                ]
+            numbers[0, :, -len(quantities) :] = output.evaluate(
+                _side_by_side(quantities), self._thetas
             )
             name = element_name(sample.responses.name, [label] if several else [])
             unit = outputs.units[column] if outputs.units else ""
@@ -186,6 +183,15 @@ class PopulationReader:
             Element(element_name(name, labels[j : j + 1]), str(unit), groups, _by_name(names, x))
             for j, (unit, x) in enumerate(zip(units, np.moveaxis(numbers, -1, 0), strict=True))
         ]
+
+
+def _side_by_side(quantities: Sequence[Quantity]) -> Callable[[Floats, Floats], Floats]:
+    """Return a functional whose last axis has the quantities."""
+
+    def functional(values: Floats, weights: Floats) -> Floats:
+        return np.stack([quantity.of(values, weights) for quantity in quantities], axis=-1)
+
+    return functional
 
 
 def _by_name(names: Sequence[str], numbers: Floats) -> dict[str, Floats]:

@@ -12,8 +12,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import as_json, from_json, report
-from prbayes._stats import INTERVAL
+from prbayes._finding import as_json, report, sentences_of
+from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import Floats, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import PopulationReader
 from prbayes.decision.populations import Populations, quantiles_of
@@ -159,7 +159,7 @@ def population(
     n_groups = max(map(len, groups.values()), default=1)
     # Estimate, lower and upper
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
-    tails = [(1 - prob) / 2, (1 + prob) / 2]
+    tails = tail_levels(prob)
     confidence = 0.95 if upper else 0.05
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
@@ -271,7 +271,7 @@ class PopulationTable(Table):
             shown = [f"{value} ({interval})" if interval else value for value, interval in texts]
             rows.append([with_unit(name, unit), *shown])
         header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         return View(self._heading(), header, rows, sentences)
 
 

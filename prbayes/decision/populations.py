@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, from_json, report
-from prbayes._stats import INTERVAL
+from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
 from prbayes.decision.quantities import (
     Quantile,
@@ -233,10 +233,17 @@ class ResponseSample:
         """The block of the design that each of the values is in, (n,)."""
         return self.design.blocks[self._order]
 
+    def parents(self, thetas: Floats) -> list[Floats]:
+        """Return the parents of populations, (k, d) -> (k, *shape) each."""
+        return self.populations.evaluator.parents(thetas, self.k)
+
+    def masses(self, thetas: Floats) -> Floats:
+        """Return weights of all points, also of those without response, (k, d) -> (k, n)."""
+        return self.design.populations(self.parents(thetas))[1]
+
     def weights(self, thetas: Floats) -> Floats:
         """Return weights of the values in populations, (k, d) -> (k, n), with sum one."""
-        _, weights = self.design.populations(self.populations.evaluator.parents(thetas, self.k))
-        weights = weights[:, self._order]
+        weights = self.masses(thetas)[:, self._order]
         with np.errstate(invalid="ignore"):
             return weights / weights.sum(axis=1, keepdims=True)
 
@@ -273,25 +280,26 @@ class ResponseSample:
         outputs = self.emulated(self.points)
         if not outputs:
             return np.asarray(error)
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
-        mass = np.nanmean(self.design.populations(parents)[1], axis=0)
+        mass = np.nanmean(self.masses(self.populations.thinned()), axis=0)
         means = np.array([mass @ counts(values) for values in outputs])
         return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
-    def evaluate(self, quantity: Quantity, thetas: Floats) -> Floats:
-        """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
-        return np.concatenate([quantity.of(self.values, w) for w in self.weight_batches(thetas)])
+    def evaluate(self, functional: Callable[[Floats, Floats], Floats], thetas: Floats) -> Floats:
+        """Return a functional of populations, (k, d) -> (k, ...); NaN without a population.
+
+        It is a function of the values and their weights, as `Quantity.of` is.
+        """
+        return np.concatenate([functional(self.values, w) for w in self.weight_batches(thetas)])
 
     @cached_property
     def lost(self) -> float:
         """The share of a population that has no response, the median over populations."""
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
-        _, weights = self.design.populations(parents)
+        weights = self.masses(self.populations.thinned())
         return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
 
     def refuse_unsupported(self) -> None:
         """Raise if the design does not support the populations, or too many responses are NaN."""
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
+        parents = self.parents(self.populations.thinned())
         if self.design.has_runs:
             refuse_unsupported(self.responses.name, self.design, parents)
         else:
@@ -315,7 +323,7 @@ class ResponseSample:
                 f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
                 "responses; ask for a Quantile or an Exceedance"
             )
-        (value,) = self.evaluate(quantity, center)
+        (value,) = self.evaluate(quantity.of, center)
         # With the responses that are equal to a quantile, such as the largest.
         at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
@@ -366,8 +374,7 @@ class ResponseSample:
         variance = (N_BLOCKS - 1) * np.var(without)
         outputs = self.emulated(self.points)
         if outputs:
-            parents = self.populations.evaluator.parents(center, self.k)
-            mass = self.design.populations(parents)[1]
+            mass = self.masses(center)
             quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
             variance += ((quantities[1:] - quantities[0]) ** 2).sum()
         return float(np.sqrt(variance))
@@ -379,7 +386,7 @@ def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, .
         return ()
     thetas = sample.populations.thinned()
     change = standard_deviation(_range_effect(sample, quantity, thetas)) / 2
-    if not change > 0.1 * standard_deviation(sample.evaluate(quantity, thetas)):
+    if not change > 0.1 * standard_deviation(sample.evaluate(quantity.of, thetas)):
         return ()
     text = (
         f"{quantity!r}: some populations extend beyond the range of the runs, where the response "
@@ -392,8 +399,7 @@ def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, .
 
 def _range_effect(sample: ResponseSample, quantity: Quantity, thetas: Floats) -> Floats:
     """Return by how much a steeper response beyond the runs changes a quantity, (k,)."""
-    populations = sample.populations
-    mass = sample.design.populations(populations.evaluator.parents(thetas, sample.k))[1]
+    mass = sample.masses(thetas)
     constant, *_, steeper = sample.emulated(sample.points)
     with np.errstate(invalid="ignore"):  # both may be infinite
         return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
@@ -656,9 +662,9 @@ def evaluate(
     populations = Populations.of(result, model, n_draws, caller, calling)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
     findings, error = sample.checked_quantity(quantity)
-    by_draw = sample.evaluate(quantity, populations.thetas)
-    (center,) = sample.evaluate(quantity, populations.center[None])
-    lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], [(1 - prob) / 2, (1 + prob) / 2])
+    by_draw = sample.evaluate(quantity.of, populations.thetas)
+    (center,) = sample.evaluate(quantity.of, populations.center[None])
+    lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], tail_levels(prob))
     return QuantityTable(
         {
             "estimate": np.nanmean(by_draw) if populations.are_draws else center,
@@ -695,5 +701,5 @@ class QuantityTable(Table):
             f"{self.attrs['quantity']}: {estimate:.4g}, {percentage(self.attrs['prob'])} interval "
             f"{lower:.4g} to {upper:.4g}"
         )
-        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        sentences = sentences_of(self.attrs)
         return View(heading, rows=rows, sentences=sentences)

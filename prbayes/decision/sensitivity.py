@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._finding import Finding, as_json, report, sentences_of
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.populations import (
     InverseTransform,
@@ -184,9 +184,9 @@ def sensitivity(
         },
         attrs={
             "quantity": repr(quantity),
-            "value": float(sample.evaluate(quantity, populations.center[None])[0]),
+            "value": float(sample.evaluate(quantity.of, populations.center[None])[0]),
             "value_error": error,
-            "sd": standard_deviation(sample.evaluate(quantity, populations.thetas)),
+            "sd": standard_deviation(sample.evaluate(quantity.of, populations.thetas)),
             "of_inputs": quantity.of_inputs,
             "scatter": _aleatory_share(sample, quantity),
             "responses": sample.responses.count,
@@ -216,7 +216,7 @@ class SensitivityTable(Table):
             numbers = [(float(row[key]), float(row[f"{key}_error"])) for key in _SHARES]
             cells = [f"{x:.2f} ± {error:.2f}" if np.isfinite(x) else "" for x, error in numbers]
             rows.append([str(factor), str(row["kind"].item()), *cells])
-        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        sentences = sentences_of(attrs)
         if np.isinf(attrs["sd"]):
             sentences.append("The quantity is infinite at some draws, which the shares leave out.")
         if attrs["inputs"]:
@@ -267,7 +267,7 @@ def _hyperparameter_indices(
     independent = second @ copula.root.T
 
     def evaluate(z: Floats) -> Floats:
-        return sample.evaluate(quantity, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
+        return sample.evaluate(quantity.of, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
 
     values = evaluate(z)
     infinite = 1 - np.isfinite(values).mean()
@@ -303,9 +303,10 @@ def input_indices(
     """
     center = sample.populations.center[None]
     unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
-    parents = sample.populations.evaluator.parents(center, sample.k)
     try:
-        transform = InverseTransform(sample.responses.name, sample.design.inputs, parents)
+        transform = InverseTransform(
+            sample.responses.name, sample.design.inputs, sample.parents(center)
+        )
     except TypeError as error:
         return unknown, str(error)
     d = transform.size
@@ -323,7 +324,7 @@ def input_indices(
     if not outputs:
         reason = "the response is not known between the runs; computed=True calls it at new ones"
         return unknown, reason
-    (at,) = sample.evaluate(quantity, center)
+    (at,) = sample.evaluate(quantity.of, center)
     replicates = []
     for values in outputs:
         numbers = quantity.of_specimen(values, at).reshape(z.shape[:-1])
@@ -397,7 +398,7 @@ def _responses_at(
 
 def _aleatory_share(sample: ResponseSample, quantity: Quantity) -> float:
     """Return the share of a new specimen's variance that is within populations."""
-    (at,) = sample.evaluate(quantity, sample.populations.center[None])
+    (at,) = sample.evaluate(quantity.of, sample.populations.center[None])
     numbers = quantity.of_specimen(sample.values, at)
     if not np.isfinite(numbers).all():
         return np.nan

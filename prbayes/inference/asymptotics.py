@@ -405,11 +405,16 @@ class Local:
     covariance: Floats  # (r, r): of the minimiser, along the directions identified
 
     @property
+    def hidden_share(self) -> Floats:
+        """The share of each element in directions that are not identified, (d,)."""
+        return np.asarray((self.unidentified**2).sum(axis=1))
+
+    @property
     def in_theta(self) -> Floats:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > 0.02
+        is_hidden = self.hidden_share > 0.02
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, 
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
 from prbayes.metrics.density import is_differentiable
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
+from prbayes.numerics.batched_minimisers import Descent, descend, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 from prbayes.numerics.threads import one_thread
 
@@ -70,6 +70,12 @@ class SamplingDistribution:
         # Rounding may leave a variance of zero or less.
         stderr = np.sqrt(np.maximum(variances, 1e-300))
         return cls(evaluator, theta, scales, information, local, axes, stderr)
+
+    @property
+    def noise(self) -> float:
+        """The part of the objective that sampling explains."""
+        pairs = zip(self.information, self.scales, strict=True)
+        return float(sum(item.noise_floor / scale for item, scale in pairs))
 
     def coordinates(self, thetas: Floats) -> Floats:
         """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
@@ -217,7 +223,7 @@ def descent_of(
     r = sampling.stderr.size
     step = 0.02  # of differences, in standard errors
     if r == 0 or needs_refits(sampling.evaluator):  # it is not used then
-        return Descent(np.eye(r), 0.0, step)
+        return partial(descend, curvature=np.eye(r), tolerance=0.0, step=step)
     # Steps of one standard error along uncorrelated directions, in coordinates: along correlated
     # axes the large curvature across them hides the small one along.
     along = sampling.axes.T @ sampling.local.identified / sampling.stderr[:, None]
@@ -240,7 +246,8 @@ def descent_of(
     # correlated estimates the mean curvature is that of a direction with hardly any error.
     cost = r / np.trace(np.linalg.inv(curvature))
     # A gain of 1e-4 is an error of about a hundredth of a standard error.
-    return Descent(curvature, (1e-3 if is_rough else 1e-4) * cost, step)
+    tolerance = (1e-3 if is_rough else 1e-4) * cost
+    return partial(descend, curvature=curvature, tolerance=tolerance, step=step)
 
 
 def minimise_sets(

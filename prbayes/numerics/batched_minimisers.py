@@ -8,12 +8,14 @@ largest difference of two distribution functions, or flat pieces; a simplex only
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from prbayes._validate import Bools, Floats, Indices
+
+# Points (A, s, r) of functions, and which functions these are, (A,) -> values (A, s).
+type Values = Callable[[Floats, Any], Floats]
 
 
 class Minima(NamedTuple):
@@ -24,8 +26,12 @@ class Minima(NamedTuple):
     converged: Bools  # (B,)
 
 
+# Functions and starts (B, r) -> their minima.
+type Descent = Callable[[Values, Floats], Minima]
+
+
 def descend(
-    value: Callable[[Floats, Any], Floats],
+    value: Values,
     start: Floats,
     curvature: Floats,
     *,
@@ -97,7 +103,7 @@ def descend(
 
 
 def _by_differences(
-    value: Callable[[Floats, Any], Floats], step: float, curvature: Floats, is_central: bool
+    value: Values, step: float, curvature: Floats, is_central: bool
 ) -> Callable[[Floats, Indices], tuple[Floats, Floats]]:
     """Return a function of points (A, r) and rows that returns values (A,) and gradients (A, r)."""
     r = len(curvature)
@@ -144,22 +150,7 @@ def _bfgs(inverse: Floats, s: Floats, y: Floats, is_first: bool) -> Floats:
     return np.asarray(projector @ inverse @ transposed + column * s[:, None, :])
 
 
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """A minimiser of many functions of coordinates at once."""
-
-    curvature: Floats  # (r, r): the Hessian of a typical function
-    tolerance: float  # gain that a minimum may miss
-    step: float  # of the differences
-
-    def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
-        """Return minimisers from starts (B, r) on."""
-        return descend(value, start, self.curvature, step=self.step, tolerance=self.tolerance)
-
-
-def descend_by_simplex(
-    value: Callable[[Floats, Any], Floats], start: Floats, *, sizes: Sequence[float]
-) -> Minima:
+def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) -> Minima:
     """Minimise B functions of r parameters by simplices, from starts (B, r), all in step.
 
     ``value`` is as in `descend`; ``sizes`` are lengths of the first edges of one simplex after the
@@ -208,7 +199,7 @@ def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _step(
-    value: Callable[[Floats, Any], Floats],
+    value: Values,
     points: Floats,
     values: Floats,
     rows: Indices,

@@ -13,6 +13,7 @@ from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local, single_output_parts
+from prbayes.inference.checks.sample_size import elements_above
 from prbayes.inference.goodness_of_fit import FittedSets
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Discrepancy, Minimum, Part
@@ -118,15 +119,7 @@ def small_simulators(evaluator: Evaluator, *, enough: int = 30) -> list[Finding]
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or len(widths) < 2 or dependent(nodes):
         return []
-    # Elements of theta that enter the populations of two simulators.
-    hyperparameters = evaluator.hyperparameters
-    prior_sd = hyperparameters.prior_sd
-    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
-    count = np.zeros(hyperparameters.size)
-    for k in range(len(nodes)):
-        flat = [parent.reshape(len(thetas), -1) for parent in evaluator.parents(thetas, k)]
-        count += np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
-    if not (count > 1).any():
+    if not (elements_above(evaluator)[: len(nodes)].sum(axis=0) > 1).any():
         return []
     return [
         Finding(

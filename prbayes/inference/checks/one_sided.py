@@ -117,15 +117,19 @@ def _limit(
     else:
         return np.nan
     above = distance, value
+
+    def crossing() -> float:
+        """Return where the straight line between both reaches the limit."""
+        return float(np.interp(highest, [below[1], above[1]], [below[0], above[0]]))
+
     for _ in range(2):  # regula falsi
-        middle = float(np.interp(highest, [below[1], above[1]], [below[0], above[0]]))
+        middle = crossing()
         value = at(middle)
         if value >= highest:
             above = middle, value
         elif np.isfinite(value):
             below = middle, value
-    middle = np.interp(highest, [below[1], above[1]], [below[0], above[0]])
-    return float(theta[i] + middle * unit)
+    return float(theta[i] + crossing() * unit)
 
 
 def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
@@ -134,13 +138,7 @@ def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
     Such a fit may be a local optimum.
     """
     is_distance = all(node.metric.distance for node in sampling.evaluator.nodes)
-    return is_distance and lowest > 3 * _noise(sampling)
-
-
-def _noise(sampling: SamplingDistribution) -> float:
-    """Return the objective's sampling noise."""
-    pairs = zip(sampling.information, sampling.scales, strict=True)
-    return float(sum(item.noise_floor / scale for item, scale in pairs))
+    return is_distance and lowest > 3 * sampling.noise
 
 
 def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | None:
@@ -150,7 +148,7 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     optimum is no poor fit: elsewhere there may then be a better one.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
-    is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
+    is_alone = sampling.local.hidden_share > 0.9
     if not is_alone.any():
         return []
     start = time.perf_counter()
@@ -163,7 +161,7 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
         return None
     if not is_stored(evaluator) and (is_long or is_far_from_data(sampling, lowest)):
         return None
-    noise = _noise(sampling)
+    noise = sampling.noise
 
     def statistic(theta: Floats, i: int) -> float:
         (total,) = evaluator.total(theta[None], scales)

@@ -95,7 +95,7 @@ def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
     """Return the elements that are pushed to an end of their prior; computes no response."""
     evaluator, scales = sampling.evaluator, sampling.scales
     # Two elements that only replace each other have a squared loading of a half each.
-    is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
+    is_alone = sampling.local.hidden_share > 0.9
     is_alone &= ~only_through_prior(evaluator)
     if not is_alone.any() or not is_stored(evaluator):
         return []
@@ -103,9 +103,7 @@ def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
     def total(theta: Floats) -> float:
         return float(evaluator.total(theta[None], scales)[0])
 
-    noise = np.array([information.noise_floor for information in sampling.information])
-    rise = float((noise / scales).sum())
-    return elements_at_prior_ends(evaluator, sampling.theta, is_alone, total, rise)
+    return elements_at_prior_ends(evaluator, sampling.theta, is_alone, total, sampling.noise)
 
 
 def prior_end_findings(
