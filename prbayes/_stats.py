@@ -76,7 +76,7 @@ def distribution_function(
     if values.ndim == 1 or (values.size > 0 and not any(values.strides[:-1])):
         first = (0,) * (values.ndim - 1)
         order, below = ranked(values[first], points, kind=kind)
-        return np.asarray(cumulated(weights, order)[..., below])
+        return cumulated(weights, order)[..., below]
     rows = np.broadcast_to(values, weights.shape)
     batch = weights.shape[:-1]
     out = np.empty((*batch, points.size))
@@ -196,4 +196,4 @@ def log_sum_exp(terms: Floats) -> Floats:
     scaled = terms - largest
     np.exp(scaled, out=scaled)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(scaled.sum(axis=-1)) + largest[..., 0])
+        return np.log(scaled.sum(axis=-1)) + largest[..., 0]

@@ -310,7 +310,7 @@ class _Estimate:
 
     def of_populations(self, prob: float) -> Floats:
         """Return the interval over populations."""
-        return np.asarray(np.nanquantile(self.by_draw, tail_levels(prob)))
+        return np.nanquantile(self.by_draw, tail_levels(prob))
 
     def interval(self, prob: float) -> Floats:
         """Return the interval over populations; if all or no points count, with its bound."""
@@ -325,7 +325,7 @@ class _Estimate:
     def interval_with_error(self, prob: float) -> Floats:
         """Return the interval over populations, wider by two standard errors on both sides."""
         margins = probability_bounds(self.mean, self.error, float(ndtr(-2))) - self.mean
-        return np.asarray(np.clip(self.of_populations(prob) + margins, 0.0, 1.0))
+        return np.clip(self.of_populations(prob) + margins, 0.0, 1.0)
 
     def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
         """Return whether the error is above a share of the distance of a requirement."""
@@ -476,7 +476,7 @@ class _Normal:
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
         """Return n draws, (n, D)."""
         z = rng.standard_normal((n, self.mean.size))
-        return np.asarray(self.mean + z @ self.root.T)
+        return self.mean + z @ self.root.T
 
     def log_density(self, z: Floats) -> Floats:
         """Return the log-density, (n, D) -> (n,)."""

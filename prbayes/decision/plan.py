@@ -276,13 +276,13 @@ class Draws:
         matrix = inverse @ _square_root(root @ covariance @ root) @ inverse
         median = np.median(self.thetas, axis=0)
         deviation = (self.thetas - median) / self.unit
-        return np.asarray(median + (deviation @ matrix.T) * self.unit)
+        return median + (deviation @ matrix.T) * self.unit
 
 
 def _square_root(matrix: Floats) -> Floats:
     """Return the symmetric square root."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,7 +488,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
     means = sums / np.where(share > 0, share, 1.0)
-    return np.asarray((means * share) @ means.T)
+    return (means * share) @ means.T
 
 
 def _projected(scores: Floats, values: Floats, mass: Floats) -> Floats:
@@ -530,7 +530,7 @@ def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
     mass = sample.masses(sample.populations.center[None])[0, is_observable]
     order = np.argsort(values.reshape(len(values), -1)[:, 0])
     steps = (np.arange(n) + 0.5) / n
-    return np.asarray(values[order][reached(mass[order], steps, normalized=True)])
+    return values[order][reached(mass[order], steps, normalized=True)]
 
 
 def _validated_counts(k: object) -> list[int]:

@@ -279,7 +279,7 @@ class ResponseSample:
         error = np.where(is_same, (weights**2).sum(), error)
         outputs = self.emulated(self.points)
         if not outputs:
-            return np.asarray(error)
+            return error
         mass = np.nanmean(self.masses(self.populations.thinned()), axis=0)
         means = np.array([mass @ counts(values) for values in outputs])
         return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
@@ -424,7 +424,7 @@ def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:
     """Return quantiles of draws, (n,), of which some may be infinite."""
     # The mean of two infinite neighbours is NaN.
     method: Any = "inverted_cdf" if np.isinf(by_draw).any() else "linear"
-    return np.asarray(np.quantile(by_draw, levels, method=method))
+    return np.quantile(by_draw, levels, method=method)
 
 
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:
@@ -447,7 +447,7 @@ def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) ->
     low = np.where(is_normal, rare + ndtri(tail) * error, low)
     high = np.minimum(np.where(is_normal, rare - ndtri(tail) * error, high), 1.0)
     bounds = np.array([low, high])
-    return np.asarray(np.where(probability > 0.5, 1 - bounds[::-1], bounds))
+    return np.where(probability > 0.5, 1 - bounds[::-1], bounds)
 
 
 class CentralSpecimens:

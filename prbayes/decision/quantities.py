@@ -243,7 +243,7 @@ class Exceedance(Quantity):
         is_beyond = self.of_specimen(values, np.nan)
         beyond, rest = weights @ is_beyond, weights @ (1 - is_beyond)
         # Sums of weights are one up to rounding.
-        return np.asarray(beyond / (beyond + rest))
+        return beyond / (beyond + rest)
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the limit."""

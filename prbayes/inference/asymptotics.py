@@ -302,7 +302,7 @@ def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> 
         centered = np.where(is_finite, finite - mass @ finite, 0.0)
         variance = float(mass @ centered**2)
         squares.append(centered**2 / max(variance, _TINY))
-    return np.asarray(np.mean(squares, axis=0))
+    return np.mean(squares, axis=0)
 
 
 def identified_by_area(information: Information, weakest: float = 1.0) -> Floats:
@@ -339,7 +339,7 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
         is_identified &= product(even, odd) > 0.35 * np.sqrt(
             product(even, even) * product(odd, odd)
         )
-    return np.asarray(vectors[:, is_identified])
+    return vectors[:, is_identified]
 
 
 # -- the sampling distribution --------------------------------------------------------------------
@@ -389,7 +389,7 @@ def first_order_shifts(
         # A ridge relative to each direction's own size: priors may differ in width by far.
         ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]
         shifts = np.linalg.solve(matrix + ridge * np.eye(r), vector[..., None])[..., 0]
-    return np.asarray(shifts)
+    return shifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,7 +407,7 @@ class Local:
     @property
     def hidden_share(self) -> Floats:
         """The share of each element in directions that are not identified, (d,)."""
-        return np.asarray((self.unidentified**2).sum(axis=1))
+        return (self.unidentified**2).sum(axis=1)
 
     @property
     def in_theta(self) -> Floats:
@@ -417,7 +417,7 @@ class Local:
         is_hidden = self.hidden_share > 0.02
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
-        return np.asarray(covariance)
+        return covariance
 
     def variance(self, gradients: Floats) -> Floats:
         """Return the variance of functions of theta with gradients (..., d).
@@ -430,7 +430,7 @@ class Local:
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
         is_hidden = (across**2).sum(axis=-1) > 0.02 * (unit**2).sum(axis=-1)
-        return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
+        return np.where(is_hidden, np.inf, np.maximum(variance, 0))
 
 
 def local_sampling(information: list[Information], scales: Floats, weakest: float = 1.0) -> Local:
@@ -472,7 +472,7 @@ def _area_covariance(information: list[Information], scales: Floats, weakest: fl
         if item.node.metric.minimum is Minimum.QUADRATIC:
             noise = item.sampling_covariance * unit
             _, vectors, is_identified = identified_by_curvature(item.hessian * unit, noise, weakest)
-            columns.append(np.asarray(vectors[:, is_identified]))
+            columns.append(vectors[:, is_identified])
         else:
             columns.append(identified_by_area(item, weakest))
     axes, strength, _ = np.linalg.svd(np.concatenate(columns, axis=1))

@@ -70,7 +70,7 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
         stored = [values[b] if values else None for values in left_out]
         objective = BatchObjective.of(evaluator, scales, observed, stored=stored)
         shifts.append(_minimum(sampling, objective, descent) - minimum)
-    return np.asarray(np.sqrt(np.square(shifts).sum(axis=0)))
+    return np.sqrt(np.square(shifts).sum(axis=0))
 
 
 def _error_of_points(sampling: SamplingDistribution) -> Floats:

@@ -131,7 +131,7 @@ def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: F
     inside = np.clip(expected, 1e-4, 1 - 1e-4)
     in_the_tails = squares / (inside * (1 - inside))
     distances = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
-    return np.asarray(np.log(np.maximum(distances, 1e-300)))
+    return np.log(np.maximum(distances, 1e-300))
 
 
 def spread_out(values: Floats) -> Floats:

@@ -46,7 +46,7 @@ class Continuation:
             result = np.where(self.below & self.above, self.lower + distance, thetas)
             result = np.where(self.above & ~self.below, np.log(distance), result)
             result = np.where(self.below & ~self.above, -np.log(remaining), result)
-        return np.asarray(result)
+        return result
 
     def values(self, coordinates: Floats) -> Floats:
         """Return values of continued elements, NaN of others, (S, d)."""
@@ -55,7 +55,7 @@ class Continuation:
             above = self.lower + np.exp(coordinates)
             below = self.upper - np.exp(-coordinates)
         result = np.where(self.above & ~self.below, above, result)
-        return np.asarray(np.where(self.below & ~self.above, below, result))
+        return np.where(self.below & ~self.above, below, result)
 
     def within(self, coordinates: Floats, margin: float = 1e-3) -> Floats:
         """Return thetas of coordinates, moved within the ends, (S, d)."""
@@ -68,7 +68,7 @@ class Continuation:
         return np.clip(shares, least, np.where(self.above, 1 - margin, 1 - 1e-16))
 
     def _thetas(self, shares: Floats, coordinates: Floats) -> Floats:
-        return np.asarray(np.where(self.is_continued, logit(shares), coordinates))
+        return np.where(self.is_continued, logit(shares), coordinates)
 
     def parents(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the parents of the k-th simulator, continued linearly beyond the ends."""

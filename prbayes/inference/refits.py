@@ -80,12 +80,12 @@ class SamplingDistribution:
     def coordinates(self, thetas: Floats) -> Floats:
         """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
         shifts = (thetas - self.theta) / self.local.prior_sd
-        return np.asarray(shifts @ self.axes / self.stderr)
+        return shifts @ self.axes / self.stderr
 
     def thetas(self, x: Floats) -> Floats:
         """Return thetas, (..., d), of coordinates (..., r)."""
         shifts = (x * self.stderr) @ self.axes.T
-        return np.asarray(self.theta + shifts * self.local.prior_sd)
+        return self.theta + shifts * self.local.prior_sd
 
     def linear_estimates(self, sets: DataSets) -> Floats:
         """Return minimisers of data sets, (S, r) in coordinates, to first order."""
@@ -228,13 +228,13 @@ def descent_of(
     # axes the large curvature across them hides the small one along.
     along = sampling.axes.T @ sampling.local.identified / sampling.stderr[:, None]
     try:
-        root = np.asarray(np.linalg.cholesky(along @ sampling.local.covariance @ along.T))
+        root = np.linalg.cholesky(along @ sampling.local.covariance @ along.T)
     except np.linalg.LinAlgError:  # a variance of zero, by rounding
         root = np.eye(r)
 
     def mean_objective(z: Floats) -> Floats:
         # A first guess of the curvature: 50 data sets suffice.
-        return np.asarray(objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0))
+        return objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0)
 
     # Positive definite: as a first guess, no direction is flatter than a twentieth of the steepest.
     curvatures, vectors = np.linalg.eigh(second_differences(mean_objective, r))
@@ -304,7 +304,7 @@ class SimplexRefits:
 
         def mean(x: Floats) -> Floats:
             thetas = self.theta + (x * steps) @ axes.T * self.prior_sd
-            return np.asarray(self.objective(thetas, slice(None)).mean(axis=0))
+            return self.objective(thetas, slice(None)).mean(axis=0)
 
         back = axes / steps  # to derivatives in units of the prior's spread
         hessian = back @ np.nan_to_num(second_differences(mean, steps.size)) @ back.T

@@ -267,7 +267,7 @@ def simulated_points(
 def _observable_by_all(evaluator: Evaluator, responses: list[Floats], group: list[int]) -> Bools:
     """Return which points all simulators of a group can observe, (n,)."""
     columns = [observable(responses[k], evaluator.nodes[k].target) for k in group]
-    return np.asarray(np.all(columns, axis=0))
+    return np.all(columns, axis=0)
 
 
 def _points_of(mass: Floats, uniform: Floats) -> Indices:

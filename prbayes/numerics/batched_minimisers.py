@@ -147,7 +147,7 @@ def _bfgs(inverse: Floats, s: Floats, y: Floats, is_first: bool) -> Floats:
     column = rho[:, None, None] * s[:, :, None]
     projector = np.eye(s.shape[-1]) - column * y[:, None, :]
     transposed = np.swapaxes(projector, -1, -2)
-    return np.asarray(projector @ inverse @ transposed + column * s[:, None, :])
+    return projector @ inverse @ transposed + column * s[:, None, :]
 
 
 def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) -> Minima:
@@ -214,7 +214,7 @@ def _step(
     center = points[:, :-1].mean(axis=1)
     lengths = np.array([1.0, expansion, contraction, -contraction])
     steps = lengths[:, None] * (center - points[:, -1])[:, None]
-    trials = np.asarray(center[:, None] + steps)
+    trials = center[:, None] + steps
     trial_values = value(trials, rows)
     # The reflected point, a farther one if that is better still, else a nearer one on either side.
     reflected, expanded = trial_values[:, 0], trial_values[:, 1]

@@ -14,12 +14,12 @@ from prbayes.numerics.points import sobol
 def normalised_weights(log_w: Floats) -> Floats:
     """Return weights with sum 1 along the last axis."""
     weights = np.exp(log_w - log_w.max(axis=-1, keepdims=True))
-    return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+    return weights / weights.sum(axis=-1, keepdims=True)
 
 
 def effective_sample_size(weights: Floats) -> Floats:
     """Return how many equal weights are as informative as weights with sum 1, (..., n) -> (...)."""
-    return np.asarray(1 / (weights**2).sum(axis=-1))
+    return 1 / (weights**2).sum(axis=-1)
 
 
 def student_vectors(u: Floats, degrees: float) -> Floats:

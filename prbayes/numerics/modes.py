@@ -17,7 +17,7 @@ LogDensity = Callable[[Floats], Floats]  # (S, d) -> (S,)
 def far_apart(candidates: Floats, count: int, unit: Floats) -> Floats:
     """Return the first candidate, (n, d), and others far from it and each other in a unit, (d,)."""
     scaled = candidates / unit
-    return np.asarray(scaled[farthest_rows(scaled, min(count, len(scaled)))] * unit)
+    return scaled[farthest_rows(scaled, min(count, len(scaled)))] * unit
 
 
 @dataclass(frozen=True, eq=False)

@@ -464,7 +464,7 @@ class AreaGuide:
             objective = objective + node.target.of(*population) / scale
         for theta, *numbers in zip(thetas, overlaps.min(axis=0), objective, strict=True):
             self.records[theta.tobytes()] = (numbers[0], numbers[1])
-        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+        return np.nan_to_num(total, nan=np.inf, posinf=np.inf)
 
 
 def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:

@@ -168,7 +168,7 @@ def _ridge(search: Search, fit: Fit, pilot_thetas: Floats) -> Ridge | None:
             hyperparameters.prior_thetas(THETAS, search.settings.random_seed), axis=0
         )
         distances = (((candidates - median) / hyperparameters.prior_sd) ** 2).sum(axis=1)
-        center = np.asarray(candidates[np.argmin(distances)])
+        center = candidates[np.argmin(distances)]
     sampling = sampling_distribution(evaluator, center, fit.scales)
     if sampling is None or not sampling.local.unidentified.size:
         return None

@@ -28,7 +28,6 @@ from prbayes.inference.checks.population import (
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
-from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
     only_through_prior,
@@ -156,21 +155,19 @@ _UNSUPPORTED = Finding(
 )
 
 
-def _supported(
-    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 0.5, of_specimen: float = 0.1
-) -> Bools:
-    """Return which optima have a log-likelihood that is known to ``largest`` nats.
+def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
+    """Return which optima have a log-likelihood that is known to half a nat.
 
     Where points lie farther apart than a population is wide, a few points that lie close to each
     other make a spurious maximum. Of many specimens with rounded readings, which are known to .06
-    nats, each may be uncertain by ``of_specimen``.
+    nats, each may be uncertain by a tenth of a nat.
     """
     size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
-    largest = max(largest, of_specimen * float(np.sqrt(size)))
+    largest = max(0.5, 0.1 * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
-    return np.asarray(np.sqrt(variance) <= largest)
+    return np.sqrt(variance) <= largest
 
 
 def mode_weights(
@@ -267,7 +264,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
         method="BFGS",
         options={"gtol": settings.tolerance * 100, "maxiter": remaining},
     )
-    theta = np.asarray(result.x) * unit
+    theta = result.x * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # The optimum of a moving support is at a jump: continue without gradients.
@@ -278,7 +275,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
             options={"maxfev": min(remaining, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
         )
         if simplex.fun < value - 1e-6:
-            theta = np.asarray(simplex.x) * unit
+            theta = simplex.x * unit
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
@@ -503,6 +500,10 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
     with the distance in the user's units where that is shorter, as from a spread to zero. Where a
     population is normal, the root is at least half as large, also with three specimens.
     """
+
+    def value_at(theta: Floats, i: int) -> float:
+        return float(ends_of_prior(hyperparameters, theta)[0][i])
+
     size = best.theta.size
     is_too_small = np.zeros(size, dtype=bool)
     for i in range(size):
@@ -511,13 +512,12 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
             continue
         # Other elements follow as they would under a normal likelihood.
         step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
-        value = ends_of_prior(hyperparameters, best.theta)[0][i]
-        near = ends_of_prior(hyperparameters, best.theta + 0.01 * step)[0][i]
-        unit = max(np.abs(near - value) / 0.01, 1e-300)  # a transform may saturate
+        value = value_at(best.theta, i)
+        near = value_at(best.theta + 0.01 * step, i)
+        unit = max(abs(near - value) / 0.01, 1e-300)  # a transform may saturate
         for shift in (-4.0, 4.0):
             theta = best.theta + shift * step
-            far = ends_of_prior(hyperparameters, theta)[0][i]
-            distance = np.fmin(np.abs(far - value) / unit, 4.0)
+            distance = np.fmin(abs(value_at(theta, i) - value) / unit, 4.0)
             if _signed_root(objective, best, theta, i) < distance / 3:
                 is_too_small[i] = True
     return is_too_small
@@ -607,16 +607,10 @@ def specimen_pool(
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
     drawn = draw_readings(likelihood, rng, values, copies * n)[0].reshape(copies * n, -1)
-    observed, shape = likelihood.readings, drawn.shape
-    missing = np.full(shape, np.nan)
-    readings = Readings(
-        np.where(np.resize(observed.is_measured, shape), drawn, np.nan),
-        np.resize(observed.error, shape),
-        np.resize(observed.step, shape),
-        missing,
-        missing,
-        np.resize(observed.is_relative, shape),
-    )
+    observed = likelihood.readings.rows(np.tile(np.arange(n), copies))
+    missing = np.full(drawn.shape, np.nan)
+    drawn = np.where(observed.is_measured, drawn, np.nan)
+    readings = replace(observed, values=drawn, lower=missing, upper=missing)
     data, preparation = specimen_data(likelihood), prepared(likelihood)
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
     tolerance = data.options.half_difference * np.sqrt(copies)
@@ -695,7 +689,7 @@ class SpecimenRefits:
         if np.isfinite(self.covariance).all():
             values, vectors = np.linalg.eigh(self.covariance)
             if values.min() > 0:
-                return np.asarray(vectors * np.sqrt(values))
+                return vectors * np.sqrt(values)
         return np.diag(self.evaluator.hyperparameters.prior_sd)
 
     def fit(self, weights: Sequence[Floats] | None = None) -> tuple[Floats, bool]:

@@ -323,7 +323,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         elif not evaluator.responses_per_theta:
             points = hyperparameters.prior_points(THETAS, settings.random_seed)
             candidates = np.concatenate([theta[None], points])
-            theta = np.asarray(candidates[np.argmin(evaluator.total(candidates, scales))])
+            theta = candidates[np.argmin(evaluator.total(candidates, scales))]
             n_screened = len(candidates)
         theta, trace = approach(search, theta, scales, Trace())
         if trace.count:

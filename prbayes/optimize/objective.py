@@ -36,12 +36,12 @@ class Ridge:
     def __call__(self, thetas: Floats, prior_sd: Floats) -> Floats:
         """Return the penalty at thetas, (..., d) -> (...)."""
         along = (thetas - self.center) / prior_sd @ self.directions
-        return np.asarray(0.5 * self.weight * (along**2).sum(axis=-1))
+        return 0.5 * self.weight * (along**2).sum(axis=-1)
 
     def gradient(self, thetas: Floats, prior_sd: Floats) -> Floats:
         """Return the gradient of the penalty at thetas, (..., d)."""
         along = (thetas - self.center) / prior_sd @ self.directions
-        return np.asarray(self.weight * (along @ self.directions.T) / prior_sd)
+        return self.weight * (along @ self.directions.T) / prior_sd
 
 
 @dataclass(eq=False)

@@ -497,7 +497,7 @@ def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     # At a bound of the support nothing moves a function, and its error is not known.
     is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
     variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
-    return np.asarray(np.sqrt(np.where(is_at_bound, np.nan, variance)))
+    return np.sqrt(np.where(is_at_bound, np.nan, variance))
 
 
 def _number(value: Any) -> Any:

@@ -342,7 +342,7 @@ def _likelihood_spread(
     for k in range(len(evaluator.nodes)):
         population = _derivatives(evaluator, k, theta, options)
         variance += population.spread**2
-    return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
+    return np.sqrt(variance) * evaluator.hyperparameters.prior_sd
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:
@@ -486,4 +486,4 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     scaling = np.diag(1 / np.where(varies, spread, 1.0))[:, varies]
     eigenvalues, vectors = np.linalg.eigh(scaling.T @ covariance @ scaling)
     is_large = eigenvalues > tolerance
-    return np.asarray(scaling @ (vectors[:, is_large] / np.sqrt(eigenvalues[is_large])))
+    return scaling @ (vectors[:, is_large] / np.sqrt(eigenvalues[is_large]))

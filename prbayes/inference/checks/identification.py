@@ -30,7 +30,7 @@ def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
     if indirect.any():
         # One, or zero up to rounding for elements on which nothing depends.
         axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
-        hidden = np.asarray(axes[:, strength > 0.5])
+        hidden = axes[:, strength > 0.5]
     return unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
 
 
@@ -107,7 +107,7 @@ def correlated_estimates(
     The variance of either is then ten times its variance with the other known.
     """
     by_data = local.identified @ np.linalg.pinv(local.covariance) @ local.identified.T
-    precision = np.asarray(by_data + np.eye(local.prior_sd.size))
+    precision = by_data + np.eye(local.prior_sd.size)
     correlation, *loadings = canonical_correlation(np.linalg.inv(precision), coefficients, inputs)
     if correlation < 0.95:
         return ""

@@ -224,7 +224,7 @@ def smoothing_bias(
     variances, vectors = np.linalg.eigh(local.covariance)
     positive = variances > 0
     along = vectors[:, positive] * np.sqrt(variances[positive])
-    axes = np.asarray(local.prior_sd[:, None] * (local.identified @ along))
+    axes = local.prior_sd[:, None] * (local.identified @ along)
     r = axes.shape[1]
     # The second order in .3 standard errors is some per cent, the points' noise small beside it.
     size = 0.3

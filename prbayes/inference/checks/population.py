@@ -300,4 +300,4 @@ def _population_coordinates(
     sampler = PopulationSampler(likelihood.inputs)
     rng = np.random.default_rng(23)
     drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
-    return np.asarray(likelihood.coordinates.of([x[0] for x in drawn], 1))
+    return likelihood.coordinates.of([x[0] for x in drawn], 1)
