@@ -96,12 +96,16 @@ def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     return quantiles if np.ndim(probability) > 0 else quantiles[..., 0]
 
 
+def ascending_quantile(values: Floats, weights: Floats, levels: ArrayLike) -> Floats:
+    """Return `quantile` of ascending values, (n,), with weights (n,): (), or (m,) of m levels."""
+    middles = np.cumsum(weights) - 0.5 * weights
+    return np.asarray(np.interp(levels, middles, values))
+
+
 def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats:
     # Of equal values the lightest first, whatever their order in the sample.
     order = np.lexsort((weights, values))
-    ascending = weights[order]
-    middles = np.cumsum(ascending) - 0.5 * ascending
-    return np.interp(levels, middles, values[order])
+    return ascending_quantile(values[order], weights[order], levels)
 
 
 _row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n),(m)->(m)")

@@ -19,13 +19,12 @@ from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, report, sentences_of
-from prbayes._stats import INTERVAL, tail_levels
+from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
 from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
     refuse_quantity,
-    weighted_quantiles,
 )
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
@@ -359,7 +358,7 @@ class ResponseSample:
             error = max(error, float(np.linalg.norm(rare)))
         tails = probability_bounds(share, error, float(ndtr(-1)))
         tails *= min(quantity.probability, 1 - quantity.probability) / share
-        ends = weighted_quantiles(self.values, weights, tails, is_upper)
+        ends = ascending_quantile(self.values, weights, 1 - tails if is_upper else tails)
         error = float(np.abs(ends - value).max())
         if self.emulator is not None:
             error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))

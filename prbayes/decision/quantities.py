@@ -10,9 +10,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, logsumexp
 
+from prbayes._stats import ascending_quantile
 from prbayes._validate import Floats, finite_number, flag, share
 from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import sobol
@@ -174,24 +174,11 @@ class Quantile(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the quantiles, by interpolation between the middles of the steps."""
-        return np.array([weighted_quantiles(values, row, self.probability) for row in weights])
+        return np.array([ascending_quantile(values, row, self.probability) for row in weights])
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the population's quantile."""
         return (values > at).astype(float)
-
-
-def weighted_quantiles(
-    values: Floats, weights: Floats, probability: ArrayLike, is_upper: bool = False
-) -> Floats:
-    """Return quantiles of ascending values (n,), between the middles of the weights' steps.
-
-    With ``is_upper`` probabilities are those above the quantiles.
-    """
-    middles = np.cumsum(weights) - 0.5 * weights
-    below = np.asarray(probability)
-    below = 1 - below if is_upper else below
-    return np.asarray(np.interp(below, middles, values))
 
 
 class Exceedance(Quantity):

@@ -61,9 +61,13 @@ class Continuation:
         """Return thetas of coordinates, moved within the ends, (S, d)."""
         return self._thetas(self._shares(coordinates, margin), coordinates)
 
+    def _unbounded_shares(self, coordinates: Floats) -> Floats:
+        """Return values as shares of the interval, also those beyond its ends."""
+        return (self.values(coordinates) - self.lower) / (self.upper - self.lower)
+
     def _shares(self, coordinates: Floats, margin: float) -> Floats:
         """Return values as shares of the interval, a margin away from ends that are passed."""
-        shares = (self.values(coordinates) - self.lower) / (self.upper - self.lower)
+        shares = self._unbounded_shares(coordinates)
         least = np.where(self.below, margin, 1e-300)
         return np.clip(shares, least, np.where(self.above, 1 - margin, 1 - 1e-16))
 
@@ -76,7 +80,7 @@ class Continuation:
         shares = self._shares(coordinates, margin)
         base = evaluator.parents(self._thetas(shares, coordinates), k)
         parents = list(base)
-        beyond = (self.values(coordinates) - self.lower) / (self.upper - self.lower) - shares
+        beyond = self._unbounded_shares(coordinates) - shares
         for i in np.flatnonzero(self.is_continued):
             passed = np.abs(beyond[:, i]) > 1e-12
             if not passed.any():

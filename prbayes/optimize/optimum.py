@@ -564,13 +564,18 @@ def identity_in(result: Any) -> Identity | None:
     return from_attributes(result[group].attrs) if group in result.children else None
 
 
+def element_order(optimum: Optimum, evaluator: Evaluator) -> list[int]:
+    """Return the places of an evaluator's elements in an optimum, whose model may be a clone."""
+    names = optimum.evaluator.hyperparameters.names
+    return [names.index(name) for name in evaluator.hyperparameters.names]
+
+
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
     """Return the optimum and comparable local optima, (M, d), in the evaluator's order of elements.
 
     The order may differ in a clone of the optimum's model.
     """
-    names = optimum.evaluator.hyperparameters.names
-    order = [names.index(name) for name in evaluator.hyperparameters.names]
+    order = element_order(optimum, evaluator)
     modes = [mode["theta"] for mode in optimum.local_optima if mode["comparable"]]
     return np.array([optimum.theta, *modes])[:, order]
 

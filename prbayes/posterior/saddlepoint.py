@@ -35,7 +35,7 @@ from prbayes.model.evaluator import Evaluator, coarser_evaluator
 from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
-from prbayes.optimize.optimum import Optimum, optima_of
+from prbayes.optimize.optimum import Optimum, element_order, optima_of
 
 
 @dataclass(frozen=True)
@@ -196,9 +196,7 @@ def estimate_likelihood(
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
         scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
     else:
-        names = optimum.evaluator.hyperparameters.names
-        order = [names.index(name) for name in hyperparameters.names]
-        errors = np.sqrt(np.diag(optimum.covariance))[order]
+        errors = np.sqrt(np.diag(optimum.covariance))[element_order(optimum, evaluator)]
         scale = np.minimum(100 * errors, hyperparameters.prior_sd)
     return EstimateLikelihood(
         evaluator=evaluator,

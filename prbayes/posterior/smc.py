@@ -254,6 +254,10 @@ class SamplingSettings:
     progressbar: bool = False
     with_groups: bool = False  # whether the result has the groups of `arviz_groups`
 
+    def is_pseudo(self, evaluator: Evaluator) -> bool:
+        """Return whether draws are those of the pseudo-posterior exp(-discrepancy / epsilon)."""
+        return bool(evaluator.nodes) and self.adjustment is None
+
 
 def require_adjustment(adjustment: object) -> None:
     """Raise unless it is "estimate" or None."""
@@ -279,7 +283,7 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
 
 def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     if settings.epsilon is not None and not is_pseudo:
         raise ValueError(
             f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
@@ -321,7 +325,7 @@ def result_of(
     clock: float,
 ) -> xr.DataTree:
     """Return the DataTree of chains, with discrepancies if these cost no response."""
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     findings: list[Finding] = []
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
@@ -583,7 +587,7 @@ def run_chains(
     particles, notes = zip(*states, strict=True)
     arrays = {name: np.array([of_chain[name] for of_chain in particles]) for name in particles[0]}
     stats, evidence = _stage_statistics([note["stages"] for note in notes])
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     return Chains(
         thetas=arrays["thetas"],
         sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC", **evidence},

@@ -34,7 +34,7 @@ from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.numerics.modes import LogDensity, far_apart, laplace
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
-from prbayes.optimize.optimum import Optimum, optima_of
+from prbayes.optimize.optimum import Optimum, element_order, optima_of
 from prbayes.posterior.importance import importance_sample
 from prbayes.posterior.saddlepoint import (
     Cumulants,
@@ -129,17 +129,13 @@ def require_density(evaluator: Evaluator) -> None:
         )
 
 
-def prior_conflicts(
-    optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
-) -> tuple[Finding, ...]:
+def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> tuple[Finding, ...]:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
+    size = 4096
     comparable = [mode["comparable"] for mode in optimum.local_optima]
     if optimum.search.prior or any(comparable):
         return ()
-    order = [
-        optimum.evaluator.hyperparameters.names.index(name)
-        for name in evaluator.hyperparameters.names
-    ]
+    order = element_order(optimum, evaluator)
     covariance = optimum.covariance[np.ix_(order, order)]
     is_identified = np.isfinite(np.diag(covariance))
     if not is_identified.any():
