@@ -355,11 +355,12 @@ class _Question:
         sample = self.populations.sample(self.response, inputs, self.output)
         return _stored_probability(sample, quantity)
 
-    def refined(self, estimate: _Estimate, inputs: Sequence[Any], points: int = 1000) -> _Estimate:
+    def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
         """Return an estimate by new points, if these are no more than the runs behind it.
 
         Inputs without an inverse distribution function keep the estimate.
         """
+        points = 1000
         if estimate.runs < points:
             return estimate
         try:

@@ -370,14 +370,14 @@ def result_of(
         return posterior_tree(evaluator, chains, attrs, groups)
 
 
-def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
-    """Return the share without response, (chains, draws, k), at some draws.
+def _lost_of_some(evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the share without response, (chains, draws, k), at 64 draws.
 
     NaN at others, and of simulators with stored responses.
     """
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
-    rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
+    rows = np.linspace(0, chains * draws - 1, 64).astype(np.intp)
     try:
         for row in np.unique(rows):
             place = np.unravel_index(row, (chains, draws))

@@ -101,13 +101,13 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     return findings
 
 
-def small_simulators(evaluator: Evaluator, *, enough: int = 30) -> list[Finding]:
+def small_simulators(evaluator: Evaluator) -> list[Finding]:
     """Report simulators of so few specimens that the spread in common is estimated too small.
 
     Bandwidths of few data let simulators that happen to scatter little weigh most, unless they have
     the same response and so one bandwidth. The probability residual and the area are right.
     """
-    nodes = evaluator.nodes
+    enough, nodes = 30, evaluator.nodes
     widths = set()
     for node in nodes:
         parts = [part.target for part in node.target.parts if part.target.metric.likelihood]

@@ -159,9 +159,6 @@ def conflict_findings(
     standard_error: Floats,
     posterior_mean: Floats,
     predictive: Floats,
-    *,
-    threshold: float = 0.05,
-    pull: float = 0.5,
 ) -> tuple[Finding, ...]:
     """Return a finding ``prior-conflict`` of each hyperparameter in conflict.
 
@@ -182,8 +179,8 @@ def conflict_findings(
     'mu: got prior 9.99 +- 0.29, data 11.2 +- 0.2 (p = 0.004)'
     """
     conflict = prior_conflict(estimate, standard_error, posterior_mean, predictive)
-    findings = []
-    matters = (conflict.adjusted <= threshold) & (conflict.pulls > pull)
+    findings, pull = [], 0.5
+    matters = (conflict.adjusted <= 0.05) & (conflict.pulls > pull)
     for j in np.flatnonzero(matters).tolist():
         center, sd = prior[:, j].mean(), prior[:, j].std(ddof=1)
         text = (

@@ -74,11 +74,12 @@ def interval_ratios(n: float) -> tuple[float, float]:
     return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
 
 
-def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
+def few_specimens(evaluator: Evaluator) -> list[Finding]:
     """Report hyperparameters that follow from so few specimens that standard errors are too small.
 
     Simulators with an element of theta in common count together.
     """
+    enough = 8
     enters = elements_above(evaluator)
     enters = enters[:, enters.any(axis=0)]
     _, groups = connected_components(enters @ enters.T)
