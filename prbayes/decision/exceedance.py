@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from typing import Any
 
@@ -489,16 +490,24 @@ class _Normal:
 class _Points:
     """Points from several proposals, with their responses."""
 
-    sizes: list[int]  # number of points from each proposal
-    proposals: list[_Normal]
+    proposals: list[tuple[_Normal, int]]  # with the number of points of each
     z: Floats  # (n, D)
     values: Floats  # (n,)
     log_ratio: Floats  # (k, n): of the density of each population to that of the central one
 
+    def joined(self, more: _Points) -> _Points:
+        """Return these and more points."""
+        return _Points(
+            self.proposals + more.proposals,
+            np.concatenate([self.z, more.z]),
+            np.concatenate([self.values, more.values]),
+            np.concatenate([self.log_ratio, more.log_ratio], axis=1),
+        )
+
     def log_mixture(self) -> Floats:
         """Return the log-density of the mixture of all proposals at the points, (n,)."""
-        sizes = np.array(self.sizes)
-        logs = [proposal.log_density(self.z) for proposal in self.proposals]
+        logs = [proposal.log_density(self.z) for proposal, _ in self.proposals]
+        sizes = np.array([size for _, size in self.proposals])
         return np.asarray(logsumexp(logs, axis=0, b=sizes[:, None] / sizes.sum()))
 
     def log_weights(self) -> Floats:
@@ -540,23 +549,20 @@ def rare_event(
     proposals = [widest]
     # A sixteenth of the points a step; more dimensions need more.
     step = max(size // 16, min(10 * d, size // 8), 1)
-    batches: list[_Points] = []
-    remaining = size // 2
-    while remaining:
-        n = min(step, remaining)
-        batches.append(_draw_points(proposals, n, transform, parents, respond, rng))
-        remaining -= n
+    draw = partial(_draw_points, transform, parents, respond, rng)
+    search = None
+    for first in range(0, size // 2, step):
+        batch = draw(proposals, min(step, size // 2 - first))
+        search = batch if search is None else search.joined(batch)
         # The level that the highest fifth of responses exceeds, as is usual for the method.
-        values = batches[-1].values[~np.isnan(batches[-1].values)]
+        values = batch.values[~np.isnan(batch.values)]
         elite = float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
-        level = min(elite, limit)
-        proposals = _cross_entropy_proposals(_concatenated(batches), level, limit) or proposals
-    search = _concatenated(batches)
+        proposals = _cross_entropy_proposals(search, min(elite, limit), limit) or proposals
     # The proposals do not depend on the final points, whose mean is unbiased. One point in ten
     # comes from the widest proposal, which bounds weights.
     copies = max(1, 9 // len(proposals))
     mixture = [proposal for proposal in proposals for _ in range(copies)] + [widest]
-    final = _draw_points(mixture, size - size // 2, transform, parents, respond, rng)
+    final = draw(mixture, size - size // 2)
     weights = np.exp(final.log_ratio + (log_normal(final.z) - final.log_mixture()))
     mean_weights = weights.mean(axis=0)
     is_beyond = ~np.isnan(final.values) & (final.values > limit)
@@ -567,7 +573,7 @@ def rare_event(
         is_above = final.values >= np.median(values)
         above, above_error = weighted_share(mean_weights[None], is_above)
         error = min(error, float(above[0] + 2 * above_error) / 3)
-    points = _concatenated([search, final])
+    points = final if search is None else search.joined(final)
     log_weights = points.log_weights()
     shares = np.exp(log_weights - log_weights.max())
     return RareEvent(
@@ -602,12 +608,12 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
 
 
 def _draw_points(
-    proposals: list[_Normal],
-    n: int,
     transform: InverseTransform,
     parents: Sequence[Floats],
     respond: Callable[[Floats], Floats],
     rng: np.random.Generator,
+    proposals: list[_Normal],
+    n: int,
 ) -> _Points:
     """Draw n points, in equal parts from each proposal, and compute their responses."""
     sizes = [len(part) for part in np.array_split(np.arange(n), len(proposals))]
@@ -620,18 +626,8 @@ def _draw_points(
         transform.log_density([values[first : first + step] for values in parents], x) - central
         for first in range(0, len(parents[0]), step)
     ]
-    return _Points(sizes, proposals, z, respond(z), np.concatenate(log_ratio))
-
-
-def _concatenated(batches: Sequence[_Points]) -> _Points:
-    """Return the points of all batches."""
-    return _Points(
-        sizes=[size for batch in batches for size in batch.sizes],
-        proposals=[proposal for batch in batches for proposal in batch.proposals],
-        z=np.concatenate([batch.z for batch in batches]),
-        values=np.concatenate([batch.values for batch in batches]),
-        log_ratio=np.concatenate([batch.log_ratio for batch in batches], axis=1),
-    )
+    pairs = list(zip(proposals, sizes, strict=True))
+    return _Points(pairs, z, respond(z), np.concatenate(log_ratio))
 
 
 def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:

@@ -74,10 +74,7 @@ def mixture_ratio(z: Floats, weights: Floats) -> Floats:
 
 
 def population_statistics(z: Floats, weights: Floats) -> Floats:
-    """Return Z_A of all inputs, then the mixture's ratio of all inputs, (2 d,); large ones reject.
-
-    Observed and bootstrap samples need the same seed of the drawn inputs.
-    """
+    """Return Z_A of all inputs, then the ratios of their mixtures, (2 d,); large ones reject."""
     return np.concatenate([zhang_statistic(z, weights), mixture_ratio(z, weights)])
 
 

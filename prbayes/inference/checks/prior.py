@@ -119,37 +119,25 @@ def prior_end_findings(
     return [Finding("prior-end", text, page)]
 
 
-@dataclass(frozen=True)
-class PriorConflict:
-    """Conflict of prior and data, by hyperparameter, (d,) each."""
+def prior_conflict(estimate: Floats, predictive: Floats) -> tuple[Floats, Floats]:
+    """Return p-values of estimates in their prior predictive distributions, plain and adjusted.
 
-    p_values: Floats  # two-sided, of the estimates in their prior predictive distributions
-    adjusted: Floats  # for the number of hyperparameters (Holm 1979)
-    pulls: Floats  # shifts of the posterior means from the estimates, in standard errors
-
-
-def prior_conflict(
-    estimate: Floats, standard_error: Floats, posterior_mean: Floats, predictive: Floats
-) -> PriorConflict:
-    """Return p-values and pulls of all hyperparameters.
-
-    ``predictive``, (S, d), are estimates from synthetic data sets at draws of the prior; 1000
-    suffice. Those that are not finite are left out. Size of one p-value at .05: .04 to .06. Power
-    with 10, 20 and 50 specimens (linear problem, sharp prior, 1000 data sets): a mean four prior
-    standard deviations off .86, .98, 1.00; a logarithm of the standard deviation three off .36 to
-    .55, .70 to .76, .94 to .96.
+    P-values, (d,), are two-sided; they are adjusted for the number of hyperparameters by Holm's
+    step-down method (1979). ``predictive``, (S, d), are estimates from synthetic data sets at draws
+    of the prior; 1000 suffice. Those that are not finite are left out. Size of one p-value at .05:
+    .04 to .06. Power with 10, 20 and 50 specimens (linear problem, sharp prior, 1000 data sets): a
+    mean four prior standard deviations off .86, .98, 1.00; a logarithm of the standard deviation
+    three off .36 to .55, .70 to .76, .94 to .96.
     """
     finite = np.isfinite(predictive)
     below = (finite & (predictive <= estimate)).sum(axis=0)
     above = (finite & (predictive >= estimate)).sum(axis=0)
     p_values = np.minimum(1.0, 2 * (np.minimum(below, above) + 1) / (finite.sum(axis=0) + 1))
-    # Holm's step-down method.
     order = np.argsort(p_values)
     factors = np.arange(len(p_values), 0, -1)
     adjusted = np.empty_like(p_values)
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
-    pulls = np.abs(posterior_mean - estimate) / standard_error
-    return PriorConflict(p_values, adjusted, pulls)
+    return p_values, adjusted
 
 
 def conflict_findings(
@@ -178,15 +166,17 @@ def conflict_findings(
     >>> finding.text.split("; ")[0]
     'mu: got prior 9.99 +- 0.29, data 11.2 +- 0.2 (p = 0.004)'
     """
-    conflict = prior_conflict(estimate, standard_error, posterior_mean, predictive)
+    _, p_values = prior_conflict(estimate, predictive)
+    # Shifts of the posterior means from the estimates, in standard errors.
+    pulls = np.abs(posterior_mean - estimate) / standard_error
     findings, pull = [], 0.5
-    matters = (conflict.adjusted <= 0.05) & (conflict.pulls > pull)
+    matters = (p_values <= 0.05) & (pulls > pull)
     for j in np.flatnonzero(matters).tolist():
         center, sd = prior[:, j].mean(), prior[:, j].std(ddof=1)
         text = (
             f"{labels[j]}: got prior {center:.3g} +- {sd:.2g}, data {estimate[j]:.3g} +- "
-            f"{standard_error[j]:.2g} (p = {conflict.adjusted[j]:.1g}); the prior pulls the "
-            f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard errors "
+            f"{standard_error[j]:.2g} (p = {p_values[j]:.1g}); the prior pulls the "
+            f"posterior mean to {posterior_mean[j]:.3g}, {pulls[j]:.1f} standard errors "
             f"from the data, expected at most {pull:g}; check the units and the prior, or widen it."
         )
         findings.append(Finding("prior-conflict", text, "likelihood.md#prior-conflict"))
