@@ -18,15 +18,16 @@ from numpy.typing import ArrayLike
 
 from prbayes._validate import Floats, Indices
 
-# The order of equal values decides the last digit of a sum of weights, and nothing else. "stable"
-# keeps it on every processor; "quicksort" is seven times faster for 100 000 values.
+# Algorithm of a sort. The order of equal values affects only the last digit of a sum of weights.
+# "stable" gives the same order on every processor, "quicksort" is seven times faster for 100 000
+# values.
 Sorting = Literal["stable", "quicksort"]
 
-# Probability of intervals: what ArviZ takes by default, az.rcParams["stats.ci_prob"].
+# Probability of intervals, which is ArviZ's default az.rcParams["stats.ci_prob"]
 INTERVAL = 0.89
 
-# Replicates for an envelope: the coverage for right models then has a standard error of .007, and
-# more would only cost memory.
+# Number of replicates for an envelope. The coverage for right models then has a standard error of
+# .007, and more would only cost memory.
 ENVELOPED = 999
 
 
@@ -72,7 +73,7 @@ def distribution_function(
 
     Values have shape (n,) or (..., n), weights (..., n); the weights are not normalised here.
     """
-    # A batch of values without strides is one row, to be sorted once.
+    # A batch of values without strides repeats one row: sort it once.
     if values.ndim == 1 or (values.size > 0 and not any(values.strides[:-1])):
         first = (0,) * (values.ndim - 1)
         order, below = ranked(values[first], points, kind=kind)
@@ -103,7 +104,7 @@ def ascending_quantile(values: Floats, weights: Floats, levels: ArrayLike) -> Fl
 
 
 def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats:
-    # Of equal values the lightest first, whatever their order in the sample.
+    # Sort equal values by weight, so that the result does not depend on their order in the sample.
     order = np.lexsort((weights, values))
     return ascending_quantile(values[order], weights[order], levels)
 
@@ -152,7 +153,8 @@ def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
     rows = np.sort(replicates, axis=1)
     columns = np.sort(rows, axis=0)
     size = len(rows)
-    # How many replicates are as far out, on the nearer side, at the outermost value of each.
+    # depth: number of replicates that are as far out, on the nearer side, at each one's outermost
+    # value
     depth = np.full(size, size)
     for column, values in zip(columns.T, rows.T, strict=True):
         as_low = np.searchsorted(column, values, side="right")

@@ -187,7 +187,7 @@ def exceedance(
     positive_integer(n_draws, "n_draws", minimum=2)
     if n_points is not None:
         positive_integer(n_points, "n_points", minimum=0)
-    if 0 < (n_points or 0) < 100:  # a tenth of them is a step towards the limit
+    if 0 < (n_points or 0) < 100:  # because the search for the limit takes steps of a part of them
         raise ValueError(f"n_points: got {n_points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
     calling = call_settings(executor, store, version)
@@ -214,7 +214,8 @@ def exceedance(
     low, high = np.transpose([estimate.interval(prob) for estimate in estimates])
     bounds = [int(means.argmin()), int(means.argmax())]
     verdict = "" if requirement is None else _verdict(estimates, requirement, prob)
-    # Where two standard errors are a factor of two of the probability, about, or would decide.
+    # A probability is rough if two standard errors are about a factor of two, or would decide the
+    # requirement.
     is_rough = np.zeros(len(means), dtype=bool)
     is_rough[bounds] = errors[bounds] > 0.3 * means[bounds]
     if requirement is not None and verdict == "not decided":
@@ -296,12 +297,12 @@ def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) ->
 class _Estimate:
     """Probabilities at one point of the intervals."""
 
-    by_draw: Floats  # (k,): NaN of populations that do not exist
+    by_draw: Floats  # (k,): probability in each population; NaN of populations that do not exist
     error: float
-    responses: int  # computed
+    responses: int  # number of responses computed
     source: str
-    runs: int = 0  # stored responses behind it
-    points: int = 0  # near the limit
+    runs: int = 0  # number of stored responses behind the probabilities
+    points: int = 0  # number of points near the limit
     lost: float = 0.0  # share of the populations without response
 
     @property
@@ -419,7 +420,8 @@ def _rare_probability(
             f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
             "return +inf for specimens that fail"
         )
-    # The probability is that of specimens with a response, as from stored responses.
+    # Divide by the share with a response: the probability is that of specimens with a response, as
+    # from stored responses.
     by_draw = np.minimum(event.by_draw / (1 - event.lost), 1.0)
     error = np.hypot(event.error / (1 - event.lost), _error_of_draws(populations, by_draw))
     count, lost = responses.count, event.lost
@@ -463,7 +465,7 @@ def _left_out_finding(response: Any, lost: float) -> list[Finding]:
 class RareEvent:
     """Probabilities of an event in each population, and the error of their mean."""
 
-    by_draw: Floats  # (k,)
+    by_draw: Floats  # (k,): probability of the event in each population
     error: float  # standard error of their mean
     lost: float  # share of the populations' weight that has no response
 
@@ -490,10 +492,11 @@ class _Normal:
 class _Points:
     """Points from several proposals, with their responses."""
 
-    proposals: list[tuple[_Normal, int]]  # with the number of points of each
+    proposals: list[tuple[_Normal, int]]  # proposals, each with its number of points
     z: Floats  # (n, D)
     values: Floats  # (n,)
-    log_ratio: Floats  # (k, n): of the density of each population to that of the central one
+    # (k, n): log ratio of the density of each population to that of the central one
+    log_ratio: Floats
 
     def joined(self, more: _Points) -> _Points:
         """Return these and more points."""
@@ -544,22 +547,24 @@ def rare_event(
        Assoc. 95, 135-143, doi:10.1080/01621459.2000.10473909.
     """
     d = transform.size
-    # Wider than the population, which bounds the weights; less so in each of many dimensions.
+    # The first proposal is wider than the population, so that weights are bounded. It is less wide
+    # in each of many dimensions.
     widest = _Normal(np.zeros(d), (1 + 0.5 / np.sqrt(d)) * np.eye(d))
     proposals = [widest]
-    # A sixteenth of the points a step; more dimensions need more.
+    # A step has a sixteenth of the points, and more in many dimensions.
     step = max(size // 16, min(10 * d, size // 8), 1)
     draw = partial(_draw_points, transform, parents, respond, rng)
     search = None
     for first in range(0, size // 2, step):
         batch = draw(proposals, min(step, size // 2 - first))
         search = batch if search is None else search.joined(batch)
-        # The level that the highest fifth of responses exceeds, as is usual for the method.
+        # Raise the level to what the highest fifth of the responses exceeds, as is usual for the
+        # method.
         values = batch.values[~np.isnan(batch.values)]
         elite = float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
         proposals = _cross_entropy_proposals(search, min(elite, limit), limit) or proposals
-    # The proposals do not depend on the final points, whose mean is unbiased. One point in ten
-    # comes from the widest proposal, which bounds weights.
+    # The estimate is unbiased, because the proposals do not depend on the final points. One point
+    # in ten comes from the widest proposal, so that weights are bounded.
     copies = max(1, 9 // len(proposals))
     mixture = [proposal for proposal in proposals for _ in range(copies)] + [widest]
     final = draw(mixture, size - size // 2)
@@ -568,7 +573,8 @@ def rare_event(
     is_beyond = ~np.isnan(final.values) & (final.values > limit)
     _, error = weighted_share(mean_weights[None], is_beyond)
     if not is_beyond.any():
-        # Nor is the event more probable than one that contains it and half of the points.
+        # No point exceeds the limit. Bound the probability by that of exceeding the median
+        # response, which contains the event.
         values = np.where(np.isnan(final.values), -np.inf, final.values)
         is_above = final.values >= np.median(values)
         above, above_error = weighted_share(mean_weights[None], is_above)
@@ -642,15 +648,15 @@ def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> lis
     log_weights = points.log_weights()[is_above]
     weights = np.exp(log_weights - log_weights.max())
     total = weights.sum()
-    # Variance towards the limit. Before the limit is reached, narrow proposals slow the search;
-    # beyond four standard deviations a normal tail has a variance of .05.
+    # Bound the variance towards the limit from below. Narrow proposals would slow the search before
+    # the limit is reached. Beyond four standard deviations a normal tail has a variance of .05.
     least = 0.1 if level >= limit else 1.0
     mean = weights @ z / total
     deviation = z - mean
     covariance = (deviation.T * weights) @ deviation / total
     variances, axes = np.linalg.eigh(covariance)
-    error = np.sqrt(2 * (weights**2).sum()) / total  # of a variance of one
-    # The largest of several variances is larger by chance (Marchenko and Pastur 1967).
+    error = np.sqrt(2 * (weights**2).sum()) / total  # standard error of a variance of one
+    # The largest of several sample variances exceeds one by chance (Marchenko and Pastur 1967).
     by_chance = (1 + np.sqrt(mean.size / 2) * error) ** 2
     if variances[-1] <= max(by_chance, 1 + 3 * error):
         return [_tail_normal(z, weights, least)]
@@ -670,7 +676,7 @@ def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:
     deviation = z - mean
     whole = float(shares @ (deviation**2).sum(axis=1))
     along = float(shares @ (deviation @ direction) ** 2)
-    # A fifth wider across, which bounds weights far out.
+    # Inflate the other directions by 20 %, so that importance weights stay bounded in the tails.
     across = 1.2 * max((whole - along) / max(mean.size - 1, 1), 1.0)
     outer = np.outer(direction, direction)
     covariance = across * (np.eye(mean.size) - outer) + max(along, least) * outer

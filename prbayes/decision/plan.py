@@ -177,7 +177,7 @@ def plan(
     _refuse_candidates(candidates)
     if quantity is not None:
         refuse_quantity(quantity, caller)
-    # 2000 draws: standard deviations are then known to two percent.
+    # With 2000 draws standard deviations have an error of two percent.
     populations = Populations.of(
         result, model, 2000, caller, call_settings(executor, store, version)
     )
@@ -256,7 +256,7 @@ class Draws:
 
     thetas: Floats  # (k, d)
     unit: Floats  # (d,): the prior's spread
-    covariance: Floats  # (d, d): in that unit
+    covariance: Floats  # (d, d): covariance in that unit
 
     @classmethod
     def of(cls, thetas: Floats, unit: Floats) -> Draws:
@@ -292,7 +292,7 @@ class _Forecast:
     populations: Populations
     draws: Draws
     quantity: Quantity | None
-    sample: ResponseSample | None  # of the quantity's response
+    sample: ResponseSample | None  # responses that the quantity is computed from
 
     def sd(self, information: Floats) -> dict[str, float]:
         """Return standard deviations by name after information, (d, d)."""
@@ -354,14 +354,14 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     if not design.has_runs:
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
-    # At least 50 specimens: smaller samples have other bandwidths.
+    # The ideal sample has at least 50 specimens, because smaller ones have other bandwidths.
     n = max(round(node.n_specimens), 50)
     target = (metric or node.metric).against(_ideal_sample(sample, n))
     bound = design.copied(design.design.with_values(sample.outputs))
     bound.target = target.metric.for_inputs(target, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
-    # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
-    # than a hundredth of the prior's information.
+    # Count directions with a standard error of up to ten prior standard deviations. Fainter ones
+    # have less than a hundredth of the prior's information.
     simulator_alone = replace(evaluator, nodes=(alone,), has_graph=False)
     local = SamplingDistribution.of(simulator_alone, center, np.ones(1), 10.0).local
     if not local.identified.size:
@@ -374,9 +374,9 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
 class ReadingErrors:
     """Errors, rounding and limits of the readings of a response."""
 
-    readings: Readings  # their errors and steps, which repeat
-    unknown: Variable[Any, Any] | None  # model variable that is the error
-    limits: tuple[Any, Any]  # lower and upper ones, infinite without a limit
+    readings: Readings  # readings whose errors and steps apply, and repeat if there are more points
+    unknown: Variable[Any, Any] | None  # model variable that is the error, if it is unknown
+    limits: tuple[Any, Any]  # lower and upper limits, infinite without a limit
 
     @classmethod
     def of(cls, sample: ResponseSample, metric: Metric | None) -> ReadingErrors | None:
@@ -468,10 +468,10 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
         scores = slopes(np.log(weights), step)
     mass = weights[0] / weights[0].sum()
     values = outputs[is_used].reshape(len(mass), -1)
-    # Bins of half the root of the number of points; equal values are in one bin.
+    # The size of bins is half the root of the number of points. Equal values share a bin.
     size = max(1, int(np.sqrt(len(mass)) / 2))
     if errors is not None:
-        copies = 16  # of each specimen, with other errors
+        copies = 16  # number of copies of each specimen, with different errors
         values = np.tile(values, (copies, 1))
         scores = np.tile(scores, (copies, 1))
         mass = np.tile(mass, copies) / copies
@@ -494,7 +494,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
 def _projected(scores: Floats, values: Floats, mass: Floats) -> Floats:
     """Return scores, (n, d), as quadratic functions of the normal scores of values, (n, m)."""
     z = ndtri((rankdata(values, axis=0) - 0.5) / len(values))
-    # Eight components of many outputs, such as those of a curve.
+    # Keep eight principal components of many outputs, such as those of a curve.
     _, axes = np.linalg.eigh(z.T @ z)
     z = z @ axes[:, -8:]
     first, second = np.triu_indices(z.shape[1])
@@ -512,7 +512,7 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
     The response contains next to no information along some directions. There both factors of a
     sandwich are rounding errors, and their quotient is arbitrary.
     """
-    if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound
+    if not np.isfinite(bound).all():  # if the support moves, and the likelihood gives no bound
         return information
     d = len(bound)
     root = np.linalg.cholesky(bound + 1e-9 * np.trace(bound) * np.eye(d))

@@ -40,7 +40,8 @@ class Element:
     name: str
     unit: str
     groups: Groups | None
-    # By quantity, (groups, k), or (1, k). Of an optimum the first population is the optimum's.
+    # numbers by quantity, (groups, k), or (1, k) without groups. The first population of an optimum
+    # is its own.
     numbers: dict[str, Floats]
     findings: tuple[Finding, ...] = ()
 
@@ -113,7 +114,7 @@ class PopulationReader:
             places = range(len(inputs.groups.labels))
             by_group = [points | {index: np.full(size, place)} for place in places]
         moments = InputMoments(label, inputs, list(self.levels.values()))
-        arrays = []  # (k, q, elements), by group
+        arrays = []  # (k, q, elements): numbers of each group
         for group_points in by_group:
             arrays.append(moments.numbers([group_points[str(p.name)] for p in inputs.parents]))
         numbers = np.stack(arrays)
@@ -198,5 +199,6 @@ def _by_name(names: Sequence[str], numbers: Floats) -> dict[str, Floats]:
     """Return numbers, (groups, k, q) -> (groups, k), by quantity, and the cv."""
     by_name = dict(zip(names, np.moveaxis(numbers, -1, 0), strict=True))
     mean, sd = by_name.pop("mean"), by_name.pop("sd")
-    size = np.where(np.abs(mean) > 1e-9 * sd, np.abs(mean), np.nan)  # above rounding
+    # if the mean is larger than rounding errors
+    size = np.where(np.abs(mean) > 1e-9 * sd, np.abs(mean), np.nan)
     return {"mean": mean, "sd": sd, "cv": sd / size} | by_name

@@ -25,7 +25,7 @@ from prbayes.results.predict import call_settings, width_of_epsilon
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
-# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17).
+# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17)
 BASES = {"B-basis": 0.10, "A-basis": 0.01}
 
 
@@ -157,7 +157,7 @@ def population(
             "one partition; ask for one input at a time"
         )
     n_groups = max(map(len, groups.values()), default=1)
-    # Estimate, lower and upper
+    # table, (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     tails = tail_levels(prob)
     confidence = 0.95 if upper else 0.05

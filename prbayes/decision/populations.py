@@ -54,7 +54,8 @@ from prbayes.results.predict import (
     serving,
 )
 
-# Populations at which checks and error estimates look: their quantiles are known to a few percent.
+# Number of populations for checks and error estimates, whose quantiles then have an error of a few
+# percent
 N_CHECKED = 400
 
 
@@ -64,11 +65,12 @@ class Populations:
 
     result: Any
     evaluator: Evaluator
-    thetas: Floats  # (k, d): draws of the posterior, or quantiles of an optimum's distribution
-    center: Floats  # (d,): the median, or the optimum
-    caller: str  # for messages
+    # (k, d): draws of the posterior, or Sobol points of an optimum's sampling distribution
+    thetas: Floats
+    center: Floats  # (d,): median of the draws, or the optimum
+    caller: str  # name of the caller, for messages
     are_draws: bool  # whether thetas are random draws, and not Sobol points
-    # Executor, store and version of responses that are not the model's own.
+    # settings of responses that are not the model's own: executor, store and version
     calling: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -173,12 +175,12 @@ class ResponseSample:
     """A response at the points of a design, whose weights represent each population."""
 
     populations: Populations
-    k: int  # the simulator with the design
+    k: int  # index of the simulator with the design
     design: ReweightedBound | EmulatedSample
     responses: Responses
-    outputs: Floats  # (n,) or (n, m): at the design's points
-    column: int | None  # of the output; None for a response with one number
-    emulator: EmulatedResponse | None = None  # of the response, where it is not stored
+    outputs: Floats  # (n,) or (n, m): outputs at the design's points
+    column: int | None  # column of the output; None for a response with one number
+    emulator: EmulatedResponse | None = None  # emulator of the response, where it is not stored
 
     def select(self, outputs: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""
@@ -323,14 +325,14 @@ class ResponseSample:
                 "responses; ask for a Quantile or an Exceedance"
             )
         (value,) = self.evaluate(quantity.of, center)
-        # With the responses that are equal to a quantile, such as the largest.
+        # Count responses that are equal to a quantile as beyond it, such as the largest one.
         at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
         if not np.isin(is_beyond, (0.0, 1.0)).all():
             return _beyond_runs(self, quantity), self._jackknife_error(quantity)
         share = float(self.mean_weights() @ is_beyond)
         is_upper = share <= 0.5
-        if not is_upper:  # the rarer side decides how well the quantity is known
+        if not is_upper:  # because the rarer side decides how well the quantity is known
             at, side = np.nextafter(value, np.inf), "on its other side"
             share = float(self.mean_weights() @ (1 - quantity.of_specimen(self.values, at)))
         error = float(self.share_error(lambda values: quantity.of_specimen(values, at)))
@@ -353,7 +355,7 @@ class ResponseSample:
         (weights,) = self.weights(center)
         is_beyond = quantity.of_specimen(self.values, at)
         on_line = self.design.has_runs and self.design.design.on_line
-        if not on_line:  # the jackknife of few points in a tail is itself rough
+        if not on_line:  # because the jackknife of few points in a tail is itself rough
             rare = weights * (is_beyond if is_upper else 1 - is_beyond)
             error = max(error, float(np.linalg.norm(rare)))
         tails = probability_bounds(share, error, float(ndtr(-1)))
@@ -400,7 +402,7 @@ def _range_effect(sample: ResponseSample, quantity: Quantity, thetas: Floats) ->
     """Return by how much a steeper response beyond the runs changes a quantity, (k,)."""
     mass = sample.masses(thetas)
     constant, *_, steeper = sample.emulated(sample.points)
-    with np.errstate(invalid="ignore"):  # both may be infinite
+    with np.errstate(invalid="ignore"):  # because both may be infinite
         return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
 
 
@@ -421,7 +423,7 @@ def standard_deviation(by_draw: Floats) -> float:
 
 def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:
     """Return quantiles of draws, (n,), of which some may be infinite."""
-    # The mean of two infinite neighbours is NaN.
+    # Do not interpolate between infinite neighbours, whose mean is NaN.
     method: Any = "inverted_cdf" if np.isinf(by_draw).any() else "linear"
     return np.quantile(by_draw, levels, method=method)
 
@@ -438,7 +440,7 @@ def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         n_events = np.where(has_events, (rare / error) ** 2, 0.0)
         by_event = np.where(has_events, error**2 / rare, error)
-    # For so many both are the normal ones to a thousandth of an error.
+    # With so many events the bounds are the normal ones to a thousandth of an error.
     is_normal = n_events > 1e6
     n_events = np.where(is_normal, 1.0, n_events)
     low = np.where(has_events, by_event * gammaincinv(np.maximum(n_events, 1e-9), tail), 0.0)
@@ -460,9 +462,10 @@ class CentralSpecimens:
         n_runs: int,
     ) -> None:
         self.populations, self.response, self.output = populations, response, output
-        # 64 calls at them cost about as much as four times the runs.
+        # The search calls the response 64 times at these specimens, which costs about four times
+        # the runs.
         self.size = min(max(n_runs // 16, 4), 32)
-        self.count = 0  # responses computed
+        self.count = 0  # number of responses computed
         self.inputs: tuple[list[Floats], list[Floats]] | None = None
 
     def __call__(self, inputs: Sequence[Any]) -> Floats:
@@ -493,10 +496,10 @@ class InverseTransform:
 
     def __init__(self, name: str, inputs: Inputs, parents: Sequence[Floats]) -> None:
         self.inputs = inputs
-        self.parents = parents  # shapes (1, *shape)
+        self.parents = parents  # parents of the population, shapes (1, *shape)
         sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
         ends = np.cumsum([0, *sizes]).tolist()
-        self.columns = [slice(a, b) for a, b in pairwise(ends)]  # of z, by input
+        self.columns = [slice(a, b) for a, b in pairwise(ends)]  # columns of z, by input
         self.size = ends[-1]
         symbols = inputs.placeholders()
         uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]

@@ -126,7 +126,7 @@ class StandardDeviation(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the standard deviations."""
-        # Relative to a central value, against cancellation.
+        # Subtract a central value, against cancellation.
         deviation = values - values[values.size // 2]
         variance = weights @ deviation**2 - (weights @ deviation) ** 2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -229,7 +229,7 @@ class Exceedance(Quantity):
         """Return the probabilities."""
         is_beyond = self.of_specimen(values, np.nan)
         beyond, rest = weights @ is_beyond, weights @ (1 - is_beyond)
-        # Sums of weights are one up to rounding.
+        # Divide by the sum of the weights, which is one up to rounding.
         return beyond / (beyond + rest)
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
@@ -343,7 +343,7 @@ def _kernel_width(values: Floats) -> float:
     if spread == 0:
         spread = np.ma.filled(finite.std(), 0.0)
     width = 0.9 * float(spread) * values.shape[1] ** -0.2
-    return width or 1.0  # of equal responses
+    return width or 1.0  # one if all responses are equal
 
 
 def _log_tail(distances: Floats) -> float:

@@ -33,7 +33,8 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 from prbayes.results.predict import call_settings
 
-# Independently scrambled point sets: the standard error between them is itself known to 18%.
+# Number of independently scrambled point sets. The standard error between them has an error of 18
+# %.
 REPLICATES = 16
 # Step of differences in standard normal numbers. Half or twice changes an index by less than a
 # hundredth (tests/decision/test_sensitivity.py).
@@ -157,7 +158,7 @@ def sensitivity(
     n_points = positive_integer(n_points, "n_points", minimum=2 * REPLICATES)
     flag(computed, "computed")
     seed = seed_number(random_seed)
-    # 4000 draws: margins and correlations are then known to two percent.
+    # With 4000 draws margins and correlations have an error of two percent.
     populations = Populations.of(
         result, model, 4000, caller, call_settings(executor, store, version)
     )
@@ -238,8 +239,8 @@ class SensitivityTable(Table):
 class Indices:
     """First-order, total-order and derivative-based indices of d factors."""
 
-    values: Floats  # (3, d)
-    errors: Floats  # (3, d): standard errors
+    values: Floats  # (3, d): indices
+    errors: Floats  # (3, d): standard errors of the indices
 
     @classmethod
     def of_replicates(cls, indices: Floats) -> Indices:
@@ -271,7 +272,7 @@ def _hyperparameter_indices(
 
     values = evaluate(z)
     infinite = 1 - np.isfinite(values).mean()
-    if infinite > 0.01:  # shares are not known to a hundredth anyway
+    if infinite > 0.01:  # because shares have an error of a hundredth anyway
         raise ValueError(
             f"prb.sensitivity: {quantity!r}: got no finite number in {infinite:.1%} of the "
             "populations, expected one in all but 1%; where specimens fail, ask for a smaller "
@@ -310,7 +311,8 @@ def input_indices(
     except TypeError as error:
         return unknown, str(error)
     d = transform.size
-    # Four times as many as hyperparameters: an emulator is cheaper than weights of a design.
+    # Inputs get four times as many points as hyperparameters, because an emulator is cheaper than
+    # weights of a design.
     first, second = _paired_points(4 * n_points // REPLICATES, d, seed)
     same_input, same_rest, neighbours = [], [], []
     for columns in transform.columns:
@@ -385,7 +387,8 @@ def _responses_at(
     x = transform(z)
     if not (sample.design.has_runs and sample.design.design.on_line):
         return sample.emulated(x)
-    # One input: linear between the runs, and not finite where the nearest run is not.
+    # With one input interpolate between the runs, and return the response of the nearest run where
+    # that is not finite.
     (runs,) = sample.points
     values = sample.select(sample.outputs)
     order = np.argsort(runs)
@@ -461,7 +464,7 @@ def _ratio(part: Floats, variance: Floats) -> Floats:
 
 
 # Normal scores of the quantiles between which a margin is linear. Variances of a normal margin are
-# then right to half a percent; closer quantiles follow the noise of 4000 draws.
+# then accurate to half a percent. Closer quantiles would follow the noise of 4000 draws.
 _SCORES = np.linspace(-2.75, 2.75, 23)
 
 
@@ -469,8 +472,8 @@ _SCORES = np.linspace(-2.75, 2.75, 23)
 class Copula:
     """Theta as a monotone function of each element of a normal vector z."""
 
-    quantiles: Floats  # (q, d): of each element, at `_SCORES`; extrapolated linearly
-    correlation: Floats  # (d, d): of z
+    quantiles: Floats  # (q, d): quantiles of each element at `_SCORES`, extrapolated linearly
+    correlation: Floats  # (d, d): correlation of z
 
     @classmethod
     def of(cls, thetas: Floats) -> Copula:

@@ -24,8 +24,8 @@ from prbayes.propagation.base import N_BLOCKS
 class DesignErrors:
     """Distance between the optima of two independent designs, in standard errors."""
 
-    points: float  # by their points; NaN if not known
-    emulators: float  # by the error of emulators; NaN without emulators
+    points: float  # distance because of the points; NaN if not known
+    emulators: float  # distance because of the emulators' error; NaN without emulators
 
     @property
     def whole(self) -> float:
@@ -40,8 +40,8 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
     if is_stored(sampling.evaluator):
         nodes, designs = sampling.evaluator.nodes, sampling.evaluator.reweighted
         on_line = {name for name, bound in designs.items() if bound.design.on_line}
-        # Two designs differ by the root of two of one's error. Points on a line, which cut it into
-        # parts of equal mass, count as exact.
+        # The difference of two designs has the error of one times the root of two. Points on a line
+        # cut it into parts of equal mass, and count as exact.
         if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
         if [bound for bound in designs.values() if bound.design.is_emulated]:
@@ -95,8 +95,9 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
     if all(bound.design.is_emulated for bound in evaluator.reweighted.values()):
-        # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
-        # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
+        # This is the rate of points that fill d dimensions evenly, for functions with a jump along
+        # a surface. The rate of smooth functions is up to 1/2 + 1/d (He and Owen 2016,
+        # doi:10.1111/rssb.12132).
         rate += 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
     return np.asarray(x[is_usable].std(axis=0, ddof=1) / N_BLOCKS**rate)
 

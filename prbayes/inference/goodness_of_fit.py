@@ -23,7 +23,7 @@ from prbayes.metrics.multivariate import failure_caps
 from prbayes.model.data_checks import resolution
 from prbayes.model.evaluator import Evaluator
 
-# p-value below which the data do not come from the family, by convention.
+# p-value below which the family of the population is rejected, by convention
 UNLIKELY = 0.01
 
 
@@ -32,11 +32,11 @@ class FittedSets:
     """Synthetic data sets with their minimisers, and the minimiser of the observed data."""
 
     sampling: SamplingDistribution
-    center: Floats  # (r,): of the observed data, in coordinates
+    center: Floats  # (r,): minimiser of the observed data, in coordinates
     sets: DataSets
-    x: Floats  # (n_sets, r): of the data sets
-    converged: Bools  # (n_sets,)
-    observed: DataSets  # the observed data, or these without rounding
+    x: Floats  # (n_sets, r): minimisers of the data sets
+    converged: Bools  # (n_sets,): whether these minimisations converged
+    observed: DataSets  # observed data, perhaps with ties spread out
 
     @classmethod
     def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets | None:
@@ -69,7 +69,7 @@ class FittedSets:
             return None
         observed = replace(self.observed, values=values)
         center = self.center
-        if self.x.any():  # data sets are refitted
+        if self.x.any():  # the data sets were refitted, not taken at theta
             (center,), _ = refit(self.sampling, observed)
         return replace(self, observed=observed, center=center)
 
@@ -121,13 +121,14 @@ def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: F
     weights = weights / weights.sum(axis=1, keepdims=True)
     order = np.argsort(values, kind="stable")
     points, weights = values[order], weights[:, order]
-    # In the middles of the steps of both.
+    # Compare both distribution functions in the middles of their steps.
     at_most = distribution_function(simulated, masses, points)
     less = distribution_function(simulated, masses, np.nextafter(points, -np.inf))
     expected = (at_most + less) / 2
     below = np.cumsum(weights, axis=1) - weights / 2
     squares = weights * (below - expected) ** 2
-    # A mass of at least 1e-4 beyond the extremes bounds the weight of single observations there.
+    # Clip the expected values, because single observations in the tails would have unbounded
+    # weight.
     inside = np.clip(expected, 1e-4, 1 - 1e-4)
     in_the_tails = squares / (inside * (1 - inside))
     distances = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
@@ -285,11 +286,11 @@ def output_misfits(fitted: FittedSets) -> list[Finding]:
 class _Outputs:
     """Data sets of one simulator, and a population for each; a failure counts as the cap."""
 
-    values: Floats  # (n, m): of the data sets; NaN if an output was not measured
-    weights: Floats  # (S, n)
-    simulated: Floats  # (N, m): of all populations
-    masses: Floats  # (S, N)
-    columns: list[int]  # of the outputs that are tested
+    values: Floats  # (n, m): values of the data sets; NaN if an output was not measured
+    weights: Floats  # (S, n): weights of these values in each data set
+    simulated: Floats  # (N, m): responses of all populations
+    masses: Floats  # (S, N): weights of the responses in each population
+    columns: list[int]  # columns of the outputs that are tested
 
     @classmethod
     def of(cls, fitted: FittedSets, sets: DataSets, x: Floats, k: int) -> _Outputs:
@@ -305,7 +306,7 @@ class _Outputs:
             sets.weights[k],
             np.minimum(simulated[0][has_response], caps),
             masses / masses.sum(axis=1, keepdims=True),
-            # At most 12, from the first to the last: neighbours on a curve misfit together.
+            # Twelve outputs of a curve suffice, because neighbours misfit together.
             np.linspace(0, m - 1, min(m, 12)).round().astype(int).tolist(),
         )
 
@@ -333,6 +334,6 @@ def _correlation(values: Floats, weights: Floats) -> Floats:
     moments = weights @ np.column_stack([a, b, a * a, b * b, a * b])
     mean_a, mean_b, square_a, square_b, product = moments.T
     variances = (square_a - mean_a**2) * (square_b - mean_b**2)
-    varies = variances > 1e-20  # beyond rounding, in units of the spread
+    varies = variances > 1e-20  # larger than rounding errors in units of the spread
     root = np.sqrt(np.where(varies, variances, 1.0))
     return np.where(varies, (product - mean_a * mean_b) / root, np.nan)

@@ -27,9 +27,9 @@ class Continuation:
     if only beyond a, and theta if beyond none.
     """
 
-    lower: Floats  # (d,): ends a; NaN of elements without them
-    upper: Floats  # (d,): ends b
-    below: Bools  # (d,): whether populations exist there
+    lower: Floats  # (d,): lower ends a; NaN of elements without ends
+    upper: Floats  # (d,): upper ends b; NaN of elements without ends
+    below: Bools  # (d,): whether populations exist below the lower end
     above: Bools
 
     @property
@@ -76,7 +76,7 @@ class Continuation:
 
     def parents(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the parents of the k-th simulator, continued linearly beyond the ends."""
-        margin = 1e-3  # part of the interval whose slope continues the parents
+        margin = 1e-3  # part of the interval from whose slope the parents are extrapolated
         shares = self._shares(coordinates, margin)
         base = evaluator.parents(self._thetas(shares, coordinates), k)
         parents = list(base)
@@ -158,7 +158,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
             middle, half = (upper[i] + lower[i]) / 2, (upper[i] - lower[i]) / 2
             points[:, i] = middle + sign * 1.05 * half
             continued = ContinuedEvaluator.continuing(evaluator, trial)
-            # Populations are possible where they have weights.
+            # A population exists there if its weights are finite and not all zero.
             weights = [continued.populations(points, k)[1] for k in range(len(evaluator.nodes))]
             side[i] = all(np.isfinite(w).all() and bool((w.sum(axis=1) > 0).all()) for w in weights)
     return Continuation(lower, upper, below, above)
@@ -170,7 +170,8 @@ def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floa
     NaN where there is no end, or elements have no values of their own, as those of a simplex.
     """
     d = theta.size
-    # A transform is at its end if a point far out has the value of one much farther out.
+    # A transform has reached its end if a point far out and one much farther out have the same
+    # value.
     spread = np.diag(hyperparameters.prior_sd)
     far = [theta + size * spread for size in (-1e6, -1e3, 1e3, 1e6)]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -25,10 +25,10 @@ from prbayes.response.distributions import PopulationSampler
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
-# ten million weights at most.
+# Number of points of a resimulated population from which data sets are drawn, so that hundreds of
+# data sets have ten million weights at most
 _MAX_POINTS = 1 << 15
-# Data sets for a sampling distribution: standard errors then have an error of 5 %.
+# Number of data sets for a sampling distribution, with which standard errors have an error of 5 %
 SETS = 200
 
 
@@ -36,10 +36,10 @@ SETS = 200
 class DataSets:
     """Data sets for all simulators of a model, as weights on fixed values."""
 
-    # By simulator (n_k,), or (n_k, m) of several outputs: all values that occur. NaN is an output
-    # that was not measured.
+    # All values that occur, by simulator: (n_k,), or (n_k, m) of several outputs. NaN marks an
+    # output that was not measured.
     values: list[Floats]
-    # By simulator (n_sets, n_k): the weight of each value in each data set; they sum to one.
+    # Weights of the values in each data set, by simulator: (n_sets, n_k), with sum one
     weights: list[Floats]
 
 
@@ -225,7 +225,7 @@ def sets_along(
             for i, mass in enumerate(weights * is_observable, start=first):
                 drawn[i] = _points_of(mass, uniform[i])
         points |= dict.fromkeys(group, drawn)
-        # How often each stored response is a specimen of each data set.
+        # Count how often each stored response is a specimen of each data set.
         places = drawn[:, np.unique(np.concatenate([numbers[k] for k in group]))]
         n_sets, n = places.shape
         ends = n * np.arange(n_sets + 1)
@@ -255,7 +255,8 @@ def simulated_points(
     responses = [values[0] for values, _ in populations]
     points: dict[int, Indices] = {}
     for group in _aligned_groups(nodes):
-        # Simulators that share specimens have the same points, with the same weights.
+        # Draw once for the group, because simulators that share specimens have the same points and
+        # weights.
         mass = populations[group[0]][1][0] * _observable_by_all(evaluator, responses, group)
         drawn = np.empty((n_sets, size), dtype=np.intp)
         for rows in _blocks(n_sets, size):
@@ -273,9 +274,9 @@ def _observable_by_all(evaluator: Evaluator, responses: list[Floats], group: lis
 def _points_of(mass: Floats, uniform: Floats) -> Indices:
     """Return points of a population at levels of its cumulated weights, (n,), (...) -> (...)."""
     below = np.cumsum(mass / mass.sum())
-    # On the right of equal sums, so that no point without weight is drawn.
+    # Search on the right of equal sums, so that no point without weight is drawn.
     points = np.searchsorted(below / below[-1], uniform, side="right")
-    return np.minimum(points, mass.size - 1)  # a product may be rounded up to the whole
+    return np.minimum(points, mass.size - 1)  # because a level may be rounded up to one
 
 
 def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indices]) -> DataSets:
@@ -284,20 +285,22 @@ def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indice
     values, weights = [], []
     for k, (node, responses) in enumerate(zip(evaluator.nodes, populations, strict=True)):
         is_observable = observable(responses, node.target)
-        # The index of each point among those that can be observed.
+        # Number the points that can be observed.
         index = np.cumsum(is_observable) - 1
         cells = index[points[k][:, numbers[k]]]
         occurring = responses[is_observable]
         observed = node.target.observed
         if observed.ndim > 1:
-            # Each specimen has the outputs of the observed one in its place, NaN for the rest.
+            # A synthetic specimen has the outputs that were measured of the observed one in its
+            # place, and NaN for the rest.
             patterns, row = np.unique(~np.isnan(observed), axis=0, return_inverse=True)
             if len(patterns) > 1:
                 size = len(occurring)
                 pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
                 cells = places.reshape(cells.shape)
                 occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
-        # The observations' weights, added up by value; the data sets of a block in one row.
+        # Add up the observations' weights by value. One call of bincount serves all data sets of a
+        # block.
         size = len(occurring)
         summed = np.empty((len(cells), size))
         for rows in _blocks(len(cells), cells.shape[1]):
@@ -349,10 +352,11 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
         for k, node in zip(group, members, strict=True):
             sampler = PopulationSampler(node.bound.inputs)
             parents = evaluator.parents(theta[None], k)
-            # Four for each specimen; the same for all simulators of the group.
+            # Draw four candidates for each specimen. The copied generator gives all simulators of
+            # the group the same candidates.
             aleatory, epistemic = sampler(parents, 4 * total, copy.deepcopy(generator))
             columns.append(np.asarray(node.bound.responses(aleatory, epistemic)[0]))
-        # A specimen that one simulator cannot measure is measured by none.
+        # Leave out specimens that any simulator of the group cannot measure.
         targets = [node.target for node in members]
         is_observable = np.all(list(map(observable, columns, targets)), axis=0)
         for k, node, column in zip(group, members, columns, strict=True):

@@ -53,7 +53,7 @@ def stencil(r: int) -> Floats:
 def hessian_of(values: Floats, r: int) -> Floats:
     """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
     center, up, down, corners = np.split(values, [1, 1 + r, 1 + 2 * r])
-    # Values that are not finite give NaN, which callers judge.
+    # Values that are not finite give NaN, which callers handle.
     with np.errstate(invalid="ignore"):
         hessian = np.diag(up - 2 * center + down)
         pp, pm, mp, mm = corners.reshape(-1, 4).T

@@ -32,9 +32,9 @@ def student_vectors(u: Floats, degrees: float) -> Floats:
 class StudentMixture:
     """A mixture of multivariate t distributions."""
 
-    centers: Floats  # (M, d)
+    centers: Floats  # (M, d): centers
     roots: Floats  # (M, d, d): lower Cholesky factors of the scale matrices
-    shares: Floats  # (M,)
+    shares: Floats  # (M,): mixing weights
     degrees: float
 
     @classmethod
@@ -52,7 +52,7 @@ class StudentMixture:
         covariance = (deviations * weights[:, None]).T @ deviations
         ridge = 1e-9 * np.diag(np.diag(covariance))
         root = np.linalg.cholesky(covariance + ridge)
-        # The first centers are far from each other (k-means++).
+        # Begin with centers that are far from each other (k-means++).
         standard = np.linalg.solve(root, deviations.T)
         squares = (standard**2).sum(axis=0)
         first: list[int] = []
@@ -69,12 +69,14 @@ class StudentMixture:
             masses = (np.exp(logs) * weights[:, None]).T
             shares = masses.sum(axis=1, keepdims=True)
             rows = masses / np.maximum(shares, 1e-300)
-            # The expected precision of a t distribution's normal variable, given the point.
+            # A t distribution is a normal one with random precision: weigh by its expected value
+            # given the point.
             precise = rows * (degrees + d) / (degrees + mixture.squares(points))
             centers = precise @ points / precise.sum(axis=1, keepdims=True)
             deviations = points - centers[:, None]
             within = (deviations * precise[..., None]).swapaxes(1, 2) @ deviations
-            # With few effective points: the covariance of all, scaled to an m-th of the volume.
+            # Shrink the covariance towards that of all points over m if the effective sample size
+            # is small.
             effective = effective_sample_size(rows)
             trust = (effective / (effective + 2 * d))[:, None, None]
             roots = np.linalg.cholesky(trust * within + (1 - trust) * covariance / m + ridge)

@@ -11,7 +11,8 @@ from prbayes._validate import Floats
 from prbayes.numerics.derivatives import central_derivatives
 from prbayes.numerics.points import farthest_rows
 
-LogDensity = Callable[[Floats], Floats]  # (S, d) -> (S,)
+# function of points, (S, d), that returns log-densities, (S,)
+LogDensity = Callable[[Floats], Floats]
 
 
 def far_apart(candidates: Floats, count: int, unit: Floats) -> Floats:
@@ -41,7 +42,7 @@ def laplace(
     for _ in range(steps):
         value, gradient, hessian = central_derivatives(log_density, modes, 0.05 * sd)
         values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-        # Absolute values: a step away from a saddle, and Newton's at a mode.
+        # Absolute eigenvalues give a step away from a saddle, and Newton's step at a mode.
         size = np.maximum(np.abs(values), 0.01)
         inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
         covariance = inverse * np.outer(scale, scale)

@@ -20,7 +20,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     Source: Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
     """
-    from scipy.stats import qmc  # takes longer to import than the whole package
+    from scipy.stats import qmc  # imported here, because it takes longer than the whole package
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random(1) if n == 1 else engine.random_base2(int(np.ceil(np.log2(n))))[:n]

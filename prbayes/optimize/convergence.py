@@ -26,15 +26,15 @@ from prbayes.numerics.derivatives import cross, differences
 from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
 
-# Relative gain that no longer counts: far below the noise of any data, which is 1 / N.
+# Relative gain that is negligible: far below the noise of any data, which is 1 / N
 _NEGLIGIBLE_GAIN = 1e-4
-# Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
-# step^2, are both below the tolerance.
+# Step of differences in prior standard deviations. The errors of rounding, 1e-16 / step, and of
+# curvature, step^2, are both below the tolerance.
 _STEP = 1e-4
-# Evaluations, for each parameter, of a simplex that settles a line search.
+# Number of evaluations, for each parameter, of the simplex after a failed line search
 _SIMPLEX_EVALUATIONS = 60
-# Overlap of two densities below which the area metric leads, and up to which it is followed; from
-# far starts half and twice lead to the same optima (benchmarks/landscapes.py).
+# Overlap of two densities below which the area metric is minimised first, and overlap at which that
+# ends. Half and twice these values give the same optima from far starts (benchmarks/landscapes.py).
 OVERLAP = 0.02
 OVERLAP_ENOUGH = 0.5
 
@@ -66,9 +66,9 @@ class Trace:
     """The points that minimisers evaluated."""
 
     thetas: tuple[Floats, ...] = ()  # (d,)
-    values: tuple[float, ...] = ()  # the objective
-    counts: tuple[int, ...] = ()  # evaluations up to each point
-    count: int = 0  # evaluations in all
+    values: tuple[float, ...] = ()  # values of the objective at the points
+    counts: tuple[int, ...] = ()  # numbers of evaluations up to each point
+    count: int = 0  # number of evaluations in all
 
     def extended(self, objective: Objective) -> Trace:
         """Return the trace with the points of one more minimisation."""
@@ -87,14 +87,16 @@ class Fit:
     theta: Floats  # (d,)
     result: Result
     details: str  # sentences with the numbers behind the result
-    trace: Trace  # with the points of earlier minimisations
-    center: Floats  # (d,): the start
-    scales: Floats  # (k,): by which discrepancies are divided
-    lowest: float  # the objective at theta
-    size: float  # its typical size
-    ridge: Ridge | None = None  # on directions that designs do not identify
-    sampling: SamplingDistribution | None = None  # None where it is not known
-    design_error: float = np.nan  # in standard errors; NaN where it is not known
+    trace: Trace  # points of this minimisation and earlier ones
+    center: Floats  # (d,): start of the minimisation
+    scales: Floats  # (k,): divisors of the discrepancies
+    lowest: float  # value of the objective at theta
+    size: float  # typical size of the objective
+    ridge: Ridge | None = None  # penalty on directions that designs do not identify
+    # sampling distribution; None where it is not known
+    sampling: SamplingDistribution | None = None
+    # error of the optimum by the design, in standard errors; NaN where it is not known
+    design_error: float = np.nan
     pilot: Floats | None = None  # (m, d): thetas around which designs grow
 
     @property
@@ -114,7 +116,8 @@ class Search:
     settings: Minimisation
     ridge: Ridge | None = None  # penalty that is added to the objective
     uses_gradient: bool = field(init=False)  # whether the method receives gradients
-    has_kinks: bool = field(init=False)  # gradients jump: line searches end in ever smaller steps
+    # whether gradients jump, so that line searches end in ever smaller steps
+    has_kinks: bool = field(init=False)
 
     def __post_init__(self) -> None:
         nodes = self.evaluator.nodes
@@ -153,7 +156,7 @@ class Search:
 
         def values(thetas: Floats) -> Floats:
             if not self.settings.prior:
-                return self.evaluator.total(thetas, scales)  # needs no compilation
+                return self.evaluator.total(thetas, scales)  # which needs no compilation
             single = self.evaluator.objective(prior=True, gradient=False)
             return np.array([float(single(theta, scales)[0]) for theta in thetas])
 
@@ -162,7 +165,8 @@ class Search:
                 return values(theta[None])[0], None, 1
             if exact is not None:
                 value, slope = exact(theta, scales)
-                # PyMC's gradient of a truncated normal is NaN at points that are cut off.
+                # Differences replace PyMC's gradient of a truncated normal, which is NaN at points
+                # that are cut off.
                 if np.isfinite(slope).all() or not np.isfinite(value):
                     return value, slope, 1
             return differences(values, _STEP * self.prior_sd)(theta)
@@ -190,7 +194,7 @@ def minimise(
     objective = search.objective(theta, scales, size, trace.count, gradient=gradient)
     method = search.settings.method
     if str(method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
-        # Successful line searches take fewer evaluations without progress.
+        # Line searches that succeed make progress within fewer evaluations.
         objective.patience = 15
         if search.has_kinks and not patient:
             objective.patience = 4
@@ -220,7 +224,7 @@ def _run_scipy(
     search: Search, objective: Objective, start: Floats, **settings: Any
 ) -> tuple[Result, str]:
     """Run a minimiser of scipy; return the result and its details."""
-    # Takes longer to import than the whole package.
+    # Import here, because SciPy's minimisers take longer to import than the whole package.
     from scipy.optimize import minimize as scipy_minimize
 
     try:
@@ -262,12 +266,12 @@ def settle(search: Search, fit: Fit) -> Fit:
             return fit
     objective = search.objective(fit.center, fit.scales, fit.size, fit.trace.count, gradient=False)
     start = (fit.theta - fit.center) / search.prior_sd
-    # In spreads of the prior; wide enough to step over a jump.
+    # Edges are in prior standard deviations; at a jump they are wide enough to step over it.
     edge = 0.5 if is_jumping else 0.01
     options = {
         "initial_simplex": np.vstack([start, start + edge * np.eye(start.size)]),
         "maxfev": _SIMPLEX_EVALUATIONS * start.size,
-        "xatol": 1e-4,  # coarse, as the gain decides
+        "xatol": 1e-4,  # coarse, because the gain decides
         "fatol": 1e-7,
     }
     result, _ = _run_scipy(search, objective, start, method="Nelder-Mead", options=options)
@@ -306,11 +310,12 @@ def _follow_gradients(search: Search, fit: Fit) -> Fit:
     """
     spent = fit.trace.count
     objective = search.objective(fit.center, fit.scales, fit.size, spent, gradient=True)
-    # Gradients by differences may take as many evaluations as a simplex.
+    # Limit the evaluations, because gradients by differences may take as many as a simplex.
     limit = _SIMPLEX_EVALUATIONS * fit.theta.size
     objective.max_evaluations = min(objective.max_evaluations, limit)
     best, lowest, result, details = fit.theta, fit.lowest, fit.result, ""
-    apart = 0.0025  # in spreads of the prior: wider than kinks of a thousand points
+    # distance in prior standard deviations, wider than the kinks of a thousand points
+    apart = 0.0025
     try:
         for _ in range(5):
             start = (best - fit.center) / search.prior_sd
@@ -371,7 +376,8 @@ def _newton_step(objective: Objective, t: Floats, apart: float) -> tuple[Floats,
         full = np.where(curvatures > 0, -slope / curvatures, np.where(slope > 0, -np.inf, np.inf))
     full[(curvatures == 0) & (slope == 0)] = 0.0
     shift = np.clip(full, -reach, reach)
-    if not (np.abs(full) <= reach).all():  # as on a saddle
+    # the minimum is far away, or there is none, as on a saddle
+    if not (np.abs(full) <= reach).all():
         return axes @ shift, np.inf, downhill
     gain = -(slope @ shift) - 0.5 * curvatures @ shift**2
     return axes @ shift, float(gain), downhill
@@ -396,7 +402,7 @@ def approach(
     evaluator = search.evaluator
     if [node for node in evaluator.nodes if node.bound.random]:
         return theta, trace
-    # A weight effective sample size below two: the design does not reach the population at all.
+    # With a weight effective sample size below two the design does not reach the population at all.
     ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]
     if not [n for n in ess if n < 2.0]:
         _, overlaps = overlapping_populations(evaluator, theta[None])
@@ -427,10 +433,10 @@ def approach(
         np.zeros_like(theta),
         jac=True,
         method="BFGS",
-        options={"gtol": 1e-2},  # coarse: the area metric is left before it converges
+        options={"gtol": 1e-2},  # coarse, because the area metric is left before it converges
         callback=stop_with_overlap,
     )
-    # The trace has values of the model's own objective.
+    # Record the values of the model's own objective in the trace, not the areas.
     objective.values = [guide.records[t.tobytes()][1] for t in objective.thetas]
     return objective.best, trace.extended(objective)
 
@@ -445,7 +451,7 @@ class AreaGuide:
             n.metric.like(AreaMetric()).against(n.target.observed, n.target.weights)
             for n in evaluator.nodes
         ]
-        # By theta: the smallest overlap, and the model's own objective.
+        # smallest overlap of a simulator, and the model's own objective, by theta
         self.records: dict[bytes, tuple[float, float]] = {}
 
     def __call__(self, thetas: Floats) -> Floats:

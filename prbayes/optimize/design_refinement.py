@@ -34,16 +34,16 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches of runs after which a design is refused.
+# Number of batches of runs after which a design is refused
 MAX_ROUNDS = 8
-# Share of it for points and for emulators: together they then have it all.
+# Share of the allowed error for points, and for emulators: both together are the whole
 _SHARE = np.sqrt(0.5)
-# Largest difference between optima of independent designs, in standard errors: a tenth adds half a
+# Largest difference between optima of independent designs, in standard errors. A tenth adds half a
 # percent to the width of an interval.
 AGREE = 0.1
-# Error of an emulator, in the response's spread, that makes it another response.
+# Error of an emulator, in standard deviations of the response, above which more runs are made
 _POOR_EMULATOR = 0.25
-# Data sets for noise floors that only end a pilot or compare optima.
+# Number of data sets for noise floors that only end a pilot or compare optima
 FEW_SETS = 50
 
 
@@ -71,7 +71,8 @@ def refine_designs(
     nearby = neighbourhood(evaluator, fit, search.settings.random_seed)
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
-        # A minimiser follows what is not identified until no design supports it.
+        # Name directions that are not identified, because a minimiser follows them beyond any
+        # design.
         names = []
         if fit.sampling is not None:
             names = unidentified_names(evaluator, fit.sampling.local)
@@ -116,7 +117,7 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
     elif fit.pilot is None or (is_emulated and local is not None):
-        # As wide as the prior along elements whose variance is not known.
+        # Take the prior's variance for elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
         relative = np.where(is_finite, covariance / np.outer(prior_sd, prior_sd), 0.0)
@@ -160,7 +161,8 @@ def _ridge(search: Search, fit: Fit, pilot_thetas: Floats) -> Ridge | None:
         return None
     center = fit.theta
     if fit.ridge is None or shortcomings(evaluator, center[None]):
-        # Of thetas that fit as well as the best, the one closest to the prior's median.
+        # Center the penalty at the theta closest to the prior's median, of those that fit as well
+        # as the best.
         values = evaluator.total(pilot_thetas, fit.scales)
         is_as_good = values <= values.min() + noise(pilot_thetas[np.argmin(values)])
         candidates = pilot_thetas[is_as_good]
@@ -208,7 +210,7 @@ def refine_at(
     while is_drawn and names:
         names &= set(shortcomings(evaluator, thetas))
         is_drawn = draw_samples(evaluator, nearby, names, larger=True, same_surfaces=True)
-    # Runs, where samples do not suffice or the emulator is poor.
+    # Add runs where larger samples do not suffice or the emulator is poor.
     for name in short:
         emulator = evaluator.reweighted[name].design.emulator
         if emulator is not None and emulator.error > _POOR_EMULATOR:
@@ -231,8 +233,9 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     names = set(evaluator.reweighted)
     is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if not is_emulated or errors.emulators > _SHARE * AGREE:
-        # The error of a design of several inputs is taken to fall with the power .65 of its size.
-        # At most twice as many runs at a time: the estimate of the error is itself uncertain.
+        # Assume that the error of a design of several inputs falls with the power .65 of its size.
+        # Add at most as many runs as there are, because the estimate of the error is itself
+        # uncertain.
         factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))
         if _add_runs(evaluator, thetas, names, factor):
             return True
@@ -284,14 +287,14 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     rng = np.random.default_rng(seed)
     thetas = evaluator.hyperparameters.prior_thetas(4 * THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
-        # Keep the best.
+        # Keep the best quarter of the thetas.
         evaluation = evaluator(thetas)
         values = (evaluation.discrepancies / scales).sum(axis=-1) - evaluation.log_other
         values = np.where(np.isfinite(evaluation.log_prior), values, np.inf)
         order = np.argsort(values)[:THETAS]
         is_apart = stored_overlap(evaluator, thetas[order[0]]) < OVERLAP
         if is_apart:
-            # Discrepancies are equal, up to rounding.
+            # Rank by the area, because without overlap discrepancies are equal up to rounding.
             order = np.argsort(AreaGuide(evaluator, scales)(thetas))[:THETAS]
         best = thetas[order]
         # Extend the designs that support fewer than half of these populations. Emulated samples
@@ -379,7 +382,7 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
 
 def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     """Report a large error of the optimum by the design, in standard errors."""
-    # An estimate from eight blocks is itself uncertain by a quarter.
+    # Allow for the uncertainty of the estimate from eight blocks, which is a quarter.
     if not error > 1.5 * AGREE:
         return []
     designs = [bound.design for bound in evaluator.reweighted.values()]

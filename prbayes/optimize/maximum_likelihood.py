@@ -67,10 +67,11 @@ class Mode:
     theta: Floats  # (d,)
     value: float
     # (d, d): inverse Hessian; infinite along directions without curvature, NaN at the edge of a
-    # support.
+    # support
     covariance: Floats
     converged: bool
-    steps: slice = slice(0)  # of the objective's trace, without those of the Hessian
+    # part of the objective's trace, without the evaluations for the Hessian
+    steps: slice = slice(0)
 
 
 def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
@@ -89,7 +90,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         if objective.count > settings.max_evaluations:
             break
     preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
-    # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
+    # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
     errors = [
         max(preparation.points.difference, likelihood.options.half_difference)
         for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
@@ -106,7 +107,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
-    n_known = len(modes) if is_supported.any() else 1  # the others are spurious
+    n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious
     if not is_supported.any():
         findings += report(_UNSUPPORTED)
     findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
@@ -212,7 +213,8 @@ class _Objective:
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Return value and gradient at theta; +inf outside the support."""
-        with np.errstate(over="ignore", invalid="ignore"):  # +inf far from the data
+        # because the value is +inf far from the data
+        with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self.function(theta, np.empty(0))
         value = float(value) if np.isfinite(value) else np.inf
         self.thetas.append(theta.copy())
@@ -240,7 +242,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     order = order[np.isfinite(values[order])]
     if not order.size:
         return [hyperparameters.initial], n_screened
-    # The best one, and points of the better quarter that are far from each other.
+    # Start at the best point, and at points of the better quarter that are far from each other.
     n_starts = 8 if settings.starts is None else max(1, settings.starts)
     candidates = thetas[order[: max(n_starts, order.size // 4)]]
     return list(far_apart(candidates, n_starts, hyperparameters.prior_sd)), n_screened
@@ -267,7 +269,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
     theta = result.x * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
-        # The optimum of a moving support is at a jump: continue without gradients.
+        # With a moving support the optimum is at a jump: continue without gradients.
         simplex = scipy_minimize(
             lambda u: objective(u * unit)[0],
             theta / unit,
@@ -294,11 +296,12 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     values, vectors = np.linalg.eigh(hessian * np.outer(unit, unit))
     if values.min() < -1e-3 * max(values.max(), 1.0):
         return unknown, np.inf
-    # A curvature below a twenty-fifth of the prior's identifies nothing.
+    # Directions with less than a twenty-fifth of the prior's curvature are not identified.
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
-    # In units of the prior along flat directions: with a slope there it is no optimum.
+    # Measure the slope along flat directions in units of the prior, because a point with a slope
+    # there is no optimum.
     _, gradient = objective(theta)
     along = vectors.T @ (gradient * unit)
     slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
@@ -358,7 +361,7 @@ def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats
         curvature = unit @ hessian @ unit
         if curvature > 1.0 / 25:
             rises = _values_beside(objective, theta, unit / np.sqrt(curvature)) - value
-            if not rises.mean() < 0.25:  # half of what curvature gives
+            if not rises.mean() < 0.25:  # half of the rise that the curvature predicts
                 continue
         for width in 2.0 ** np.arange(-12, 1):
             rises = _values_beside(objective, theta, width * unit) - value
@@ -415,11 +418,12 @@ def share_mode(
         value, gradient = objective((at + across @ u) * unit)
         return value, across.T @ (gradient * unit)
 
-    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):  # a barrier is likely in the middle
+    # begins in the middle, where a barrier is likely
+    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):
         at, offset = start + share * step, np.zeros(across.shape[1])
         value, _ = profile(offset, at)
         if value > height and offset.size:
-            # Off the line, on which a symmetric objective has no slope.
+            # Start off the line, on which a symmetric objective has no slope.
             value = scipy_minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
         if value > height:
             return False
@@ -433,7 +437,7 @@ def _findings(
     best = modes[0]
     refuse_lost_specimens(evaluator, best.theta)
     is_flat = np.isinf(np.diag(best.covariance))
-    # Three nats: a likelihood ratio of twenty.
+    # A rise of three nats is a likelihood ratio of twenty.
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = [*failing_region_findings(evaluator, best.theta)]
     findings += replaced_findings(evaluator, best.theta)
@@ -510,11 +514,11 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
         variance = best.covariance[i, i]
         if not 0 < variance < np.inf:
             continue
-        # Other elements follow as they would under a normal likelihood.
+        # Move the other elements to their conditional optima under a normal likelihood.
         step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
         value = value_at(best.theta, i)
         near = value_at(best.theta + 0.01 * step, i)
-        unit = max(abs(near - value) / 0.01, 1e-300)  # a transform may saturate
+        unit = max(abs(near - value) / 0.01, 1e-300)  # bounded, because a transform may saturate
         for shift in (-4.0, 4.0):
             theta = best.theta + shift * step
             distance = np.fmin(abs(value_at(theta, i) - value) / unit, 4.0)
@@ -750,7 +754,7 @@ class SpecimenRefits:
                     np.add.at(count, specimens, 1)
             factors /= count
             stated = likelihood.measurements[0].weights
-            if stated is not None:  # which are in the likelihood, and in the weights
+            if stated is not None:  # the likelihood contains stated weights, and so do the factors
                 factors = factors / np.where(stated > 0, stated, 1.0)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]

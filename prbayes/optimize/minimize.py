@@ -297,10 +297,12 @@ class _Problem:
     """What is minimised, and the fits so far."""
 
     search: Search
-    advance: Callable[[int, str], None]  # of the progress bar: number of runs, and a note
-    n_previous: int  # responses computed before, without those of designs
-    record: SearchRecord  # of the start
-    fits: list[Fit] = field(default_factory=list)  # of each step; a spent budget reports the last
+    # update of the progress bar by a number of runs, with a note
+    advance: Callable[[int, str], None]
+    n_previous: int  # number of responses computed before, without those of designs
+    record: SearchRecord  # record of the start of the search
+    # fits of all steps; if a budget is spent the last one is reported
+    fits: list[Fit] = field(default_factory=list)
 
 
 def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
@@ -377,7 +379,7 @@ def _optimise(
                 fit = _fit(problem, restart.alternative, fit.scales, fit.trace, pilot, ridge)
     problem.fits.append(fit)
     if fit.ridge is not None and fit.sampling is not None:
-        # Without the ridge along directions that grown designs have come to identify.
+        # Minimise without the ridge along directions that the grown designs identify.
         directions = fit.sampling.local.unidentified
         if directions.shape[1] < fit.ridge.directions.shape[1]:
             rest = replace(fit.ridge, directions=directions) if directions.size else None
@@ -456,7 +458,7 @@ def _starts_by_cost(search: Search, fit: Fit) -> int:
     start = time.perf_counter()
     evaluator.total(fit.theta[None], fit.scales)
     seconds = time.perf_counter() - start
-    # Four starts take 200 populations for each element of theta, about, and a few more.
+    # Four starts take about 200 populations for each element of theta.
     return 4 if 400 * fit.theta.size * seconds < 30 else 0
 
 
@@ -466,12 +468,14 @@ def _settle(problem: _Problem, fit: Fit) -> Fit:
     evaluator = search.evaluator
     end = settle(search, fit)
     if search.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
-        # A simplex may move to where few points have a lower value by accident.
+        # The simplex may have moved to where few points have a low value by chance: settle again on
+        # the refined designs.
         end = settle(search, fit)
         if shortcomings(evaluator, end.theta[None]):
             end = fit
     shift = np.abs(end.theta - fit.theta)
-    # Standard errors change less than the theta of a settled line search.
+    # Standard errors are computed again only if theta has moved by a hundredth of the prior's
+    # spread.
     if end.sampling is not None and (shift > 0.01 * search.prior_sd).any():
         end = replace(end, sampling=sampling_distribution(evaluator, end.theta, end.scales))
     if end.sampling is None or not (np.isnan(end.design_error) or shift.any()):
@@ -530,7 +534,8 @@ def _report(
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
     local = None if fit.sampling is None else fit.sampling.local
     unknown = [] if at_edge or at_jump else [*optimum.stderr.items()]
-    first = [finding for node in evaluator.nodes for finding in node.bound.findings]  # are logged
+    # findings that are logged already
+    first = [finding for node in evaluator.nodes for finding in node.bound.findings]
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),

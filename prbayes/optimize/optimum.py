@@ -57,7 +57,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.convergence import OVERLAP, Fit, Result, Search, stored_overlap
 
-# A smaller share is displayed as 0.0%.
+# Smallest share that is not displayed as 0.0%
 SMALLEST_SHARE = 5e-4
 NO_RESPONSE = "have no response (NaN) and are left out"
 
@@ -378,8 +378,8 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     covariance = fit.covariance
     functions = None if fit.sampling is None else sampling_of_functions(fit.sampling)
     point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
-    # How the search ended, unless its end is no minimum. A variance of rounding errors is as
-    # suspect as an infinite one; the discrepancy decides.
+    # Report how the search ended, unless its end is no minimum. If all variances are infinite or
+    # rounding errors, check whether the discrepancy changes at all.
     is_affordable = not (record.stopped and evaluator.responses_per_theta)
     variance = np.diag(covariance) / hyperparameters.prior_sd**2
     is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
@@ -392,7 +392,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     elif is_flat:
         result = Result.NO_INFORMATION
     elif is_affordable and not search.settings.prior and stored_overlap(evaluator, theta) < OVERLAP:
-        # Such a minimum is one of the mass beyond the grid, and no fit.
+        # Without overlap the minimum is one of the mass beyond the metric's grid, and no fit.
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
@@ -400,7 +400,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales
-    n_responses = evaluator.n_responses - n_previous  # without those of the support
+    n_responses = evaluator.n_responses - n_previous  # counted before the support computes any
     support = {
         name: {key: float(value[0]) for key, value in numbers.items()}
         for name, numbers in evaluator.support(theta[None]).items()
@@ -445,7 +445,7 @@ def n_computed(evaluator: Evaluator) -> int:
 def point_text(evaluator: Evaluator, theta: Floats) -> str:
     """Return the free variables at theta in words, without constants."""
     hyperparameters = evaluator.hyperparameters
-    # Beside a second point, so that constants can be recognised.
+    # Constants are recognised by a comparison with a second point.
     points = hyperparameters.constrained(np.stack([theta, hyperparameters.initial]))
     names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
@@ -467,7 +467,7 @@ def point_and_stderr(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     hyperparameters = evaluator.hyperparameters
-    step = 1e-4 * hyperparameters.prior_sd  # any small step: transforms are smooth
+    step = 1e-4 * hyperparameters.prior_sd  # any small step will do, because transforms are smooth
     values = hyperparameters.constrained(cross(theta, step))
     prior = hyperparameters.constrained(hyperparameters.prior_thetas(THETAS, seed=0))
     deterministics = {str(variable.name) for variable in evaluator.model.deterministics}
@@ -476,11 +476,12 @@ def point_and_stderr(
         gradients = slopes(value, step)
         errors = delta_method(gradients, covariance)
         if functions is not None and name in deterministics:
-            # Functions of unidentified elements may be identified: if better than by their prior.
+            # Functions of unidentified elements may be identified: require a smaller error than the
+            # prior's spread.
             faint = np.sqrt(functions.variance(gradients))
             upper, lower = np.quantile(prior[name], [0.84, 0.16], axis=0)
             errors = np.where(np.isinf(errors) & (faint < (upper - lower) / 2), faint, errors)
-        # Constants up to rounding, such as the diagonal of a correlation matrix.
+        # Constants, such as the diagonal of a correlation matrix, vary by rounding alone.
         ranges = np.ptp(np.concatenate([value, prior[name]]), axis=0)
         is_constant = ranges <= 1e-12 * np.abs(value[0])
         stderr[name] = _number(np.where(is_constant, 0.0, errors))
@@ -494,7 +495,7 @@ def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
     size = np.abs(gradients)
     is_touched = np.einsum("...i,ij,...j->...", size, is_infinite.astype(float), size) > 0
-    # At a bound of the support nothing moves a function, and its error is not known.
+    # At a bound of the support the gradient of a function vanishes, and its error is not known.
     is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
     variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
     return np.sqrt(np.where(is_at_bound, np.nan, variance))

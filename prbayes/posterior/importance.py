@@ -21,7 +21,7 @@ from prbayes._validate import Floats
 from prbayes.numerics.mixtures import StudentMixture, effective_sample_size
 from prbayes.numerics.modes import Laplace, LogDensity
 
-# The prior as a proposal: draws by size and seed, (size, d), and its log-density.
+# prior as a proposal: function of size and seed that returns draws, (size, d), and log-density
 Prior = tuple[Callable[[int, int], Floats], LogDensity]
 
 
@@ -29,13 +29,14 @@ Prior = tuple[Callable[[int, int], Floats], LogDensity]
 class ImportanceOptions:
     """Sizes and limits of importance sampling."""
 
-    oversampling: int = 2  # points of the first proposal for each draw
-    degrees: float = 5.0  # of freedom of the proposal's t distributions
+    oversampling: int = 2  # number of points of the first proposal for each draw
+    degrees: float = 5.0  # degrees of freedom of the proposal's t distributions
     pareto_k: float = 0.7  # largest shape of the weights' tail of reliable draws (Vehtari et al.)
     effective: float = 0.5  # smallest effective sample size of reliable draws, for each draw
     rounds: int = 6  # largest number of proposals; the r-th fitted one has r / 2 points a draw
-    components: int = 4  # of a fitted mixture
-    prior_share: float = 0.1  # of the points of a fitted proposal; half in the first
+    components: int = 4  # number of components of a fitted mixture
+    # share of the points that come from the prior; half in the first fitted proposal
+    prior_share: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class ImportanceSample:
     log_density: Floats  # (n,)
     pareto_k: float  # shape of the tail of the weights
     efficiency: float  # effective sample size for each point
-    effective_size: float  # of the points of all proposals
+    effective_size: float  # effective sample size of the points of all proposals
     log_evidence: float  # logarithm of the integral of the density
     is_reliable: bool  # whether the weights are even enough
 
@@ -61,7 +62,8 @@ def importance_sample(
 ) -> ImportanceSample:
     """Return ``size`` draws by importance sampling around modes and from the prior."""
     masses = np.array([mode.log_mass for mode in modes])
-    # A mode whose mass the approximation gets wrong still has points.
+    # Bound the mixing weights from below, because the approximation may underestimate a mode's
+    # mass.
     shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
     proposal = StudentMixture(
         np.stack([mode.mode for mode in modes]),
@@ -70,7 +72,7 @@ def importance_sample(
         options.degrees,
     )
     points = proposal.draws(options.oversampling * size, seed)
-    # A few points show whether the rest are worth their time.
+    # Evaluate a few points first: they show whether the rest are worth the time.
     pilot = min(max(len(points) // 8, 512), len(points))
     log_p = log_density(points[:pilot])
     log_ratio = log_p - logsumexp(proposal.log_densities(points[:pilot]), axis=1)
@@ -82,7 +84,7 @@ def importance_sample(
         log_p = np.concatenate([log_p, log_density(points[pilot:])])
     proposals, n_prior = [(proposal, len(points))], 0
     if prior is not None:
-        # A ridge between modes has no points of theirs.
+        # Draws of the prior cover ridges between the modes.
         n_prior = int(options.prior_share * len(points))
         new = prior[0](n_prior, seed)
         points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
@@ -96,9 +98,10 @@ def importance_sample(
             terms.append(prior[1](points) + np.log(n_prior / len(points)))
         log_ratio = log_p - logsumexp(terms, axis=0)
         sample = _resampled(points, log_p, log_ratio, size, seed, options)
-        # Too few effective points have no moments.
+        # Stop if there are too few effective points for the moments of a mixture.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
-        # Fitted proposals look better than they are until the points are in all regions.
+        # Require more effective points of fitted proposals, which look better than they are until
+        # all regions have points.
         is_enough = round_ == 1 or sample.effective_size >= size
         if (sample.is_reliable and is_enough) or round_ == options.rounds or is_lost:
             break
@@ -141,15 +144,15 @@ def _resampled(
 ) -> ImportanceSample:
     """Return draws by Pareto-smoothed weights and systematic resampling."""
     stats: Any = import_module("arviz_stats")
-    # ArviZ takes log-likelihoods, whose negatives are log weights of leave-one-out.
+    # ArviZ expects log-likelihoods, whose negatives are the log weights of leave-one-out.
     smoothed, pareto_k = stats.base.array_stats.psislw(-log_ratio)
     weights = np.exp(smoothed - logsumexp(smoothed))
     rng = np.random.default_rng(seed)
-    # In random order: every fourth point of a Sobol sequence is in the same quarter.
+    # Shuffle the points, because every fourth point of a Sobol sequence is in the same quarter.
     order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
     places = np.searchsorted(np.cumsum(weights[order]), positions)
-    # In random order again: copies of a point are next to each other.
+    # Shuffle the draws, because copies of a point are next to each other.
     rows = rng.permutation(order[places.clip(max=len(weights) - 1)])
     efficiency = float(effective_sample_size(weights) / len(weights))
     effective = efficiency * len(points)

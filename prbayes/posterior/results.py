@@ -44,11 +44,13 @@ AT_BEST = ("discrepancy_error", "lost_mass_at_best", "failed_mass_at_best")
 class Chains:
     """Chains of draws with the diagnostics of their sampler."""
 
-    thetas: Floats  # (chains, draws, d)
-    sampler: Mapping[str, Any]  # attributes: the name of the sampler, and diagnostics
+    thetas: Floats  # (chains, draws, d): draws in unconstrained space
+    sampler: Mapping[str, Any]  # attributes of the result: name of the sampler, and diagnostics
     sample_stats: xr.Dataset
-    log_likelihood: Floats | None = None  # (chains, draws), up to a constant; None by specimen
-    discrepancies: Floats | None = None  # (chains, draws, k); NaN if they would cost responses
+    # (chains, draws): log-likelihood up to a constant; None for log-likelihoods by specimen
+    log_likelihood: Floats | None = None
+    # (chains, draws, k): discrepancies; NaN if they would cost responses
+    discrepancies: Floats | None = None
     lost: Floats | None = None  # (chains, draws, k): share without response; NaN if stored
     # Error of the discrepancy, and lost and failed shares of the population, at the best draw: the
     # numbers `AT_BEST` by simulator.
@@ -116,7 +118,7 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     discrepancies, lost = by_draw["discrepancy"], by_draw["lost_mass"]
     n_nodes = len(evaluator.nodes)
     discrepancies[:, :, :n_nodes] = chains.discrepancies
-    lost[:, :, :n_nodes] = chains.lost  # without a design
+    lost[:, :, :n_nodes] = chains.lost  # shares of populations without a design
     supports = evaluator.support(rows)
     unknown = dict.fromkeys(("lossy_draws", "required_ess", *AT_BEST), np.nan)
     for k, node in enumerate(evaluator.nodes):
@@ -221,7 +223,8 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     )
     return xr.Dataset(
         {
-            # ArviZ functions that need a number for each observation show these names.
+            # The names explain themselves, because ArviZ functions that need a number for each
+            # observation show them.
             "one_number_for_all_specimens": (
                 dims,
                 (chains.log_likelihood - other_terms).reshape(shape),
@@ -243,7 +246,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
         name = likelihood.measurements[-1].name
         dim = str(observed[name].dims[0])
         labels = specimen_labels(likelihood)
-        if labels is not None:  # by specimen, not by reading
+        if labels is not None:  # the numbers are those of specimens, not of readings
             dim = f"{name}_specimen"
             coords[dim] = labels
         variables[name] = (["chain", "draw", dim], values[name].reshape(n_chains, n_draws, -1))
@@ -286,7 +289,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
             if not valid.size:
                 continue
             values, weights = node.bound.populations([parent[valid] for parent in parents])
-            points = values[0]  # of all populations
+            points = values[0]  # responses that all populations share
             cumulative = np.cumsum(np.where(is_missing(points), 0.0, weights), axis=1)
             for place, row in zip(first + valid, cumulative, strict=True):
                 if row[-1] > 0:

@@ -182,7 +182,7 @@ def modes_of(target: Target) -> list[Laplace] | None:
     starts = target.starts
     try:
         if len(starts) > 1:
-            # Starts on the way to the same mode continue as one.
+            # Continue once from starts that are on the way to the same mode.
             rough = laplace(target.log_posterior, starts, target.scale, steps=6)
             starts = np.stack([mode.mode for mode in distinct_modes(rough)])
         candidates = laplace(target.log_posterior, starts, target.scale)
@@ -194,7 +194,7 @@ def modes_of(target: Target) -> list[Laplace] | None:
         for i, mode in enumerate(distinct_modes(candidates))
         if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
     ]
-    return modes or None  # populations that shrink to a point have no mass
+    return modes or None  # None, because populations that shrink to a point have no mass
 
 
 def importance_chains(
@@ -234,7 +234,7 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    # A step that overflows is a divergence.
+    # A step that overflows is a divergence, and not an error.
     with evaluator.model, np.errstate(over="ignore"):
         idata = pm.sample(
             settings.draws,
@@ -250,7 +250,7 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     posterior = idata["posterior"].to_dataset()
     if settings.chains > 1:
         r_hat = import_module("arviz").rhat(posterior).to_array().max()
-        if not r_hat <= 1.1:  # chains in different modes
+        if not r_hat <= 1.1:  # because chains are in different modes
             return None
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])

@@ -351,7 +351,7 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            # Draws are as wide as few specimens make them, unlike standard errors.
+            # Leave out few-specimens, because draws are as wide as few specimens make them.
             findings += [f for f in optimum.findings if f.code != "few-specimens"]
             if evaluator.nodes and not is_pseudo:
                 findings += prior_conflicts(optimum, evaluator, thetas)
@@ -403,7 +403,7 @@ def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
         shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
         limit = node.bound.max_lost
         share = share_of_lossy(lost[:, :, k], limit)
-        if share > 0.05:  # a few draws may be far out
+        if share > 0.05:  # because a few draws may be far out
             findings.append(
                 Finding(
                     "lost-mass",
@@ -490,7 +490,7 @@ def _chains_on_designs(
             content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
             stored["start"] = hashlib.sha256(content).hexdigest()
         checkpoint = Checkpoint(settings.checkpoint, identity_of(evaluator), stored)
-        # A run without a seed takes that of the run that it continues.
+        # A run without a seed has the seed of the run that it continues.
         entropy = int(checkpoint.settings["entropy"])
     seeds = np.random.SeedSequence(entropy)
     refinements: list[Floats] = []
@@ -553,7 +553,7 @@ def run_chains(
     budget is spent before the first chain is finished.
     """
     saved = [] if checkpoint is None else _saved_states(checkpoint, len(refinements))
-    states: list[State] = []  # of the kernels of finished chains
+    states: list[State] = []  # states of the kernels of finished chains
     stopped = ""
     with shown(settings.progressbar), progress("SMC stages") as advance:
         for chain, seed in enumerate(seeds):

@@ -28,7 +28,7 @@ def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
     hidden = local.unidentified
     indirect = only_through_prior(evaluator)
     if indirect.any():
-        # One, or zero up to rounding for elements on which nothing depends.
+        # Singular values are one, or zero up to rounding of directions that only the prior informs.
         axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
         hidden = axes[:, strength > 0.5]
     return unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
@@ -92,7 +92,7 @@ def mixed_directions(local: Local, coefficients: Indices, inputs: Indices, names
     directions = [
         named_direction(direction, names)
         for direction in (local.unidentified @ axes.T).T
-        # A thousandth of the square is a thirtieth of a spread of the prior.
+        # A squared share of .001 is a thirtieth of a prior standard deviation.
         if min(float((direction[block] ** 2).sum()) for block in (coefficients, inputs)) > 0.001
     ]
     verb = "is" if len(directions) == 1 else "are"
@@ -128,7 +128,7 @@ def canonical_correlation(
     )
     between = first @ covariance[np.ix_(rows, columns)] @ second.T
     u, correlations, vt = np.linalg.svd(between)
-    # Loadings are the covariances of theta with the best combinations.
+    # The loadings are covariances of theta with the most correlated combinations.
     return (
         float(correlations[0]),
         np.linalg.solve(first, u[:, 0]),
@@ -189,13 +189,14 @@ def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> l
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
     """Return whether no discrepancy changes around theta, as where populations miss the data."""
-    # In spreads of the prior: small enough to stay on a plateau, and large against rounding.
+    # A hundredth of the prior's spread is small enough to stay on a plateau, and large against
+    # rounding.
     step = 0.01 * evaluator.hyperparameters.prior_sd
     values = evaluator(cross(theta, step)).discrepancies
     with np.errstate(invalid="ignore"):
-        # 1e4 times the rounding of a sum in double precision.
+        # The limit is 1e4 times the rounding error of a sum in double precision.
         is_small = np.abs(values - values[0]) <= 1e-12 * np.abs(values[0])
-    # Infinite values are equal, although their difference is not zero.
+    # Compare for equality as well, because the difference of infinite values is NaN.
     return bool(((values == values[0]) | is_small).all())
 
 
@@ -211,7 +212,7 @@ def elements_at_edge(
     """
     hyperparameters = evaluator.hyperparameters
     shift = theta - np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
-    # Collapsed populations end 2.9 to 24 spreads of the prior out.
+    # In the studies collapsed populations were 2.9 to 24 prior standard deviations out.
     far = np.flatnonzero(np.abs(shift) > 2.0 * hyperparameters.prior_sd)
     if not far.size or no_information(evaluator, theta):
         return ()
@@ -220,13 +221,14 @@ def elements_at_edge(
     center, *values = evaluator.total(np.vstack([theta, further, back]), scales)
     with np.errstate(invalid="ignore"):
         changes_further, changes_back = np.abs(np.array(values) - center).reshape(2, -1)
-    # Of collapsed populations a spread further changes 2e-7 of the size at most, and the way back
-    # 7e-4 at least: any value in [1e-6, 1e-4] gives the same verdicts.
+    # For collapsed populations a prior standard deviation further changes the objective by at most
+    # 2e-7 of its size, and the way back by at least 7e-4: any limit in [1e-6, 1e-4] gives the same
+    # verdicts.
     unchanged = max(1e-5, tolerance) * size
     at_edge = []
     for i in np.flatnonzero((changes_further < unchanged) & (changes_back > unchanged)):
-        # Far out the population is one number, to the last digit. The comparison uses the last
-        # point from theta to there whose discrepancy is unchanged.
+        # Far beyond the data the population collapses numerically. Compare at the last point on the
+        # way back at which the discrepancy has not changed.
         way = theta + np.linspace(0, 1, 101)[:, None] * (back[i] - theta)
         is_same = np.abs(evaluator.total(way, scales) - center) < unchanged
         last = way[np.logical_and.accumulate(is_same)][-1]

@@ -28,10 +28,10 @@ class OneSidedBound:
     """A hyperparameter that the data bound from one side."""
 
     name: str
-    value: float  # of the optimum, in the users' own units
-    limit: float  # one-sided, 95%
+    value: float  # value at the optimum, in the users' own units
+    limit: float  # one-sided limit with a confidence of 95 %
     is_upper: bool
-    end: float  # of the prior on the other side; NaN without one
+    end: float  # end of the prior on the other side; NaN without an end
 
 
 def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
@@ -99,7 +99,8 @@ def _limit(
     theta: Floats, i: int, statistic: Callable[[Floats, int], float], unit: float, most: float
 ) -> float:
     """Return the i-th element at the limit, at most so many units away, NaN without a limit."""
-    place, below = theta.copy(), (0.0, 0.0)  # distance and statistic
+    # distance and statistic of the last point below the limit
+    place, below = theta.copy(), (0.0, 0.0)
     highest = float(ndtri(0.95))
 
     def at(distance: float) -> float:
@@ -154,7 +155,8 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     start = time.perf_counter()
     (lowest,) = evaluator.total(sampling.theta[None], scales)
     seconds = time.perf_counter() - start
-    # Some ten places, with the derivatives of the population at each.
+    # The search evaluates about ten points for each element, with the derivatives of the population
+    # at each.
     n_populations = 20 * sampling.theta.size**2
     is_long = seconds * n_populations > 30 or budget().is_limited
     if needs_refits(evaluator):
@@ -166,10 +168,10 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     def statistic(theta: Floats, i: int) -> float:
         (total,) = evaluator.total(theta[None], scales)
         if not total > lowest + 0.1 * noise:
-            return np.nan  # flat: saves the standard error
+            return np.nan  # because the objective is flat, and the standard error costs more
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
         if not all(np.nansum(weights) > 0 for _, weights in populations):
-            return np.nan  # without any response
+            return np.nan  # because no point has a response there
         sampled = SamplingDistribution.of(evaluator, theta, scales)
         error = np.sqrt(sampled.local.in_theta[i, i])
         if not np.isfinite(error):

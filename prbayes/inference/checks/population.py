@@ -48,7 +48,8 @@ def zhang_statistic(z: Floats, weights: Floats) -> Floats:
     cumulative = np.cumsum(weights, axis=1)
     uniform = np.random.default_rng(0).random((8 if points > 1 else 1, n, 1))
     drawn = (cumulative < uniform * cumulative[:, -1:]).sum(axis=-1)
-    u = np.sort(ndtr(np.clip(z[np.arange(n), drawn], -6, 6)), axis=1)  # (draws, N, d)
+    # (draws, N, d): distribution functions of the drawn inputs
+    u = np.sort(ndtr(np.clip(z[np.arange(n), drawn], -6, 6)), axis=1)
     rank = np.arange(1, n + 1)[:, None]
     terms = np.log(u) / (n - rank + 0.5) + np.log1p(-u) / (rank - 0.5)
     statistic: Floats = -terms.sum(axis=1).mean(axis=0)
@@ -85,7 +86,7 @@ class PopulationTest:
     p_value: float
     zhang: Floats  # (d,): p-values of Z_A by input, not adjusted for the number of statistics
     mixture: Floats  # (d,): p-values of the mixture's likelihood ratio by input
-    n: int  # specimens
+    n: int  # number of specimens
 
 
 def population_test(z: Floats, weights: Floats, null: Sequence[Floats] | Floats) -> PopulationTest:

@@ -28,7 +28,7 @@ class PriorEnd:
     """A hyperparameter at an end of its prior."""
 
     name: str
-    value: float  # of the optimum, in the users' own units
+    value: float  # value at the optimum, in the users' own units
     bound: float  # the end of the prior
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ def elements_at_prior_ends(
         def along(x: Floats, start: Floats = start, i: int = i) -> float:
             return objective(start + np.insert(x, i, 0.0) * hyperparameters.prior_sd)
 
-        # A coarse search suffices.
+        # A coarse search suffices, because only its minimum is compared with the limit.
         origin = np.zeros(theta.size - 1)
         options = {
             "maxfev": 100 * theta.size,
@@ -80,9 +80,9 @@ def elements_at_prior_ends(
         at_end = theta.copy()
         at_end[i] += np.copysign(10 * hyperparameters.prior_sd[i], below[i] - 0.5)
         if objective(at_end) > objective(theta) + 1e-3 * rise:
-            continue  # a minimum before the end
+            continue  # because the minimum lies before the end
         limit, lowest = objective(theta) + rise, along(origin)
-        # Infinite where no design reaches.
+        # The objective is infinite where no design has points.
         if origin.size and limit < lowest < np.inf:
             lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
         if lowest > limit:
@@ -94,7 +94,8 @@ def elements_at_prior_ends(
 def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
     """Return the elements that are pushed to an end of their prior; computes no response."""
     evaluator, scales = sampling.evaluator, sampling.scales
-    # Two elements that only replace each other have a squared loading of a half each.
+    # The limit excludes elements that only replace each other, whose squared loadings are a half
+    # each.
     is_alone = sampling.local.hidden_share > 0.9
     is_alone &= ~only_through_prior(evaluator)
     if not is_alone.any() or not is_stored(evaluator):
@@ -167,7 +168,7 @@ def conflict_findings(
     'mu: got prior 9.99 +- 0.29, data 11.2 +- 0.2 (p = 0.004)'
     """
     _, p_values = prior_conflict(estimate, predictive)
-    # Shifts of the posterior means from the estimates, in standard errors.
+    # shifts of the posterior means from the estimates, in standard errors
     pulls = np.abs(posterior_mean - estimate) / standard_error
     findings, pull = [], 0.5
     matters = (p_values <= 0.05) & (pulls > pull)

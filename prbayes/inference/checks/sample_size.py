@@ -30,9 +30,10 @@ def elements_above(evaluator: Evaluator) -> Bools:
         flat = [parent.reshape(len(thetas), -1) for parent in parents]
         values = np.concatenate(flat, axis=1)
         if values.shape[1] > len(parents):
-            # Of a vector a population may depend on one element alone.
+            # Draw specimens, because a population may depend on a single element of a vector
+            # parent.
             inputs = evaluator.simulators[k].inputs
-            with contextlib.suppress(TypeError):  # not all inputs can be drawn
+            with contextlib.suppress(TypeError):  # raised by inputs that cannot be drawn
                 values = _specimens(inputs, parents)
         row |= (values[1:] != values[0]).any(axis=1)
     return enters
@@ -68,7 +69,7 @@ def interval_ratios(n: float) -> tuple[float, float]:
     """
     upper = (1 + INTERVAL) / 2
     z = float(ndtri(upper))
-    # The maximum of the likelihood divides the squares by n.
+    # The factor n / (n - 1) is that of the maximum of the likelihood, which divides squares by n.
     mean = np.sqrt(n / (n - 1)) * stdtrit(n - 1, upper) / z
     longest, shortest = (np.sqrt(n / (2 * gammaincinv((n - 1) / 2, p))) for p in (1 - upper, upper))
     return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
@@ -88,9 +89,10 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
         members = [evaluator.simulators[k] for k in np.flatnonzero(groups == group)]
         labels = [member.specimens for member in members if member.specimens is not None]
         count = sum(member.n_specimens for member in members)
-        if len(labels) == len(members):  # specimens in common count once
+        if len(labels) == len(members):  # because specimens in common count once
             count = float(np.unique(np.concatenate(labels)).size)
-        counts.append(round(count, 6))  # a sum of weights may be slightly below a whole number
+        # because a sum of weights may be slightly below a whole number
+        counts.append(round(count, 6))
     n = min(counts, default=enough)
     if not n < enough:
         return _spread_in_common(evaluator, enters, groups, counts)
