@@ -286,7 +286,7 @@ class ExceedanceTable(Table):
 
 
 def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) -> str:
-    """Return whether a requirement is met by the whole interval, by none of it, or by a part."""
+    """Return whether the whole interval meets a requirement, or none of it, or a part."""
     low, high = np.transpose([estimate.interval_with_error(prob) for estimate in estimates])
     if high.max() <= requirement:
         return "met"
@@ -315,7 +315,11 @@ class _Estimate:
         return np.nanquantile(self.by_draw, tail_levels(prob))
 
     def interval(self, prob: float) -> Floats:
-        """Return the interval over populations; if all or no points count, with its bound."""
+        """Return the interval over populations, with a bound where no or every point counts.
+
+        If no (or every) point exceeds the limit, the upper (lower) end is the one-sided bound of
+        that share.
+        """
         low, high = self.of_populations(prob)
         least, most = probability_bounds(self.mean, self.error, (1 - prob) / 2)
         if self.mean == 1:
@@ -330,7 +334,7 @@ class _Estimate:
         return np.clip(self.of_populations(prob) + margins, 0.0, 1.0)
 
     def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
-        """Return whether the error is above a share of the distance of a requirement."""
+        """Return whether the error is above a share of the interval's distance to a requirement."""
         distances = np.abs(self.of_populations(prob) - requirement)
         return bool(self.error > share * distances.min())
 
@@ -358,7 +362,7 @@ class _Question:
         return _stored_probability(sample, quantity)
 
     def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
-        """Return an estimate by new points, if these are no more than the runs behind it.
+        """Return an estimate by new points, if they are no more than the runs of the first one.
 
         Inputs without an inverse distribution function keep the estimate.
         """
@@ -639,7 +643,8 @@ def _draw_points(
 def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:
     """Return the normal distribution nearest to the populations above a level, if any point is.
 
-    Two of them if the points above spread wider than the population, as on both sides of it.
+    Return two of them if the points above scatter wider than the population, as on both sides of
+    it.
     """
     is_above = points.values >= level
     if not is_above.any():
@@ -667,7 +672,7 @@ def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> lis
 def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:
     """Return a normal distribution with the mean of points, and their variance along it.
 
-    Few points do not determine a covariance of several dimensions: across the mean it is isotropic.
+    The covariance is isotropic in the other directions, because few points do not determine it.
     """
     total = weights.sum()
     mean = weights @ z / total

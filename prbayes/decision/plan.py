@@ -260,7 +260,7 @@ class Draws:
 
     @classmethod
     def of(cls, thetas: Floats, unit: Floats) -> Draws:
-        """Return draws, (k, d), with a covariance in which outliers beyond 3 sd are drawn in."""
+        """Return draws, (k, d), with a covariance in which outliers are moved to 3 sd."""
         d = unit.size
         covariance = np.cov(drawn_in(thetas / unit), rowvar=False).reshape(d, d)
         return cls(thetas, unit, covariance)
@@ -268,7 +268,7 @@ class Draws:
     def with_information(self, information: Floats) -> Floats:
         """Return the draws after information, (d, d), narrowed around the same median.
 
-        Precisions add up; the map is the symmetric one between the two normal distributions.
+        Precisions add up. The map between the two normal distributions is the symmetric one.
         """
         covariance = np.linalg.inv(np.linalg.inv(self.covariance) + information)
         root = _square_root(self.covariance)
@@ -313,7 +313,7 @@ class _Forecast:
         return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
     def needed(self, information: Floats, name: str, target: float | None) -> float:
-        """Return the smallest number of specimens that reaches a target; inf, NaN without one."""
+        """Return the smallest number of specimens for a target: inf if none, NaN without one."""
         if target is None:
             return np.nan
 
@@ -380,7 +380,7 @@ class ReadingErrors:
 
     @classmethod
     def of(cls, sample: ResponseSample, metric: Metric | None) -> ReadingErrors | None:
-        """Return those of a metric, or of the simulator; None of exact readings."""
+        """Return the errors of a metric, or of the simulator; None if readings are exact."""
         simulator = sample.populations.evaluator.simulators[sample.k]
         assert isinstance(simulator, EmulatedSimulator)
         measurement = simulator.measurement

@@ -203,7 +203,7 @@ def _mean(draws: Floats) -> Floats:
 
 
 def _defined(row: Floats, is_left_out: Any) -> Floats:
-    """Return the other numbers of populations; NaN where most populations are left out."""
+    """Return the numbers that are not left out, or NaN if most are."""
     numbers = row[~is_left_out]
     return numbers if numbers.size > 0.5 * row.size else np.array([np.nan])
 
@@ -257,7 +257,7 @@ class PopulationTable(Table):
         )
 
     def __repr__(self) -> str:
-        """Return a sentence for each population; of a selection what xarray shows."""
+        """Return a sentence for each population, or xarray's text for a selection."""
         if not self._is_whole:
             return super().__repr__()
         return "\n  ".join([f"{self._heading()}:", *self.sentences()])

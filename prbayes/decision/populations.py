@@ -194,9 +194,9 @@ class ResponseSample:
     def emulated(self, points: Sequence[Floats]) -> list[Floats]:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.
 
-        The rest differ from it by its error: they lack a block of the runs each, or add the error
-        of left-out runs, or that beyond the runs' range. Empty where responses are stored and not
-        emulated.
+        The others differ from it by an estimate of its error: they lack a block of the runs each,
+        or add the error of left-out runs, or the error beyond the runs' range. The list is empty if
+        responses are stored and not emulated.
         """
         if self.emulator is None:
             assert self.design.has_runs
@@ -264,9 +264,10 @@ class ResponseSample:
     def share_error(self, counts: Callable[[Floats], Floats]) -> Floats:
         """Return the error of the mean share of responses that count, by points and emulator.
 
-        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. Of the points
-        it is the jackknife over their blocks; if none or all of them count, one over their
-        effective number. Of the emulator it is that of emulators without a block of the runs.
+        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. The part by
+        points is the jackknife over their blocks, or one over their effective number if none or all
+        of them count. The part by emulators is the scatter of emulators without a block of the
+        runs.
         """
         is_counted = counts(self.values)
         weights = self.mean_weights()
@@ -315,8 +316,8 @@ class ResponseSample:
     def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
         """Return findings, and the error of the quantity at the centre.
 
-        Findings are of a tail of few points, and of populations beyond the runs. Raises ValueError
-        if no response is in the tail, or specimens failed.
+        Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
+        no response is in the tail, or specimens failed.
         """
         caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
@@ -329,7 +330,7 @@ class ResponseSample:
         at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
         if not np.isin(is_beyond, (0.0, 1.0)).all():
-            return _beyond_runs(self, quantity), self._jackknife_error(quantity)
+            return _beyond_runs(self, quantity), _jackknife_error(self, quantity)
         share = float(self.mean_weights() @ is_beyond)
         is_upper = share <= 0.5
         if not is_upper:  # because the rarer side decides how well the quantity is known
@@ -366,19 +367,20 @@ class ResponseSample:
             error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
         return findings, error
 
-    def _jackknife_error(self, quantity: Quantity) -> float:
-        """Return the error of a quantity at the centre, by points and emulator."""
-        center = self.populations.center[None]
-        is_kept = self.blocks != np.arange(N_BLOCKS)[:, None]
-        rest = self.weights(center) * is_kept
-        without = quantity.of(self.values, rest / rest.sum(axis=1, keepdims=True))
-        variance = (N_BLOCKS - 1) * np.var(without)
-        outputs = self.emulated(self.points)
-        if outputs:
-            mass = self.masses(center)
-            quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
-            variance += ((quantities[1:] - quantities[0]) ** 2).sum()
-        return float(np.sqrt(variance))
+
+def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
+    """Return the error of a quantity at the centre, by points and emulator."""
+    center = sample.populations.center[None]
+    is_kept = sample.blocks != np.arange(N_BLOCKS)[:, None]
+    rest = sample.weights(center) * is_kept
+    without = quantity.of(sample.values, rest / rest.sum(axis=1, keepdims=True))
+    variance = (N_BLOCKS - 1) * np.var(without)
+    outputs = sample.emulated(sample.points)
+    if outputs:
+        mass = sample.masses(center)
+        quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
+        variance += ((quantities[1:] - quantities[0]) ** 2).sum()
+    return float(np.sqrt(variance))
 
 
 def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
@@ -415,7 +417,7 @@ def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
 
 
 def standard_deviation(by_draw: Floats) -> float:
-    """Return that of a quantity over draws; infinite if the quantity is infinite at one of them."""
+    """Return the standard deviation over draws; infinite if one draw is infinite."""
     if np.isinf(by_draw).any():
         return np.inf
     return float(np.nanstd(by_draw))
@@ -431,8 +433,8 @@ def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:
     r"""Return the bounds of probabilities that leave out ``tail`` on each side, (2, ...).
 
-    Those of a Poisson mean (Garwood 1936), for :math:`(p / error)^2` events: for many the normal
-    ones, and for none of n points, with an error of 1 / n, the rule of three.
+    They are those of a Poisson mean (Garwood 1936), for :math:`(p / error)^2` events: for many the
+    normal ones, and for none of n points, with an error of 1 / n, the rule of three.
     """
     probability, error = np.asarray(probability, dtype=float), np.asarray(error, dtype=float)
     rare = np.minimum(probability, 1 - probability)
@@ -490,8 +492,8 @@ class CentralSpecimens:
 class InverseTransform:
     """The aleatory inputs of one population as functions of standard normal numbers z.
 
-    Inverse distribution functions at Phi(z). A distribution that has none, or depends on another
-    input, raises TypeError.
+    The inputs are inverse distribution functions at Phi(z). A distribution without one, or one that
+    depends on another input, raises TypeError.
     """
 
     def __init__(self, name: str, inputs: Inputs, parents: Sequence[Floats]) -> None:
@@ -531,7 +533,7 @@ class InverseTransform:
     def has_support_of(self, parents: Sequence[Floats]) -> bool:
         """Return whether the population has a density wherever the k populations of parents do.
 
-        Looks at their ends, five standard deviations of z from the middle.
+        Their ends are compared, five standard deviations of z from the middle.
         """
         ends = self._of_populations(parents, np.array([[-5.0], [5.0]]) * np.ones(self.size))
         return not np.isneginf(self.log_density(self.parents, ends)).any()

@@ -84,7 +84,7 @@ class Quantity(ABC):
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return the number of each specimen whose variance is attributed to the inputs.
 
-        By default the response itself; ``at`` is the quantity of the population.
+        It is the response by default. ``at`` is the quantity of the population.
         """
         return values
 
@@ -335,7 +335,7 @@ def extreme_places(
 def _kernel_width(values: Floats) -> float:
     """Return the bandwidth for responses of the same specimens, (places, n), by Silverman's rule.
 
-    Their spread is that at a place in the middle, or else that between places.
+    Their spread is the median over places of that at a place, or else that between places.
     """
     finite = np.ma.masked_invalid(values)
     within = np.ma.filled(finite.std(axis=1), 0.0)
@@ -360,7 +360,7 @@ def _log_tail(distances: Floats) -> float:
 def _climbed(
     height: Callable[[Sequence[float]], float], start: list[float], low: Floats, high: Floats
 ) -> list[float]:
-    """Return a place that is higher than the start, by steps along the axes that are halved."""
+    """Climb from a start by steps along the axes, which are halved where none leads higher."""
     step = (high - low) / 32 ** (1 / low.size)
     for _ in range(10):
         steps = np.diag(step)

@@ -299,8 +299,8 @@ def input_indices(
 ) -> tuple[Indices, str]:
     """Return the indices of the inputs at the central population, and why they are not known.
 
-    Inputs are independent. The errors include the emulator's, from emulators without a block of
-    runs each.
+    Inputs are independent. The errors include that of the emulator, from emulators without a block
+    of runs.
     """
     center = sample.populations.center[None]
     unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
@@ -458,7 +458,7 @@ def _complete_pairs(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 
 
 def _ratio(part: Floats, variance: Floats) -> Floats:
-    """Return a share of a variance; NaN of none."""
+    """Return a share of a variance, NaN if the variance is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(variance > 0, part / variance, np.nan)
 

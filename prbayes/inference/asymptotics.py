@@ -37,7 +37,7 @@ _TINY = np.finfo(float).tiny
 
 
 def single_output_parts(target: Discrepancy) -> list[Part]:
-    """Return the parts that see one number of a specimen: of one output, the metric itself."""
+    """Return the parts that compare one number of a specimen: with one output the metric."""
     return [part for part in target.parts if not part.target.event]
 
 
@@ -135,12 +135,12 @@ class Information:
 
     @property
     def node(self) -> Node:
-        """The simulator, which is that of the evaluator after a pickle too."""
+        """The simulator, read from the evaluator so that both are the same after a pickle."""
         return self.evaluator.nodes[self.k]
 
     @cached_property
     def stencil(self) -> Stencil:
-        """The populations around theta, as close as the discrepancy can be differenced."""
+        """The populations around theta, at the smallest steps that suit the discrepancy."""
         target, bound = self.node.target, self.node.bound
         # With a moving support the step is wide, so that the edge passes several points.
         is_smooth = not bound.support_moves if bound.stored else is_differentiable(target)
@@ -194,7 +194,7 @@ class Information:
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it.
 
-        Of a log-likelihood, its expected gain from the truth to its maximum: half for each
+        For a log-likelihood it is the expected gain from the truth to the maximum: half for each
         hyperparameter, over N (Wilks 1938, doi:10.1214/aoms/1177732360).
         """
         if not self.node.metric.distance:
@@ -257,7 +257,7 @@ class Information:
     def areas(self, sets: DataSets, subset: Bools | None = None) -> list[LinearArea]:
         """Return a linear model of each area that the metric is a sum of, for data sets.
 
-        ``subset`` are the points of the population that count; all by default.
+        ``subset`` selects points of the population; all by default.
         """
         around = self.stencil
         observed, observed_weights = sets.values[self.k], sets.weights[self.k]
@@ -401,7 +401,8 @@ def first_order_shifts(
 class Local:
     """Covariance of the minimiser at one theta, in units of the prior's spread.
 
-    Elements and functions with a share above .02 in unidentified directions are not identified.
+    Elements and functions whose share in unidentified directions is above .02 count as not
+    identified.
     """
 
     prior_sd: Floats  # (d,): standard deviations of the prior
@@ -416,7 +417,7 @@ class Local:
 
     @property
     def in_theta(self) -> Floats:
-        """The covariance in theta, (d, d), infinite for elements with a share not identified."""
+        """The covariance in theta, (d, d); infinite for elements that are not fully identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
         is_hidden = self.hidden_share > 0.02
@@ -427,8 +428,9 @@ class Local:
     def variance(self, gradients: Floats) -> Floats:
         """Return the variance of functions of theta with gradients (..., d).
 
-        Infinite for those with a share not identified. A function of unidentified elements may be
-        identified, such as the standard deviation of an input whose correlation is not.
+        It is infinite for functions that are not fully identified. A function of unidentified
+        elements may be identified, such as the standard deviation of an input whose correlation is
+        not.
         """
         unit = gradients * self.prior_sd
         along = unit @ self.identified
@@ -468,7 +470,7 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
 
 
 def _area_covariance(information: list[Information], scales: Floats, weakest: float) -> Local:
-    """Return the covariance of the shifts over simulated data sets, if there are areas."""
+    """Return the sampling distribution with area metrics, from shifts over data sets."""
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
     # Columns span the space that any simulator identifies. The column of zeros keeps the array from
@@ -496,7 +498,7 @@ def _area_covariance(information: list[Information], scales: Floats, weakest: fl
 def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]:
     """Name unidentified directions, orthonormal columns (d, q), such as 'mu[0] - 0.8 mu[1]'.
 
-    They are rotated so that elements are alone if possible.
+    They are rotated so that each has few elements.
     """
     labels = []
     space = unidentified

@@ -29,7 +29,7 @@ class DesignErrors:
 
     @property
     def whole(self) -> float:
-        """Both together; NaN if nothing is known."""
+        """Both distances together; NaN if neither is known."""
         errors = [e for e in (self.points, self.emulators) if not np.isnan(e)]
         return float(np.linalg.norm(errors)) if errors else np.nan
 
@@ -52,8 +52,9 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
     """Return the error of the optimum by emulators, (r,).
 
-    From minima of emulators that lack a block of the runs, less the minimum of the whole by the
-    same descent, which may differ from the optimum for other reasons.
+    It is the spread of minima by emulators that lack a block of the runs, around the minimum by all
+    runs. The same descent finds that minimum, because it may differ from the optimum for other
+    reasons.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
     left_out = [
@@ -76,7 +77,7 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
 def _error_of_points(sampling: SamplingDistribution) -> Floats:
     """Return the error of the optimum by the design's points, (r,).
 
-    The spread of the minima of blocks of the design, as if they were independent, bounds it.
+    It is bounded by the spread of the minima by blocks of the design, as if these were independent.
     """
     evaluator = sampling.evaluator
     observed = observed_set(evaluator)

@@ -58,7 +58,7 @@ class FittedSets:
         return cls(sampling, x[0], sets, x, converged, observed_set(sampling.evaluator))
 
     def without_rounding(self) -> FittedSets | None:
-        """Return the same with tied observations spread out; None if none are tied."""
+        """Return a copy with tied observations spread out, or None if there are no ties."""
         values = [
             np.column_stack([spread_out(column) for column in y.reshape(len(y), -1).T])
             for y in self.observed.values
@@ -113,8 +113,9 @@ def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -
 def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: Floats) -> Floats:
     """Return logarithms of two distances of data sets from populations, (S, 2).
 
-    Those of Cramer-von Mises and Anderson-Darling, between the weighted values (n,), (S, n) of data
-    sets and populations (N,) or (S, N), (S, N). Only finite responses can be observed.
+    The distances are those of Cramér-von Mises and Anderson-Darling. Data sets are values (n,) with
+    weights (S, n), populations are responses (N,) or (S, N) with masses (S, N). Only finite
+    responses can be observed.
     """
     masses = np.where(np.isfinite(simulated), masses, 0.0)
     masses = masses / masses.sum(axis=1, keepdims=True)
@@ -244,8 +245,8 @@ def population_misfit(
 def output_misfits(fitted: FittedSets) -> list[Finding]:
     """Report for each simulator of several outputs which of them, and which pairs, misfit.
 
-    Outputs by the distances of Cramer-von Mises and Anderson-Darling, pairs by the residual of
-    their correlation.
+    Outputs are tested by the distances of Cramér-von Mises and Anderson-Darling, pairs by the
+    residual of their correlation.
     """
     findings = []
     evaluator, is_fitted = fitted.sampling.evaluator, fitted.converged

@@ -141,7 +141,7 @@ class ContinuedEvaluator(Evaluator):
 
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
-    """Return coordinates with the ends beyond which populations of thetas, (S, d), exist.
+    """Return the continuation beyond those ends where populations of thetas, (S, d), exist.
 
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """
@@ -167,7 +167,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
 def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floats, Floats, Floats]:
     """Return values of elements in the users' own units, and the ends of their ranges, (d,) each.
 
-    NaN where there is no end, or elements have no values of their own, as those of a simplex.
+    They are NaN where there is no end, and for all elements if one variable is a simplex.
     """
     d = theta.size
     # A transform has reached its end if a point far out and one much farther out have the same

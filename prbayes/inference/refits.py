@@ -55,9 +55,9 @@ class SamplingDistribution:
     ) -> SamplingDistribution:
         """Return the distribution at theta.
 
-        From the metrics' derivatives, to first order; from refits if a metric declares nothing.
-        Directions with a standard error above ``weakest`` prior standard deviations are not
-        identified.
+        It is of first order, from the metrics' derivatives, or from refits if a metric does not
+        declare its minimum. Directions with a standard error above ``weakest`` prior standard
+        deviations are not identified.
         """
         nodes = range(len(evaluator.nodes))
         information = [Information(evaluator, k, theta) for k in nodes]
@@ -97,8 +97,9 @@ def sampling_of_functions(sampling: SamplingDistribution) -> Local:
     """Return the first-order distribution with directions that are weakly identified as well.
 
     The data may identify a function of theta, such as a standard deviation, but not its elements,
-    such as those of a Cholesky factor. Directions count up to 10 prior standard deviations; any
-    value from 3 to 30 gives the same (tests/test_correlated_inputs.py).
+    such as those of a Cholesky factor. Directions count if their standard error is at most 10 prior
+    standard deviations. Any limit from 3 to 30 gives the same results
+    (tests/test_correlated_inputs.py).
     """
     if not sampling.local.unidentified.size or needs_refits(sampling.evaluator):
         return sampling.local
@@ -142,9 +143,9 @@ def refit(
 ) -> tuple[Floats, Bools]:
     """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-    With stored responses by an exact minimisation from ``start``, the optimum by default, without a
-    new response; otherwise to first order. ``is_rough``: a few hundredths of a standard error
-    suffice, in half of the time.
+    Stored responses are minimised exactly from ``start``, by default the optimum, without a new
+    response. Others give first-order estimates. With ``is_rough`` the error is a few hundredths of
+    a standard error, in half of the time.
     """
     if not is_stored(sampling.evaluator):
         x = sampling.linear_estimates(sets)
@@ -294,8 +295,8 @@ class SimplexRefits:
         A direction is identified if the minimisers scatter along it by less than ``weakest`` prior
         standard deviations, and if the discrepancy rises along it: its second derivative, averaged
         over data sets, is more than twice the mean gain of one identified direction over
-        ``weakest**2``. For a quadratic discrepancy both say the same; along a flat one a minimiser
-        stays close to its start, and only the second says so.
+        ``weakest**2``. For a quadratic discrepancy both conditions are equivalent. Along a flat
+        direction a minimiser stays close to its start, and only the second condition fails.
         """
         # Steps of the second differences are the minimisers' standard errors, because kinks at
         # different places average out over them. They are half a prior standard deviation where
@@ -430,7 +431,7 @@ class BatchObjective:
         simulators: Sequence[int] | None = None,
         stored: Sequence[Floats | None] = (),
     ) -> BatchObjective:
-        """Prepare the observed sides of all data sets; of all simulators by default.
+        """Prepare the discrepancies against all data sets, by default of all simulators.
 
         ``stored``, by simulator, replaces the responses at the designs' points unless it is None.
         """

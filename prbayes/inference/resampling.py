@@ -74,7 +74,7 @@ def dependent(nodes: Sequence[Node]) -> bool:
 
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return indices of simulators, in groups that share specimens, even through a third one."""
+    """Return groups of simulators that share specimens, as indices, also by a third one."""
     from scipy.sparse.csgraph import connected_components
 
     if all(node.specimens is None for node in nodes):
@@ -86,7 +86,7 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share a design, by specimens or groups."""
+    """Return names, and those of all simulators that share a design with them."""
     result = set(names)
     for group in [*groups(nodes), *families(nodes)]:
         members = {nodes[k].name for k in group}
@@ -96,7 +96,7 @@ def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
 
 
 def families(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return indices of simulators whose specimens are of the same groups, together."""
+    """Return lists of indices of simulators that belong to groups of the same specimens."""
     by_inputs: dict[int, list[int]] = {}
     for k, node in enumerate(nodes):
         if node.group:
@@ -157,7 +157,8 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
 def _are_countable(evaluator: Evaluator, responses: list[Floats]) -> bool:
     """Return whether it suffices, and is faster, to draw how often each point occurs.
 
-    The observations are different specimens, measured alike, and more than points.
+    This requires that observations are different specimens, measured alike, and more than the
+    points.
     """
     nodes = evaluator.nodes
     for node in nodes:
@@ -186,7 +187,7 @@ def _drawn_counts(
 def _counted_sets(
     evaluator: Evaluator, responses: list[Floats], counts: list[NDArray[np.int64]]
 ) -> DataSets:
-    """Return the data sets in which points occur so often."""
+    """Return data sets from the numbers of times that each point occurs."""
     values, weights = [], []
     for node, response, count in zip(evaluator.nodes, responses, counts, strict=True):
         is_observable = observable(response, node.target)
@@ -198,7 +199,7 @@ def _counted_sets(
 def sets_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
 ) -> tuple[DataSets, list[csr_array]]:
-    """Draw one data set at each theta; return how often each point occurs, by group, too.
+    """Draw one data set at each theta, and return it with counts of each point, by group.
 
     Points are those of stored responses: counts have shape (n, points).
     """
@@ -280,7 +281,7 @@ def _points_of(mass: Floats, uniform: Floats) -> Indices:
 
 
 def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indices]) -> DataSets:
-    """Return the data sets that are measured on specimens, given as points of responses (n,)."""
+    """Return data sets of specimens, which are given as indices of the responses (n,)."""
     numbers, _ = specimens(evaluator.nodes)
     values, weights = [], []
     for k, (node, responses) in enumerate(zip(evaluator.nodes, populations, strict=True)):

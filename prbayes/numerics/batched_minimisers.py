@@ -20,7 +20,7 @@ type Values = Callable[[Floats, Any], Floats]
 
 
 class Minima(NamedTuple):
-    """Ends of descents."""
+    """Minima at the ends of descents."""
 
     x: Floats  # (B, r): ends of the descents
     values: Floats  # (B,)
@@ -136,7 +136,8 @@ def _bfgs(inverse: Floats, s: Floats, y: Floats, is_first: bool) -> Floats:
     """Return updated inverse Hessians, (B, r, r), from steps s and changes y of gradients, (B, r).
 
     Nocedal and Wright, eq. 6.17; first guesses get the size of a first step, eq. 6.20, with the
-    guess in place of the identity. Hessians stay where they would not be positive definite.
+    guess in place of the identity. Hessians are not updated where they would not be positive
+    definite.
     """
     sy = (s * y).sum(axis=-1)
     # Update only if step and change of the gradient are not nearly orthogonal, which would spoil

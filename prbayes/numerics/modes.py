@@ -16,7 +16,7 @@ LogDensity = Callable[[Floats], Floats]
 
 
 def far_apart(candidates: Floats, count: int, unit: Floats) -> Floats:
-    """Return the first candidate, (n, d), and others far from it and each other in a unit, (d,)."""
+    """Return ``count`` candidates, the first and others, that are far apart in a unit, (d,)."""
     scaled = candidates / unit
     return scaled[farthest_rows(scaled, min(count, len(scaled)))] * unit
 

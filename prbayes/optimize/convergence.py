@@ -187,7 +187,7 @@ def minimise(
 ) -> Fit:
     """Minimise from theta with the remaining evaluations.
 
-    At kinks a line search is stopped soon, unless it is to be ``patient``.
+    If the metric has kinks, a line search is stopped soon, unless it is ``patient``.
     """
     size = search.size(theta, scales)
     gradient = search.uses_gradient
@@ -246,10 +246,10 @@ def _run_scipy(
 
 
 def settle(search: Search, fit: Fit) -> Fit:
-    """Decide whether a line search that gave up, at a kink or rounding, has converged.
+    """Decide whether a line search that gave up, because of kinks or rounding, has converged.
 
-    It has if gradients around its end promise next to nothing, or else if a simplex gains nothing,
-    after a more patient line search if the first was stopped soon.
+    It has converged if gradients around its end predict no gain, or else if a simplex gains
+    nothing. At kinks a more patient line search comes before the simplex.
     """
     most = search.settings.max_evaluations
     if fit.result.converged or fit.trace.count >= most or not search.uses_gradient:
@@ -303,10 +303,10 @@ def _loses_responses(search: Search, theta: Floats) -> bool:
 
 
 def _follow_gradients(search: Search, fit: Fit) -> Fit:
-    """Take Newton steps from gradients a distance apart, which count kinks as curvature.
+    """Take Newton steps from gradients a distance apart, so that kinks count as curvature.
 
-    Converged if such a step neither promises nor brings a gain, and the objective is higher a
-    quarter of the prior's spread downhill: kinks make small minima on a slope.
+    The fit has converged if such a step neither predicts nor brings a gain, and if the objective is
+    higher a quarter of the prior's spread downhill, because kinks make small minima on a slope.
     """
     spent = fit.trace.count
     objective = search.objective(fit.center, fit.scales, fit.size, spent, gradient=True)
@@ -358,7 +358,7 @@ def _relative_gain(lowest: float, objective: Objective) -> float:
 
 
 def _newton_step(objective: Objective, t: Floats, apart: float) -> tuple[Floats, float, Floats]:
-    """Return a Newton step from gradients around a point, its expected gain, and ways downhill.
+    """Return a Newton step from gradients around a point, its gain, and downhill directions.
 
     The gain is infinite if the minimum is farther away than ten times the distance of the
     gradients, if there is none, or if the objective is not finite at one of them.
@@ -474,7 +474,7 @@ class AreaGuide:
 
 
 def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
-    """Return the theta with the smallest objective, or area where no population meets the data.
+    """Return the theta with the smallest objective, or with the smallest area without any overlap.
 
     Without overlap density metrics are the same everywhere, up to rounding.
     """

@@ -49,7 +49,7 @@ FEW_SETS = 50
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """Where to minimise again on designs that have grown."""
+    """Start of the next minimisation, on designs that have grown."""
 
     theta: Floats  # (d,)
     pilot: Floats | None
@@ -106,8 +106,9 @@ def refine_designs(
 def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     """Return thetas around a fit that designs have to support, (m, d).
 
-    Those of the pilot; or normal thetas with the covariance of the fit, no wider than the prior,
-    where emulated samples follow the fit anywhere or a ridge is on unidentified directions.
+    They are those of the pilot, unless emulated samples can follow the fit anywhere, or a ridge
+    penalises unidentified directions: then they are normal with the covariance of the fit, no wider
+    than the prior.
     """
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
@@ -146,7 +147,7 @@ def _cover(search: Search, fit: Fit, nearby: Floats) -> Restart:
 
 
 def _ridge(search: Search, fit: Fit, pilot_thetas: Floats) -> Ridge | None:
-    """Return a penalty on directions that are not identified, or None if there are none.
+    """Return a penalty on directions that are not identified, or None if all are identified.
 
     Along them a minimiser follows the error of the design, which grows with the distance. The
     penalty is the sampling noise at one spread of the prior.
@@ -222,7 +223,7 @@ def refine_at(
 def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     """Add points to all designs until their error is expected to be small enough.
 
-    Returns whether any were added; ``thetas``, (P, d), are where the populations in question are.
+    ``thetas``, (P, d), are those of the populations to support. Returns whether points were added.
     """
     _log.info(
         "the optima of independent designs would differ by %.2f standard errors, more than the "
@@ -339,10 +340,10 @@ def draw_samples(
     larger: bool = False,
     same_surfaces: bool = False,
 ) -> bool:
-    """Redraw emulated samples for the populations at thetas; return whether there are any.
+    """Redraw emulated samples for the populations at thetas; return whether any was drawn.
 
-    Those of the designs named, and of simulators that share their specimens. ``larger`` samples are
-    not drawn beyond the largest size, and then do not count.
+    The samples are those of the named designs, and of simulators that share their specimens.
+    ``larger`` ones have at most the largest size.
     """
     names = siblings(evaluator.nodes, names)
     is_drawn = False
@@ -362,7 +363,7 @@ def draw_samples(
 def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Redraw emulated samples for the populations at thetas within the context.
 
-    Those of designs of a model that was never calibrated, which cover the prior alone.
+    These are the samples of models that were never calibrated, which cover the prior alone.
     """
     bounds = evaluator.reweighted.items()
     names = {name for name, bound in bounds if len(bound.design.groups) == 1}
@@ -440,7 +441,7 @@ def refuse(
 
 
 def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
-    """Raise if too much of a population, by simulator without a design, has no response."""
+    """Raise if too much of the population of a simulator without a design has no response."""
     for node in evaluator.nodes:
         if node.reweighted is None:
             share, limit = lost.get(node.name, 0.0), node.bound.max_lost

@@ -39,7 +39,7 @@ class LocalOptimum:
     better: bool  # whether it is better than the reference
 
     def finding(self, evaluator: Evaluator) -> Finding:
-        """Report that the data could as well come from here."""
+        """Report that the data could as well come from this optimum."""
         return Finding(
             "second-mode",
             f"Another optimum fits about as well, {point_text(evaluator, self.theta)}: its "
@@ -71,7 +71,7 @@ class Reference:
         return values.reshape(thetas.shape[:-1])
 
     def descend(self, shifts: Floats, curvature: Floats) -> tuple[Floats, Floats]:
-        """Return the minima below shifts from theta, (n, d), all at once, and their values.
+        """Return the minima that descents from shifts, (n, d), reach, and their values.
 
         Shifts and curvature, (d, d), are in units of the prior's spread.
         """
@@ -86,7 +86,7 @@ class Reference:
         return ends, values
 
     def polish(self, thetas: Floats) -> tuple[Floats, Floats]:
-        """Return the minima near thetas, (n, d), and their values, from the reference's Hessian."""
+        """Return the minima near thetas, (n, d), and values, by the Hessian of the reference."""
         local = self.local
         covariance = local.identified @ local.covariance @ local.identified.T
         inverse = (covariance + local.unidentified @ local.unidentified.T) / self.noise

@@ -176,7 +176,8 @@ def mode_weights(
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
-    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass.
+    ``log_prior``, (M,), is added if the optima are those of the likelihood. ``prior_sd``, (d,),
+    then bounds the mass.
     """
     logs = np.array([-mode.value for mode in modes])
     if log_prior is not None:
@@ -403,9 +404,10 @@ def share_mode(
     second: Mode,
     barrier: float,
 ) -> bool:
-    """Return whether two optima are of one mode: no barrier in nats lies between them.
+    """Return whether two optima belong to one mode: no barrier, in nats, lies between them.
 
-    The profile along the straight line has the smallest value across it: a ridge is one mode.
+    The profile along the straight line takes the smallest value across it, so that a ridge is one
+    mode.
     """
     from scipy.linalg import null_space
     from scipy.optimize import minimize as scipy_minimize
@@ -528,7 +530,7 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
 
 
 def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> float:
-    """Return the root of the likelihood ratio of the best mode to theta, given its i-th element."""
+    """Return the signed root of the profile likelihood ratio at theta's i-th element."""
     from scipy.optimize import minimize as scipy_minimize
 
     rest = np.arange(theta.size) != i

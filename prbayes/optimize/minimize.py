@@ -294,7 +294,7 @@ def minimize(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised, and the fits so far."""
+    """State of a minimisation: its search, and the fits so far."""
 
     search: Search
     # update of the progress bar by a number of runs, with a note
@@ -402,7 +402,7 @@ def _fit(
     pilot: Floats | None = None,
     ridge: Ridge | None = None,
 ) -> Fit:
-    """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
+    """Minimise from theta; with several simulators again, scaled by the noise at the pilot."""
     search = replace(problem.search, ridge=ridge)
     evaluator = search.evaluator
     fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
@@ -443,7 +443,8 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
 def _starts_by_cost(search: Search, fit: Fit) -> int:
     """Return the number of starts in search of other optima.
 
-    Where responses are simulated again, a few if the fit is poor and they take half a minute.
+    Where responses are simulated again, it is four if the fit is poor and the search takes less
+    than half a minute.
     """
     evaluator = search.evaluator
     if not evaluator.responses_per_theta:

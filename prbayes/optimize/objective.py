@@ -46,7 +46,7 @@ class Ridge:
 
 @dataclass(eq=False)
 class Objective:
-    """A function in standardised parameters t and values, theta = center + t * prior_sd."""
+    """A function of standardised parameters t, theta = center + t * prior_sd."""
 
     function: Function
     center: Floats  # (d,)
@@ -115,8 +115,8 @@ class Objective:
 def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     """Return the first divisors of the discrepancies, (k,): epsilons, or typical sizes.
 
-    One for a simulator alone. Raises ValueError if log-densities are added to discrepancies
-    without an epsilon of each.
+    The divisor of a single simulator is one. Raises ValueError if log-densities are added to
+    discrepancies without an epsilon of each.
     """
     terms = ""
     if prior:

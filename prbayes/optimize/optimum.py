@@ -177,7 +177,7 @@ def _text(optimum: Optimum) -> str:
 
 
 def _html(optimum: Optimum) -> str:
-    """Return the same for a notebook, as a table."""
+    """Return estimates, cost and findings as a table for a notebook."""
     header = ["", "estimate", "standard error"]
     return view(
         _heading(optimum),
@@ -370,8 +370,8 @@ class Optimum:
 def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) -> Optimum:
     """Return the optimum of a fit, without findings, local optima and design error.
 
-    ``n_previous`` responses were computed for something else. None is computed if a budget has
-    stopped the search.
+    ``n_previous`` responses were computed before the search. No response is computed if a budget
+    has stopped it.
     """
     evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
     hyperparameters = evaluator.hyperparameters
@@ -510,7 +510,7 @@ def _number(value: Any) -> Any:
 
 
 def refuse_model(result: object, caller: str) -> None:
-    """Raise if a model stands where a result is expected."""
+    """Raise if a model is passed instead of a result."""
     if isinstance(result, pm.Model):
         raise TypeError(
             f"{caller}: got a Model, expected a result of prb.minimize or prb.sample; pass the "
@@ -643,7 +643,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
 
 
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
-    """Return how simulators compare their outputs, where not one by one."""
+    """Return how simulators compare several outputs together."""
     if "compared" not in calibration:
         return ()
     clauses = calibration["compared"].values.tolist()

@@ -114,7 +114,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
 
 def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
-    """Return the ratio of variances of the minimiser with shared and with different specimens."""
+    """Return the variance of the minimiser with shared specimens over that with different ones."""
     minima = [item.node.metric.minimum for item in information]
     if len(minima) < 2 or Minimum.UNKNOWN in minima:
         return 1.0
@@ -173,8 +173,8 @@ def _by_sandwich(information: Information) -> float | None:
 def _by_refits(information: Information) -> float | None:
     """Return the mean of delta . grad d / p, delta from the sampling distribution.
 
-    The derivative along delta is the difference between one and a half and half of it: exact for a
-    discrepancy that grows like a square or like an absolute value.
+    The derivative along delta is the difference between 1.5 delta and .5 delta, which is exact for
+    a discrepancy that grows like a square or like an absolute value.
     """
     scales = np.ones(len(information.evaluator.nodes))
     refits = simplex_refits(
@@ -198,7 +198,7 @@ def _by_refits(information: Information) -> float | None:
 
 
 def _by_coverage(information: Information) -> float | None:
-    """Solve for the epsilon whose posteriors cover, with features that are linear in theta."""
+    """Solve for the epsilon whose posteriors have the nominal coverage, with linear features."""
     # Keep the strongest directions, which are the last: two for one output, close to its location
     # and spread, because further information is of the order of the error of derivatives of stored
     # weights. With m outputs they are as many as locations, spreads and correlations.

@@ -132,7 +132,7 @@ class BatchedKernel(SMC_KERNEL):
         self._reset_state()
 
     def _take(self, particles: Particles) -> None:
-        """Take particles over, also to the attributes that PyMC reads."""
+        """Replace the particles, and the attributes that PyMC reads."""
         self.particles = particles
         self.tempered_posterior = particles.thetas
         self.prior_logp = particles.log_prior
@@ -226,7 +226,7 @@ class BatchedKernel(SMC_KERNEL):
         self.n_steps = step
 
     def _accept(self, thetas: Floats, log_ratio: Floats) -> float:
-        """Accept or reject, given the log ratio of the proposal's densities there and back."""
+        """Accept or reject, given the log ratio of the proposal's densities in both directions."""
         current, proposed = self.particles, self._evaluate(thetas)
         with np.errstate(invalid="ignore"):
             tempered = self.beta * (proposed.log_likelihood - current.log_likelihood)
@@ -336,9 +336,9 @@ _DIGEST = hashlib.sha256
 class Checkpoint:
     """Arrays and a JSON note in one netCDF file, which each save replaces at once.
 
-    ``settings`` are what the draws depend on besides the problem; an ``entropy`` of None is that of
-    the file, or a new one. A file that cannot be read, or of another problem or settings, raises
-    StoreError and remains as it is.
+    The draws depend on the problem and on ``settings``. An ``entropy`` of None is replaced by that
+    of the file, or by a new one. A file that cannot be read, or of another problem or settings,
+    raises StoreError and remains as it is.
     """
 
     def __init__(

@@ -219,7 +219,7 @@ def estimate_likelihood(
 def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
-    """Return metrics with whitening and bandwidths of the population, scales and minimiser."""
+    """Return metrics that are prepared on the population, with scales and minimiser."""
     from scipy.optimize import minimize as scipy_minimize
 
     targets = []
@@ -343,7 +343,7 @@ def _likelihood_spread(
 ) -> Floats:
     """Return changes of the populations over a prior standard deviation, (d,).
 
-    Of log weights, or of responses in units of their standard deviation.
+    The changes are those of log weights, or of responses in units of their standard deviation.
     """
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
@@ -483,7 +483,8 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     """Return the standardised combinations of scores that vary, (d, r), by their covariance.
 
     A hyperparameter without influence has a score of zero, and two that only act together have
-    proportional scores. Neither enters the density: their posterior is their prior given the rest.
+    proportional scores. Neither enters the density, so that their posterior is their prior given
+    the others.
     """
     tolerance = options.smallest_eigenvalue
     spread = np.sqrt(np.diag(covariance))

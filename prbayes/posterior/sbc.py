@@ -178,7 +178,7 @@ class Ranks(Tree):
     _parts = ("prior_sbc", "envelope", "truth", "posterior_sd")
 
     def to_dataframe(self) -> Any:
-        """Return a row for each variable: the mean and sd of its ranks, and the envelope's word."""
+        """Return a row for each variable: mean and sd of its ranks, and the envelope's verdict."""
         import pandas as pd
 
         ranks = self["prior_sbc"].to_dataset()

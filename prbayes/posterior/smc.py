@@ -373,7 +373,7 @@ def result_of(
 def _lost_of_some(evaluator: Evaluator, thetas: Floats) -> Floats:
     """Return the share without response, (chains, draws, k), at 64 draws.
 
-    NaN at others, and of simulators with stored responses.
+    It is NaN at other draws, and for simulators with stored responses.
     """
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
@@ -616,7 +616,7 @@ def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence
 
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
-    """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
+    """Return statistics by chain and stage, NaN after the last stage, and the mean evidence."""
     n_stages = max(len(stages["beta"]) for stages in chains)
     variables = {}
     for name in chains[0]:

@@ -76,7 +76,7 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     """Return the posterior given the metrics' own estimate, by scores or refits, or raise.
 
-    The log-density of data sheets is a likelihood itself.
+    For data sheets the log-density of the metric is the likelihood.
     """
     require_density(evaluator)
     if evaluator.nodes[0].metric.exact_likelihood:
@@ -246,9 +246,9 @@ def extended_log_density(
     The weights are known up to a factor.
 
     The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
-    distribution with their moments. A few data sets with one standard error join the moments, which
-    matters if few of the synthetic ones have weights. ``shifts``, (S, r), are the populations
-    relative to the observed estimate.
+    distribution with their moments. A few data sets with a scatter of one standard error are added
+    to the moments, in case few of the synthetic ones have weights. ``shifts``, (S, r), are the
+    populations relative to the observed estimate.
     """
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
@@ -485,7 +485,7 @@ def _moved_inside(
     """Return the distribution at a point inside if the estimate is near an edge, else None.
 
     Near an edge, as where a standard deviation is about zero, estimates pile up and have no
-    density. One linear step from a point inside has: in the variance such a step has no edge.
+    density. One linear step from a point inside has a density, because it may pass the edge.
     """
     evaluator, scales, theta = sampling.evaluator, sampling.scales, sampling.theta
     if needs_refits(evaluator):

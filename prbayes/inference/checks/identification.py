@@ -24,7 +24,7 @@ from prbayes.response.discrepancy import has_discrepancy
 
 
 def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
-    """Name directions that the data identify less than the prior."""
+    """Name directions about which the data are less informative than the prior."""
     hidden = local.unidentified
     indirect = only_through_prior(evaluator)
     if indirect.any():
@@ -41,9 +41,9 @@ def unidentified_findings(
     *,
     has_bounds: bool = True,
 ) -> list[Finding]:
-    """Report directions that the data identify less than the prior, without excluded names.
+    """Report directions about which the data are less informative than the prior.
 
-    ``has_bounds``: bounds from one side were searched.
+    ``excluded`` names are left out. ``has_bounds`` is whether one-sided bounds were searched.
     """
     directions = [name for name in unidentified_names(evaluator, local) if name not in excluded]
     if not directions:
@@ -137,7 +137,7 @@ def canonical_correlation(
 
 
 def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indices]:
-    """Return the elements of theta above the coefficients only, and above other inputs only."""
+    """Return the elements that enter the discrepancy's coefficients only, and other inputs only."""
     if not has_discrepancy(node.bound.responses.function):
         return np.arange(0), np.arange(0)
     inputs, model = node.bound.inputs, evaluator.model
@@ -175,7 +175,7 @@ def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> li
 
 
 def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> list[Finding]:
-    """Report standard errors that are NaN, with the obstacle; by default the end of a support."""
+    """Report standard errors that are NaN. The default reason is the end of a support."""
     names = [name for name, errors in stderr.items() if np.isnan(errors).any()]
     if not names:
         return []
@@ -240,8 +240,8 @@ def elements_at_edge(
 def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
     """Return whether distribution functions at two thetas differ by more than .02.
 
-    Half of the mass whose spread shrinks by a factor of 1.3 makes .035; a constant population has a
-    difference of one point's mass.
+    If the spread of half of the mass shrinks by a factor of 1.3, they differ by .035. Constant
+    populations differ by the mass of one point.
     """
     largest = 0.0
     for k, node in enumerate(evaluator.nodes):

@@ -102,10 +102,11 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
 
 
 def small_simulators(evaluator: Evaluator) -> list[Finding]:
-    """Report simulators of so few specimens that the spread in common is estimated too small.
+    """Report simulators of so few specimens that their common spread is underestimated.
 
-    Bandwidths of few data let simulators that happen to scatter little weigh most, unless they have
-    the same response and so one bandwidth. The probability residual and the area are right.
+    With bandwidths of few data, simulators that scatter little by chance have the largest weight,
+    unless all have one response and so one bandwidth. The probability residual and the area have no
+    such bias.
     """
     enough, nodes = 30, evaluator.nodes
     widths = set()
@@ -210,8 +211,8 @@ def smoothing_bias(
 ) -> list[Finding]:
     """Report log-likelihoods whose smoothing moves the optimum by more than half a standard error.
 
-    By a Newton step to the optimum under kernels of half the width; of stored responses only. It
-    needs the sampling distribution ``local``.
+    The shift is a Newton step to the optimum under kernels of half the width. It needs stored
+    responses and the sampling distribution ``local``.
     """
     smoothed = [
         k

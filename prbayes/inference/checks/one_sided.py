@@ -35,7 +35,7 @@ class OneSidedBound:
 
 
 def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
-    """Report values and limits, those of one side in one finding."""
+    """Report values and limits, in one finding for upper and one for lower limits."""
     findings = []
     words = ("below", "least", "up", "larger"), ("above", "most", "down", "smaller")
     for is_upper in (True, False):
@@ -98,7 +98,7 @@ def one_sided_bounds(
 def _limit(
     theta: Floats, i: int, statistic: Callable[[Floats, int], float], unit: float, most: float
 ) -> float:
-    """Return the i-th element at the limit, at most so many units away, NaN without a limit."""
+    """Return the i-th element at the limit, or NaN if none is within ``most`` units."""
     # distance and statistic of the last point below the limit
     place, below = theta.copy(), (0.0, 0.0)
     highest = float(ndtri(0.95))
@@ -120,7 +120,7 @@ def _limit(
     above = distance, value
 
     def crossing() -> float:
-        """Return where the straight line between both reaches the limit."""
+        """Return the distance at which the line through both points reaches the limit."""
         return float(np.interp(highest, [below[1], above[1]], [below[0], above[0]]))
 
     for _ in range(2):  # regula falsi
@@ -134,7 +134,7 @@ def _limit(
 
 
 def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
-    """Return whether distances, ``lowest`` in all, are three times those of data from there.
+    """Return whether the distance, ``lowest``, is three times that of data drawn at the optimum.
 
     Such a fit may be a local optimum.
     """

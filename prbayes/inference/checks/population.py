@@ -149,7 +149,7 @@ def population_findings(
 
 
 def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
-    """Report populations with a quarter of an expected specimen without response; no run.
+    """Report populations in which at least .25 specimens are expected to have no response; no run.
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
     truncated to the other inputs (`prbayes.specimens.response_share`). Where it is +inf specimens
@@ -182,9 +182,9 @@ def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Findin
 def replaced_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
     """Report populations that rest on finite numbers in place of responses that failed.
 
-    Of stored responses the share is that of the runs' weights; of the log-likelihood by specimen
-    that of specimens whose nearest run has the number. Responses that are simulated again are
-    computed once more.
+    The share is the weight of stored responses that were replaced. For the log-likelihood by
+    specimen it is the share of specimens whose nearest run was replaced. Responses that are
+    simulated again are computed once more.
     """
     shares = {}
     for k, node in enumerate(evaluator.nodes):
@@ -218,22 +218,22 @@ def replaced_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...
 
 
 def _replaces(responses: Responses) -> bool:
-    """Return whether numbers are in place of some responses."""
+    """Return whether finite numbers have replaced some responses."""
     return responses.failures > 0 and bool(np.isfinite(responses.replacement))
 
 
 def _replaced_share(responses: Responses, values: Floats, weights: Floats) -> float:
-    """Return the weight of the responses, (n, ...), that are the number."""
+    """Return the weight of the responses, (n, ...), that were replaced."""
     is_replaced = (values == responses.replacement).reshape(len(values), -1).all(axis=1)
     return float(weights @ is_replaced)
 
 
 def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr: Floats) -> Floats:
-    """Return the shift of an optimum, in standard errors (d,), if lost specimens counted.
+    """Return how far an optimum would move if lost specimens counted, in standard errors, (d,).
 
-    The optimum is that of the specimens with a response. Counted, points without one keep their
-    weight and are farther from the data than all responses. No response is computed where they are
-    stored; the minimum is searched by Nelder-Mead.
+    The optimum is that of the specimens with a response. If they counted, points without a response
+    would keep their weight and be farther from the data than all responses. No response is computed
+    where they are stored; the minimum is searched by Nelder-Mead.
     """
     from scipy.optimize import minimize as scipy_minimize
 
@@ -265,7 +265,7 @@ def refuse_lost_specimens(evaluator: Evaluator, theta: Floats) -> None:
 def failing_share(evaluator: Evaluator, theta: Floats) -> dict[str, float]:
     """Return the share of a population, at theta (d,), without a finite response; no run.
 
-    By simulator, of the log-likelihood by specimen alone.
+    The shares are by simulator, of those with a log-likelihood by specimen.
     """
     shares = dict.fromkeys((simulator.name for simulator in evaluator.emulated), 0.0)
     return shares | {s.name: share for s, share in _failing_shares(evaluator, theta)}

@@ -76,9 +76,9 @@ def interval_ratios(n: float) -> tuple[float, float]:
 
 
 def few_specimens(evaluator: Evaluator) -> list[Finding]:
-    """Report hyperparameters that follow from so few specimens that standard errors are too small.
+    """Report too few specimens for standard errors.
 
-    Simulators with an element of theta in common count together.
+    Specimens of simulators with a common element of theta are added.
     """
     enough = 8
     enters = elements_above(evaluator)
@@ -121,7 +121,8 @@ def _spread_in_common(
     """Report a spread that populations with means of their own underestimate (Neyman and Scott).
 
     With G means the maximum of the likelihood is sqrt(1 - G / N) of a common standard deviation,
-    about G / sqrt(2 N) standard errors below it. The metrics are tested by refits.
+    about G / sqrt(2 N) standard errors below it. Metrics of distributions are tested by refits
+    instead.
     """
     if evaluator.nodes:
         return []
