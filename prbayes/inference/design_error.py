@@ -15,6 +15,7 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import observed_set
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
@@ -32,6 +33,11 @@ class DesignErrors:
         """Both distances together; NaN if neither is known."""
         errors = [e for e in (self.points, self.emulators) if not np.isnan(e)]
         return float(np.linalg.norm(errors)) if errors else np.nan
+
+
+def is_emulated(evaluator: Evaluator) -> bool:
+    """Return whether all designs have emulated samples; True without a design."""
+    return all(bound.design.is_emulated for bound in evaluator.reweighted.values())
 
 
 def design_error(sampling: SamplingDistribution) -> DesignErrors:
@@ -95,7 +101,7 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
-    if all(bound.design.is_emulated for bound in evaluator.reweighted.values()):
+    if is_emulated(evaluator):
         # This is the rate of points that fill d dimensions evenly, for functions with a jump along
         # a surface. The rate of smooth functions is up to 1/2 + 1/d (He and Owen 2016,
         # doi:10.1111/rssb.12132).

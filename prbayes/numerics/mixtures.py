@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
+from prbayes._stats import reached
 from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
 
@@ -88,8 +89,7 @@ class StudentMixture:
         """Return Sobol points of the mixture, (size, d), with each component's share of them."""
         d = self.centers.shape[1]
         u = sobol(size, d + 2, seed)
-        component = np.searchsorted(np.cumsum(self.shares), u[:, d + 1])
-        component = component.clip(max=len(self.shares) - 1)
+        component = reached(self.shares, u[:, d + 1])
         standard = student_vectors(u[:, : d + 1], self.degrees)
         shifts = np.einsum("sde,se->sd", self.roots[component], standard)
         return np.asarray(self.centers[component] + shifts)

@@ -13,7 +13,7 @@ from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information, oriented
 from prbayes.inference.checks.identification import unidentified_names
-from prbayes.inference.design_error import DesignErrors, design_error
+from prbayes.inference.design_error import DesignErrors, design_error, is_emulated
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
 from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
@@ -113,11 +113,10 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
     local = None if fit.sampling is None else fit.sampling.local
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if fit.ridge is not None and local is not None:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-    elif fit.pilot is None or (is_emulated and local is not None):
+    elif fit.pilot is None or (local is not None and is_emulated(evaluator)):
         # Take the prior's variance for elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
@@ -232,8 +231,7 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    if not is_emulated or errors.emulators > _SHARE * AGREE:
+    if not is_emulated(evaluator) or errors.emulators > _SHARE * AGREE:
         # Assume that the error of a design of several inputs falls with the power .65 of its size.
         # Add at most as many runs as there are, because the estimate of the error is itself
         # uncertain.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -153,10 +154,17 @@ def _rows(optimum: Optimum) -> list[list[str]]:
         if not has_rows or value.size > 20:
             rows.append([name, short(value), short(error)])
             continue
-        values, errors = single_elements({name: value}), single_elements({name: error})
-        for element in optimum_elements({name: value}, {name: error}):
-            rows.append([element, short(values[element]), short(errors[element])])
+        for element, *numbers in _elements({name: value}, {name: error}):
+            rows.append([element, *map(short, numbers)])
     return rows
+
+
+def _elements(
+    point: Mapping[Any, xr.DataArray], stderr: Mapping[Any, xr.DataArray]
+) -> list[tuple[str, float, float]]:
+    """Return name, estimate and standard error of each element in a table."""
+    values, errors = single_elements(point), single_elements(stderr)
+    return [(name, values[name], errors[name]) for name in optimum_elements(point, stderr)]
 
 
 def _failures_and_findings(optimum: Optimum) -> list[str]:
@@ -315,13 +323,9 @@ class Optimum:
 
         point = labelled(self.evaluator, self.point, {}).data_vars
         stderr = labelled(self.evaluator, self.stderr, {}).data_vars
-        values, errors = single_elements(point), single_elements(stderr)
-        names = optimum_elements(point, stderr)
-        columns = {
-            "estimate": [values[name] for name in names],
-            "standard error": [errors[name] for name in names],
-        }
-        return pd.DataFrame(columns, index=pd.Index(names, name="hyperparameter"))
+        columns = ["hyperparameter", "estimate", "standard error"]
+        rows = _elements(point, stderr)
+        return pd.DataFrame(rows, columns=columns).set_index("hyperparameter")
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.

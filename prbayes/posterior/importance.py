@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from prbayes._stats import reached
 from prbayes._validate import Floats
 from prbayes.numerics.mixtures import StudentMixture, effective_sample_size
 from prbayes.numerics.modes import Laplace, LogDensity
@@ -151,9 +152,8 @@ def _resampled(
     # Shuffle the points, because every fourth point of a Sobol sequence is in the same quarter.
     order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
-    places = np.searchsorted(np.cumsum(weights[order]), positions)
     # Shuffle the draws, because copies of a point are next to each other.
-    rows = rng.permutation(order[places.clip(max=len(weights) - 1)])
+    rows = rng.permutation(order[reached(weights[order], positions)])
     efficiency = float(effective_sample_size(weights) / len(weights))
     effective = efficiency * len(points)
     return ImportanceSample(
