@@ -19,13 +19,13 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._validate import Bools, Floats
-from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
+from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
     refuse_lost_specimens,
     replaced_findings,
 )
-from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
+from prbayes.inference.checks.prior import elements_at_prior_ends
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.model.evaluator import (
@@ -443,7 +443,7 @@ def _findings(
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = [*failing_region_findings(evaluator, best.theta)]
     findings += replaced_findings(evaluator, best.theta)
-    findings += [*few_specimens(evaluator), *prior_end_findings(ends)]
+    findings += few_specimens(evaluator)
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(
@@ -456,13 +456,12 @@ def _findings(
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     is_direct = ~only_through_prior(evaluator)
-    unidentified = names[np.isinf(np.diag(best.covariance)) & is_direct].tolist()
+    unidentified = names[is_flat & is_direct].tolist()
     bounds = one_sided_bounds(
         evaluator, best.theta, is_flat & is_direct, partial(_signed_root, objective, best)
     )
-    bounds = [bound for bound in bounds if bound.name not in {end.name for end in ends}]
-    findings += bound_findings(bounds)
-    excluded = {end.name for end in ends} | {bound.name for bound in bounds}
+    one_sided, excluded = end_and_bound_findings(ends, bounds)
+    findings += one_sided
     flat = [name for name in unidentified if name not in excluded]
     if flat:
         findings.append(

@@ -41,12 +41,12 @@ from prbayes.inference.checks.metric_suitability import (
     smoothing_bias,
 )
 from prbayes.inference.checks.one_sided import (
-    bound_findings,
     bounds_by_metric,
+    end_and_bound_findings,
     is_far_from_data,
 )
 from prbayes.inference.checks.population import replaced_findings
-from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
+from prbayes.inference.checks.prior import ends_by_metric
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import (
@@ -595,14 +595,10 @@ def optimum_findings(
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
         findings += few_specimens(evaluator)
-        ends = ends_by_metric(sampling)
+        ends, bounds = ends_by_metric(sampling), bounds_by_metric(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
-        findings += prior_end_findings(ends, page)
-        names = {end.name for end in ends}
-        bounds = bounds_by_metric(sampling)
-        if bounds is not None:
-            findings += bound_findings([b for b in bounds if b.name not in names])
-            names |= {bound.name for bound in bounds}
+        one_sided, names = end_and_bound_findings(ends, bounds or [], page)
+        findings += one_sided
         findings += unidentified_findings(
             evaluator, sampling.local, names, has_bounds=bounds is not None
         )

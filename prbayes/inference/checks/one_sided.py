@@ -15,6 +15,7 @@ from scipy.special import ndtri
 
 from prbayes._finding import Finding
 from prbayes._validate import Bools, Floats
+from prbayes.inference.checks.prior import PriorEnd, prior_end_findings
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored, needs_refits
 from prbayes.inference.resampling import observed_set
@@ -58,6 +59,18 @@ def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
         )
         findings.append(Finding("one-sided-bound", text, "optimum_or_abc.md#a-spread-near-zero"))
     return findings
+
+
+def end_and_bound_findings(
+    ends: list[PriorEnd],
+    bounds: Sequence[OneSidedBound],
+    page: str = "likelihood.md#end-of-a-prior",
+) -> tuple[list[Finding], set[str]]:
+    """Report ends of priors, and bounds of the other hyperparameters; return the names as well."""
+    names = {end.name for end in ends}
+    bounds = [bound for bound in bounds if bound.name not in names]
+    findings = [*prior_end_findings(ends, page), *bound_findings(bounds)]
+    return findings, names | {bound.name for bound in bounds}
 
 
 def one_sided_bounds(
