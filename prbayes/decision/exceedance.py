@@ -32,7 +32,6 @@ from prbayes.decision.populations import (
     CentralSpecimens,
     InverseTransform,
     Populations,
-    ResponseSample,
     output_column,
     probability_bounds,
 )
@@ -359,7 +358,13 @@ class _Question:
             responses = self.populations.responses(self.response, inputs)
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
         sample = self.populations.sample(self.response, inputs, self.output)
-        return _stored_probability(sample, quantity)
+        by_draw = sample.evaluate(quantity.of, self.populations.thetas)
+        error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
+        error = np.hypot(error, _error_of_draws(self.populations, by_draw))
+        kind = "stored" if sample.emulator is None else "emulated"
+        source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
+        count, n_runs = sample.responses.count, sample.n_runs
+        return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
     def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
         """Return an estimate by new points, if they are no more than the runs of the first one.
@@ -374,17 +379,6 @@ class _Question:
         except TypeError:
             return estimate
         return replace(refined, responses=estimate.responses + refined.responses)
-
-
-def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estimate:
-    """Return the probabilities of each population from stored or emulated responses."""
-    by_draw = sample.evaluate(quantity.of, sample.populations.thetas)
-    error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
-    error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
-    kind = "stored" if sample.emulator is None else "emulated"
-    source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
-    count, n_runs = sample.responses.count, sample.n_runs
-    return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
 
 def _rare_probability(

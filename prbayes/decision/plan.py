@@ -354,9 +354,15 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     if not design.has_runs:
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
-    # The ideal sample has at least 50 specimens, because smaller ones have other bandwidths.
+    # The ideal sample has specimens at equal steps of probability, at least 50 of them because
+    # smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)
-    target = (metric or node.metric).against(_ideal_sample(sample, n))
+    is_observable = observable(sample.outputs, node.target)
+    values = sample.outputs[is_observable]
+    mass = sample.masses(center[None])[0, is_observable]
+    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    rows = order[reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)]
+    target = (metric or node.metric).against(values[rows])
     bound = design.copied(design.design.with_values(sample.outputs))
     bound.target = target.metric.for_inputs(target, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
@@ -520,17 +526,6 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
     values, vectors = np.linalg.eigh(inverse @ information @ inverse.T)
     capped = (vectors * np.minimum(values, 1.0)) @ vectors.T
     return np.asarray(root @ capped @ root.T)
-
-
-def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
-    """Return n specimens at equal steps of probability of the central population."""
-    node = sample.populations.evaluator.nodes[sample.k]
-    is_observable = observable(sample.outputs, node.target)
-    values = sample.outputs[is_observable]
-    mass = sample.masses(sample.populations.center[None])[0, is_observable]
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
-    steps = (np.arange(n) + 0.5) / n
-    return values[order][reached(mass[order], steps, normalized=True)]
 
 
 def _validated_counts(k: object) -> list[int]:

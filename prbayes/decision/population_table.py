@@ -169,7 +169,10 @@ def population(
                 table[0, i, :, q] = _quantiles(draws, [confidence])[0]
                 continue
             low, high = _quantiles(draws, tails)
-            table[:, i, :, q] = [_mean(draws) if populations.are_draws else values[:, 0], low, high]
+            estimate = values[:, 0]
+            if populations.are_draws:
+                estimate = np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
+            table[:, i, :, q] = [estimate, low, high]
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -195,11 +198,6 @@ def population(
 def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:
     """Return quantiles over populations, (groups, k) -> (p, groups); a draw may be infinite."""
     return np.array([quantiles_of(_defined(row, np.isnan(row)), probabilities) for row in draws]).T
-
-
-def _mean(draws: Floats) -> Floats:
-    """Return means over populations, (groups, k) -> (groups,)."""
-    return np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
 
 
 def _defined(row: Floats, is_left_out: Any) -> Floats:

@@ -145,8 +145,15 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
 
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """
-    d = evaluator.hyperparameters.size
-    lower, upper = _logistic_ends(evaluator.hyperparameters)
+    hyperparameters = evaluator.hyperparameters
+    d = hyperparameters.size
+    base = hyperparameters.prior_thetas(2, 0)
+    _, lower, upper = ends_of_prior(hyperparameters, base[0])
+    expected = lower + (upper - lower) * expit(base)
+    if np.isfinite(expected).any():
+        values = _free_values(hyperparameters, base)
+        is_logistic = np.isclose(values, expected, rtol=1e-9).all(axis=0)
+        lower, upper = (np.where(is_logistic, ends, np.nan) for ends in (lower, upper))
     bounded = np.isfinite(upper - lower)
     below, above = bounded.copy(), bounded.copy()
     for side, sign in ((below, -1), (above, 1)):
@@ -183,18 +190,6 @@ def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floa
     lower = np.where((low == outermost) & np.isfinite(low), low, np.nan)
     upper = np.where((high == uppermost) & np.isfinite(high), high, np.nan)
     return values[0], lower, upper
-
-
-def _logistic_ends(hyperparameters: Hyperparameters) -> tuple[Floats, Floats]:
-    """Return the ends, (d,) each, of elements that are logistic functions of theta, else NaN."""
-    base = hyperparameters.prior_thetas(2, 0)
-    _, lower, upper = ends_of_prior(hyperparameters, base[0])
-    expected = lower + (upper - lower) * expit(base)
-    is_logistic = np.zeros(lower.size, dtype=bool)
-    if np.isfinite(expected).any():
-        values = _free_values(hyperparameters, base)
-        is_logistic = np.isclose(values, expected, rtol=1e-9).all(axis=0)
-    return np.where(is_logistic, lower, np.nan), np.where(is_logistic, upper, np.nan)
 
 
 def _free_values(hyperparameters: Hyperparameters, thetas: Floats) -> Floats:

@@ -12,7 +12,7 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
-from prbayes.optimize.convergence import Fit
+from prbayes.optimize.convergence import Fit, Search
 from prbayes.optimize.design_refinement import FEW_SETS, noise_floors, refine_at
 from prbayes.optimize.objective import Ridge
 from prbayes.optimize.optimum import point_text
@@ -126,25 +126,24 @@ class Reference:
         ]
 
 
-def find_local_optima(
-    evaluator: Evaluator, fit: Fit, starts: int, seed: int, *, refine: bool
-) -> list[LocalOptimum]:
+def find_local_optima(search: Search, fit: Fit, starts: int) -> list[LocalOptimum]:
     """Return other optima than a fit, sorted by value; refine designs where they fall short."""
     if fit.sampling is None:
         return []
+    evaluator, settings = search.evaluator, search.settings
     floors = noise_floors(evaluator, fit.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / fit.scales).sum())
     reference = Reference(evaluator, fit.theta, fit.scales, fit.sampling.local, noise, fit.ridge)
     undersampled: list[Floats] = []
     for remaining in (2, 1, 0):  # most designs need one search
-        candidates = optima_from_prior(reference, starts, seed, undersampled)
+        candidates = optima_from_prior(reference, starts, settings.random_seed, undersampled)
         optima = [o for o in candidates if not shortcomings(evaluator, o.theta[None])]
         undersampled = [
             optimum.theta
             for optimum in candidates
             if (optimum.better or optimum.comparable) and optimum not in optima
         ]
-        if not undersampled or not refine or not remaining:
+        if not (undersampled and settings.refine and remaining):
             break
         refine_at(evaluator, undersampled[0][None], beside=fit.theta[None])
     if len(floors) < 2 or not optima:

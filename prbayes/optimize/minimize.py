@@ -426,9 +426,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
             return fit, []
-        optima = find_local_optima(
-            evaluator, fit, n_starts, settings.random_seed, refine=settings.refine
-        )
+        optima = find_local_optima(problem.search, fit, n_starts)
         if not (is_first and optima and optima[0].better):
             break
         search = replace(problem.search, ridge=fit.ridge)

@@ -355,14 +355,6 @@ class Checkpoint:
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = str(np.random.SeedSequence().entropy)
 
-    def arrays_of(self, prefix: str) -> dict[str, Floats]:
-        """Return the arrays whose names begin with a prefix, by the rest of their names."""
-        return {
-            name.removeprefix(prefix): array
-            for name, array in self.arrays.items()
-            if name.startswith(prefix)
-        }
-
     def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Replace the file; it is safe on disk when this returns."""
         variables = {}

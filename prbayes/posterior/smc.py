@@ -602,8 +602,13 @@ def _saved_states(checkpoint: Checkpoint, round_: int) -> list[State]:
     """Return the states of the kernels that have begun in this round of refinement."""
     if checkpoint.note.get("round") != round_:
         return []
-    notes = checkpoint.note["states"]
-    return [(checkpoint.arrays_of(f"chain{i}_"), note) for i, note in enumerate(notes)]
+    states = []
+    for i, note in enumerate(checkpoint.note["states"]):
+        prefix = f"chain{i}_"
+        arrays = checkpoint.arrays.items()
+        of_chain = {k.removeprefix(prefix): v for k, v in arrays if k.startswith(prefix)}
+        states.append((of_chain, note))
+    return states
 
 
 def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence[Floats]) -> None:
