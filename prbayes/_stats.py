@@ -97,7 +97,7 @@ def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     return quantiles if np.ndim(probability) > 0 else quantiles[..., 0]
 
 
-def ascending_quantile(values: Floats, weights: Floats, levels: ArrayLike) -> Floats:
+def ascending_quantile(values: Floats, weights: Floats, levels: float | Floats) -> Floats:
     """Return `quantile` of ascending values, (n,), with weights (n,): (), or (m,) of m levels."""
     middles = np.cumsum(weights) - 0.5 * weights
     return np.asarray(np.interp(levels, middles, values))

@@ -258,39 +258,34 @@ def _group_scores(
     numbers, total = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
-    observed = np.zeros((n, len(point)))
-    populations: list[WeightSlopes | ShiftedResponses] = []
-    functions = []
-    for k, node in zip(members, nodes, strict=True):
-        population = _derivatives(evaluator, k, point, options)
-        score = partial(
-            specimen_scores, node.target, population, options=options.score, total=total
-        )
-        # The gradient of the objective, in units of the prior, is the sum of these scores over
-        # specimens.
-        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
-        observed += factor * score(node.observed[np.argsort(numbers[k])])
-        populations.append(population)
-        functions.append((factor, score))
-    mean = observed.mean(axis=0)
+    populations = [_derivatives(evaluator, k, point, options) for k in members]
+    functions = [
+        partial(specimen_scores, node.target, population, options=options.score, total=total)
+        for node, population in zip(nodes, populations, strict=True)
+    ]
+    # The gradient of the objective, in units of the prior, is the sum of these scores over
+    # specimens.
+    factors = [evaluator.hyperparameters.prior_sd / (n * scales[k]) for k in members]
+    parts = zip(members, nodes, factors, functions, strict=True)
+    observed = sum(
+        factor * score(node.observed[np.argsort(numbers[k])]) for k, node, factor, score in parts
+    )
+    mean = np.mean(observed, axis=0)
     identity = np.eye(len(point))
-    is_stored = [node.bound.stored for node in nodes]
-    if not all(is_stored):
+    if not all(node.bound.stored for node in nodes):
         tables = []
-        for k, (factor, _), population in zip(members, functions, populations, strict=True):
+        for k, node, factor, population in zip(members, nodes, factors, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
-            node = evaluator.nodes[k]
             table = tabulated_scores(node.target, population, node.observed, options.score, total)
             tables.append((k, factor, table))
         return ResimulatedScores(tuple(tables), mean, n, identity)
-    is_observable = np.ones(len(populations[0].responses), dtype=bool)
-    for node, population in zip(nodes, populations, strict=True):
-        is_observable &= observable(population.responses, node.target)
-    parts = [
-        factor * score(population.responses[is_observable])
-        for (factor, score), population in zip(functions, populations, strict=True)
-    ]
-    stored = sum(parts) - mean
+    responses = [population.responses for population in populations]
+    targets = [node.target for node in nodes]
+    is_observable = np.all(list(map(observable, responses, targets)), axis=0)
+    stored = -mean + sum(
+        factor * score(values[is_observable])
+        for factor, score, values in zip(factors, functions, responses, strict=True)
+    )
     rows = max(16, IN_CACHE // len(stored))
     return StoredScores(members[0], is_observable, stored, n, identity, rows)
 
