@@ -147,7 +147,7 @@ def _limit(
 
 
 def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
-    """Return whether the distance, ``lowest``, is three times that of data drawn at the optimum.
+    """Return whether the distance, ``lowest``, is over three times that of data drawn there.
 
     Such a fit may be a local optimum.
     """
