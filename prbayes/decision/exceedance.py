@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 from os import PathLike
 from typing import Any
 
@@ -434,7 +435,7 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
 
 def _rough_finding(response: Any, estimates: Sequence[_Estimate], is_rough: Bools) -> list[Finding]:
     """Return a finding if the error of a probability is too large."""
-    rough = [estimate for estimate, bad in zip(estimates, is_rough, strict=True) if bad]
+    rough = list(compress(estimates, is_rough))
     if not rough:
         return []
     worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -324,18 +325,16 @@ class _Forecast:
 
         if not exceeds(0):
             return 0.0
-        short, enough = 0, 1
+        enough = 1
         while exceeds(enough):
-            short, enough = enough, 2 * enough
-            if short > 1_000_000:
+            enough *= 2
+            if enough > 2_000_000:
                 return np.inf
-        while enough - short > 1:
-            middle = (enough + short) // 2
-            if exceeds(middle):
-                short = middle
-            else:
-                enough = middle
-        return float(enough)
+        short = enough // 2
+        smallest = bisect_left(
+            range(enough), True, lo=short + 1, key=lambda number: not exceeds(number)
+        )
+        return float(smallest)
 
 
 # -- information of one specimen -------------------------------------------------------------------

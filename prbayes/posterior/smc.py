@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from os import PathLike
 from typing import Any, Literal
 
@@ -622,17 +623,15 @@ def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
     """Return statistics by chain and stage, NaN after the last stage, and the mean evidence."""
-    n_stages = max(len(stages["beta"]) for stages in chains)
     variables = {}
     for name in chains[0]:
-        table = np.full((len(chains), n_stages), np.nan)
-        for row, stages in zip(table, chains, strict=True):
-            row[: len(stages[name])] = stages[name]
-        variables[name] = (["chain", "stage"], table)
-    coords = {"chain": np.arange(len(chains)), "stage": np.arange(n_stages)}
+        by_stage = zip_longest(*(stages[name] for stages in chains), fillvalue=np.nan)
+        variables[name] = (["stage", "chain"], np.array(list(by_stage), dtype=float))
+    statistics = xr.Dataset(variables).transpose("chain", "stage")
+    coords = {dim: np.arange(size) for dim, size in statistics.sizes.items()}
     logs = np.array([stages["log_marginal_likelihood"][-1] for stages in chains])
     evidence = {
         "log_marginal_likelihood": float(logsumexp(logs) - np.log(logs.size)),
         "log_marginal_likelihood_sd": float(logs.std(ddof=1)) if logs.size > 1 else np.nan,
     }
-    return xr.Dataset(variables, coords=coords), evidence
+    return statistics.assign_coords(coords), evidence

@@ -142,15 +142,13 @@ def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indic
         return np.arange(0), np.arange(0)
     inputs, model = node.bound.inputs, evaluator.model
     *arguments, coefficients = range(len(inputs.arguments))
+    shapes = evaluator.hyperparameters.shapes.values()
+    sizes = [int(np.prod(shape, dtype=int)) for shape in shapes]
     above = []
     for numbers in ([coefficients], arguments):
         names = {rv.name for rv in inputs.parents_above(numbers)}
-        is_above: list[bool] = []
-        shapes = evaluator.hyperparameters.shapes.values()
-        for value, shape in zip(model.value_vars, shapes, strict=True):
-            size = int(np.prod(shape, dtype=int))
-            is_above += [model.values_to_rvs[value].name in names] * size
-        above.append(np.flatnonzero(is_above))
+        is_above = [model.values_to_rvs[value].name in names for value in model.value_vars]
+        above.append(np.flatnonzero(np.repeat(is_above, sizes)))
     return np.setdiff1d(above[0], above[1]), np.setdiff1d(above[1], above[0])
 
 
