@@ -23,7 +23,7 @@ from benchmarks.metrics import METRICS
 from benchmarks.study import Study
 from benchmarks.systems import SYSTEMS
 from prbayes.optimize.convergence import Search, Trace, approach, minimise, settle
-from prbayes.optimize.objective import Method
+from prbayes.optimize.objective import Minimisation
 
 IMAGES = Path("docs/images")
 SIZE = 1000
@@ -64,13 +64,11 @@ def basins(evaluator: Any, name: str, *, guided: bool) -> tuple[Any, float]:
     mu, sigma = SYSTEMS[name].truth
     labels, counts = [], []
     for theta in thetas(name, STARTS):
-        search = Search(
-            evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5,
-            max_evaluations=500,
-        )  # fmt: skip
+        settings = Minimisation(tolerance=1e-5, max_evaluations=500)
+        search = Search(evaluator, np.array([sigma, 1.0]), settings)
         start, trace = theta, Trace()
         if guided:
-            start, trace = approach(search, theta, np.ones(1), 0, trace)
+            start, trace = approach(search, theta, np.ones(1), trace)
         run = settle(search, minimise(search, start, np.ones(1), trace))
         at, spread = run.theta[0], np.exp(run.theta[1])
         is_close = 0.5 < spread / sigma < 2

@@ -25,7 +25,7 @@ from benchmarks.study import Study
 from benchmarks.systems import SYSTEMS
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.convergence import Search, Trace, minimise, settle
-from prbayes.optimize.objective import Method
+from prbayes.optimize.objective import Method, Minimisation
 
 SIZES = (20, 50, 1000, 100_000)
 POINTS = {
@@ -68,9 +68,8 @@ def row(cell: str, seed: int) -> dict[str, list[float]]:
     names = base.hyperparameters
     fits = {}
     for method, configured in METHODS.items():
-        search = Search(
-            ev, names.prior_sd, configured, prior=False, tolerance=1e-6, max_evaluations=2000
-        )
+        settings = Minimisation(method=configured, max_evaluations=2000)
+        search = Search(ev, names.prior_sd, settings)
         theta = names.unconstrained({"mu": system.initial[0], "sigma": system.initial[1]})
         run = settle(search, minimise(search, theta, np.ones(1), Trace()))
         point = names.constrained(run.theta[None])

@@ -41,7 +41,8 @@ import prbayes as prb
 from benchmarks.metrics import METRICS
 from benchmarks.study import Study
 from prbayes.metrics.density import twice_silverman
-from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.numerics.modes import laplace
+from prbayes.posterior.importance import importance_sample
 from prbayes.posterior.saddlepoint import EstimateLikelihood, estimate_likelihood
 from prbayes.posterior.target import RefitLikelihood, Target, refit_likelihood
 

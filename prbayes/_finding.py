@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 from prbayes._validate import plain_text
 
@@ -66,6 +67,11 @@ def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, .
 def as_json(findings: Iterable[Finding]) -> str:
     """Return findings as one attribute of a stored result."""
     return json.dumps([asdict(finding) for finding in findings])
+
+
+def sentences_of(attrs: Mapping[str, Any]) -> list[str]:
+    """Return the findings in the attributes of a stored result as sentences."""
+    return [str(finding) for finding in from_json(attrs.get("findings", "[]"))]
 
 
 def from_json(text: str) -> tuple[Finding, ...]:

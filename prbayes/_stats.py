@@ -14,19 +14,20 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 
-# The order of equal values decides the last digit of a sum of weights, and nothing else. "stable"
-# keeps it on every processor; "quicksort" is seven times faster for 100 000 values.
+# Algorithm of a sort. The order of equal values affects only the last digit of a sum of weights.
+# "stable" gives the same order on every processor, "quicksort" is seven times faster for 100 000
+# values.
 Sorting = Literal["stable", "quicksort"]
 
-# Probability of intervals: what ArviZ takes by default, az.rcParams["stats.ci_prob"].
+# Probability of intervals, which is ArviZ's default az.rcParams["stats.ci_prob"]
 INTERVAL = 0.89
 
-# Replicates for an envelope: the coverage for right models then has a standard error of .007, and
-# more would only cost memory.
+# Number of replicates for an envelope. The coverage for right models then has a standard error of
+# .007, and more would only cost memory.
 ENVELOPED = 999
 
 
@@ -40,23 +41,21 @@ def finite_sample(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return values[is_finite], w
 
 
-def ranked(
-    values: Floats, points: Floats, *, kind: Sorting = "stable"
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def ranked(values: Floats, points: Floats, *, kind: Sorting = "stable") -> tuple[Indices, Indices]:
     """Return the order of values, (n,), and how many of them are not above each point, (m,)."""
     order = np.argsort(values, kind=kind)
     below = np.searchsorted(values[order], points, side="right")
     return order, below
 
 
-def cumulated(weights: Floats, order: NDArray[np.intp]) -> Floats:
+def cumulated(weights: Floats, order: Indices) -> Floats:
     """Return sums of the first 0, 1, ... n weights in an order, (..., n), (n,) -> (..., n + 1)."""
     total = np.cumsum(weights[..., order], axis=-1)
     zero = np.zeros((*total.shape[:-1], 1))
     return np.concatenate([zero, total], axis=-1)
 
 
-def summed_below(weights: Any, order: NDArray[np.intp], below: Any, xp: Any = np) -> Any:
+def summed_below(weights: Any, order: Indices, below: Any, xp: Any = np) -> Any:
     """Return the sums of the first ``below`` weights in an order, (..., n), (n,), (m,) -> (..., m).
 
     ``cumulated(weights, order)[..., below]`` by operations that JAX differentiates too: no array is
@@ -74,11 +73,11 @@ def distribution_function(
 
     Values have shape (n,) or (..., n), weights (..., n); the weights are not normalised here.
     """
-    # A batch of values without strides is one row, to be sorted once.
+    # A batch of values without strides repeats one row: sort it once.
     if values.ndim == 1 or (values.size > 0 and not any(values.strides[:-1])):
         first = (0,) * (values.ndim - 1)
         order, below = ranked(values[first], points, kind=kind)
-        return np.asarray(cumulated(weights, order)[..., below])
+        return cumulated(weights, order)[..., below]
     rows = np.broadcast_to(values, weights.shape)
     batch = weights.shape[:-1]
     out = np.empty((*batch, points.size))
@@ -98,18 +97,27 @@ def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     return quantiles if np.ndim(probability) > 0 else quantiles[..., 0]
 
 
+def ascending_quantile(values: Floats, weights: Floats, levels: float | Floats) -> Floats:
+    """Return `quantile` of ascending values, (n,), with weights (n,): (), or (m,) of m levels."""
+    middles = np.cumsum(weights) - 0.5 * weights
+    return np.asarray(np.interp(levels, middles, values))
+
+
 def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats:
-    # Of equal values the lightest first, whatever their order in the sample.
+    # Sort equal values by weight, so that the result does not depend on their order in the sample.
     order = np.lexsort((weights, values))
-    ascending = weights[order]
-    middles = np.cumsum(ascending) - 0.5 * ascending
-    return np.interp(levels, middles, values[order])
+    return ascending_quantile(values[order], weights[order], levels)
 
 
 _row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n),(m)->(m)")
 
 
-def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> NDArray[np.intp]:
+def tail_levels(prob: float) -> list[float]:
+    """Return the probabilities of the ends of an interval with equal tails."""
+    return [(1 - prob) / 2, (1 + prob) / 2]
+
+
+def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> Indices:
     """Return the index at which the running sum of weights first reaches each level.
 
     Weights (..., n) and levels (..., m) give indices (..., m): the step-wise quantile of ascending
@@ -145,7 +153,8 @@ def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
     rows = np.sort(replicates, axis=1)
     columns = np.sort(rows, axis=0)
     size = len(rows)
-    # How many replicates are as far out, on the nearer side, at the outermost value of each.
+    # depth: number of replicates that are as far out, on the nearer side, at each one's outermost
+    # value
     depth = np.full(size, size)
     for column, values in zip(columns.T, rows.T, strict=True):
         as_low = np.searchsorted(column, values, side="right")
@@ -193,4 +202,4 @@ def log_sum_exp(terms: Floats) -> Floats:
     scaled = terms - largest
     np.exp(scaled, out=scaled)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(scaled.sum(axis=-1)) + largest[..., 0])
+        return np.log(scaled.sum(axis=-1)) + largest[..., 0]

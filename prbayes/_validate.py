@@ -19,6 +19,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 # Numbers in memory at a time where work is done in blocks: 32 MiB. Where the blocks leave a trace
 # in an answer, that place says so.

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import compress
 from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, from_json, report
-from prbayes._stats import INTERVAL
+from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import (
     AT_ONCE,
+    Bools,
     Floats,
     Seed,
     finite_number,
@@ -31,7 +33,6 @@ from prbayes.decision.populations import (
     CentralSpecimens,
     InverseTransform,
     Populations,
-    ResponseSample,
     output_column,
     probability_bounds,
 )
@@ -186,7 +187,7 @@ def exceedance(
     positive_integer(n_draws, "n_draws", minimum=2)
     if n_points is not None:
         positive_integer(n_points, "n_points", minimum=0)
-    if 0 < (n_points or 0) < 100:  # a tenth of them is a step towards the limit
+    if 0 < (n_points or 0) < 100:  # because the search for the limit takes steps of a part of them
         raise ValueError(f"n_points: got {n_points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
     calling = call_settings(executor, store, version)
@@ -198,8 +199,7 @@ def exceedance(
     n_searched = 0
     if len(places) > 1:
         respond = CentralSpecimens(populations, response, output, n_points or estimates[0].runs)
-        sign = -1.0 if below else 1.0
-        extremes = extreme_places(inputs, places, lambda x: sign * respond(x), [sign * limit])
+        extremes = extreme_places(inputs, places, respond, [limit])
         places += extremes
         estimates += [question.estimate(place, n_points) for place in extremes]
         n_searched = respond.count
@@ -214,7 +214,8 @@ def exceedance(
     low, high = np.transpose([estimate.interval(prob) for estimate in estimates])
     bounds = [int(means.argmin()), int(means.argmax())]
     verdict = "" if requirement is None else _verdict(estimates, requirement, prob)
-    # Where two standard errors are a factor of two of the probability, about, or would decide.
+    # A probability is rough if two standard errors are about a factor of two, or would decide the
+    # requirement.
     is_rough = np.zeros(len(means), dtype=bool)
     is_rough[bounds] = errors[bounds] > 0.3 * means[bounds]
     if requirement is not None and verdict == "not decided":
@@ -270,7 +271,7 @@ class ExceedanceTable(Table):
         rows = [["standard error of the computation", *errors]]
         if len(values) > 1:
             rows.append(["intervals at", *map(str, attrs["at"])])
-        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        sentences = sentences_of(attrs)
         if "requirement" in attrs:
             sentences.insert(
                 0, f"At most {attrs['requirement']:g} is required: {attrs['verdict']}."
@@ -285,7 +286,7 @@ class ExceedanceTable(Table):
 
 
 def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) -> str:
-    """Return whether a requirement is met by the whole interval, by none of it, or by a part."""
+    """Return whether the whole interval meets a requirement, or none of it, or a part."""
     low, high = np.transpose([estimate.interval_with_error(prob) for estimate in estimates])
     if high.max() <= requirement:
         return "met"
@@ -296,12 +297,12 @@ def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) ->
 class _Estimate:
     """Probabilities at one point of the intervals."""
 
-    by_draw: Floats  # (k,): NaN of populations that do not exist
+    by_draw: Floats  # (k,): probability in each population; NaN of populations that do not exist
     error: float
-    responses: int  # computed
+    responses: int  # number of responses computed
     source: str
-    runs: int = 0  # stored responses behind it
-    points: int = 0  # near the limit
+    runs: int = 0  # number of stored responses behind the probabilities
+    points: int = 0  # number of points near the limit
     lost: float = 0.0  # share of the populations without response
 
     @property
@@ -311,10 +312,14 @@ class _Estimate:
 
     def of_populations(self, prob: float) -> Floats:
         """Return the interval over populations."""
-        return np.asarray(np.nanquantile(self.by_draw, [(1 - prob) / 2, (1 + prob) / 2]))
+        return np.nanquantile(self.by_draw, tail_levels(prob))
 
     def interval(self, prob: float) -> Floats:
-        """Return the interval over populations; if all or no points count, with its bound."""
+        """Return the interval over populations, with a bound where no or every point counts.
+
+        If no (or every) point exceeds the limit, the upper (lower) end is the one-sided bound of
+        that share.
+        """
         low, high = self.of_populations(prob)
         least, most = probability_bounds(self.mean, self.error, (1 - prob) / 2)
         if self.mean == 1:
@@ -326,10 +331,10 @@ class _Estimate:
     def interval_with_error(self, prob: float) -> Floats:
         """Return the interval over populations, wider by two standard errors on both sides."""
         margins = probability_bounds(self.mean, self.error, float(ndtr(-2))) - self.mean
-        return np.asarray(np.clip(self.of_populations(prob) + margins, 0.0, 1.0))
+        return np.clip(self.of_populations(prob) + margins, 0.0, 1.0)
 
     def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
-        """Return whether the error is above a share of the distance of a requirement."""
+        """Return whether the error is above a share of the interval's distance to a requirement."""
         distances = np.abs(self.of_populations(prob) - requirement)
         return bool(self.error > share * distances.min())
 
@@ -354,13 +359,20 @@ class _Question:
             responses = self.populations.responses(self.response, inputs)
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
         sample = self.populations.sample(self.response, inputs, self.output)
-        return _stored_probability(sample, quantity)
+        by_draw = sample.evaluate(quantity.of, self.populations.thetas)
+        error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
+        error = np.hypot(error, _error_of_draws(self.populations, by_draw))
+        kind = "stored" if sample.emulator is None else "emulated"
+        source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
+        count, n_runs = sample.responses.count, sample.n_runs
+        return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
-    def refined(self, estimate: _Estimate, inputs: Sequence[Any], points: int = 1000) -> _Estimate:
-        """Return an estimate by new points, if these are no more than the runs behind it.
+    def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
+        """Return an estimate by new points, if they are no more than the runs of the first one.
 
         Inputs without an inverse distribution function keep the estimate.
         """
+        points = 1000
         if estimate.runs < points:
             return estimate
         try:
@@ -368,17 +380,6 @@ class _Question:
         except TypeError:
             return estimate
         return replace(refined, responses=estimate.responses + refined.responses)
-
-
-def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estimate:
-    """Return the probabilities of each population from stored or emulated responses."""
-    by_draw = sample.evaluate(quantity, sample.populations.thetas)
-    error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
-    error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
-    kind = "stored" if sample.emulator is None else "emulated"
-    source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
-    count, n_runs = sample.responses.count, sample.n_runs
-    return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
 
 def _rare_probability(
@@ -418,7 +419,8 @@ def _rare_probability(
             f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
             "return +inf for specimens that fail"
         )
-    # The probability is that of specimens with a response, as from stored responses.
+    # Divide by the share with a response: the probability is that of specimens with a response, as
+    # from stored responses.
     by_draw = np.minimum(event.by_draw / (1 - event.lost), 1.0)
     error = np.hypot(event.error / (1 - event.lost), _error_of_draws(populations, by_draw))
     count, lost = responses.count, event.lost
@@ -431,11 +433,9 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
     return float(np.nanstd(by_draw, ddof=1) / np.sqrt(n)) if populations.are_draws else 0.0
 
 
-def _rough_finding(
-    response: Any, estimates: Sequence[_Estimate], is_rough: NDArray[np.bool_]
-) -> list[Finding]:
+def _rough_finding(response: Any, estimates: Sequence[_Estimate], is_rough: Bools) -> list[Finding]:
     """Return a finding if the error of a probability is too large."""
-    rough = [estimate for estimate, bad in zip(estimates, is_rough, strict=True) if bad]
+    rough = list(compress(estimates, is_rough))
     if not rough:
         return []
     worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)
@@ -464,7 +464,7 @@ def _left_out_finding(response: Any, lost: float) -> list[Finding]:
 class RareEvent:
     """Probabilities of an event in each population, and the error of their mean."""
 
-    by_draw: Floats  # (k,)
+    by_draw: Floats  # (k,): probability of the event in each population
     error: float  # standard error of their mean
     lost: float  # share of the populations' weight that has no response
 
@@ -479,7 +479,7 @@ class _Normal:
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
         """Return n draws, (n, D)."""
         z = rng.standard_normal((n, self.mean.size))
-        return np.asarray(self.mean + z @ self.root.T)
+        return self.mean + z @ self.root.T
 
     def log_density(self, z: Floats) -> Floats:
         """Return the log-density, (n, D) -> (n,)."""
@@ -491,16 +491,25 @@ class _Normal:
 class _Points:
     """Points from several proposals, with their responses."""
 
-    sizes: list[int]  # number of points from each proposal
-    proposals: list[_Normal]
+    proposals: list[tuple[_Normal, int]]  # proposals, each with its number of points
     z: Floats  # (n, D)
     values: Floats  # (n,)
-    log_ratio: Floats  # (k, n): of the density of each population to that of the central one
+    # (k, n): log ratio of the density of each population to that of the central one
+    log_ratio: Floats
+
+    def joined(self, more: _Points) -> _Points:
+        """Return these and more points."""
+        return _Points(
+            self.proposals + more.proposals,
+            np.concatenate([self.z, more.z]),
+            np.concatenate([self.values, more.values]),
+            np.concatenate([self.log_ratio, more.log_ratio], axis=1),
+        )
 
     def log_mixture(self) -> Floats:
         """Return the log-density of the mixture of all proposals at the points, (n,)."""
-        sizes = np.array(self.sizes)
-        logs = [proposal.log_density(self.z) for proposal in self.proposals]
+        logs = [proposal.log_density(self.z) for proposal, _ in self.proposals]
+        sizes = np.array([size for _, size in self.proposals])
         return np.asarray(logsumexp(logs, axis=0, b=sizes[:, None] / sizes.sum()))
 
     def log_weights(self) -> Floats:
@@ -537,39 +546,39 @@ def rare_event(
        Assoc. 95, 135-143, doi:10.1080/01621459.2000.10473909.
     """
     d = transform.size
-    # Wider than the population, which bounds the weights; less so in each of many dimensions.
+    # The first proposal is wider than the population, so that weights are bounded. It is less wide
+    # in each of many dimensions.
     widest = _Normal(np.zeros(d), (1 + 0.5 / np.sqrt(d)) * np.eye(d))
     proposals = [widest]
-    # A sixteenth of the points a step; more dimensions need more.
+    # A step has a sixteenth of the points, and more in many dimensions.
     step = max(size // 16, min(10 * d, size // 8), 1)
-    batches: list[_Points] = []
-    remaining = size // 2
-    while remaining:
-        n = min(step, remaining)
-        batches.append(_draw_points(proposals, n, transform, parents, respond, rng))
-        remaining -= n
-        # The level that the highest fifth of responses exceeds, as is usual for the method.
-        values = batches[-1].values[~np.isnan(batches[-1].values)]
+    draw = partial(_draw_points, transform, parents, respond, rng)
+    search = None
+    for first in range(0, size // 2, step):
+        batch = draw(proposals, min(step, size // 2 - first))
+        search = batch if search is None else search.joined(batch)
+        # Raise the level to what the highest fifth of the responses exceeds, as is usual for the
+        # method.
+        values = batch.values[~np.isnan(batch.values)]
         elite = float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
-        level = min(elite, limit)
-        proposals = _cross_entropy_proposals(_concatenated(batches), level, limit) or proposals
-    search = _concatenated(batches)
-    # The proposals do not depend on the final points, whose mean is unbiased. One point in ten
-    # comes from the widest proposal, which bounds weights.
+        proposals = _cross_entropy_proposals(search, min(elite, limit), limit) or proposals
+    # The estimate is unbiased, because the proposals do not depend on the final points. One point
+    # in ten comes from the widest proposal, so that weights are bounded.
     copies = max(1, 9 // len(proposals))
     mixture = [proposal for proposal in proposals for _ in range(copies)] + [widest]
-    final = _draw_points(mixture, size - size // 2, transform, parents, respond, rng)
+    final = draw(mixture, size - size // 2)
     weights = np.exp(final.log_ratio + (log_normal(final.z) - final.log_mixture()))
     mean_weights = weights.mean(axis=0)
     is_beyond = ~np.isnan(final.values) & (final.values > limit)
     _, error = weighted_share(mean_weights[None], is_beyond)
     if not is_beyond.any():
-        # Nor is the event more probable than one that contains it and half of the points.
+        # No point exceeds the limit. Bound the probability by that of exceeding the median
+        # response, which contains the event.
         values = np.where(np.isnan(final.values), -np.inf, final.values)
         is_above = final.values >= np.median(values)
         above, above_error = weighted_share(mean_weights[None], is_above)
         error = min(error, float(above[0] + 2 * above_error) / 3)
-    points = _concatenated([search, final])
+    points = final if search is None else search.joined(final)
     log_weights = points.log_weights()
     shares = np.exp(log_weights - log_weights.max())
     return RareEvent(
@@ -579,7 +588,7 @@ def rare_event(
     )
 
 
-def weighted_share(weights: Floats, counts: NDArray[np.bool_]) -> tuple[Floats, float]:
+def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
     r"""Return shares of points that count, by rows of weights (k, n), and the first one's error.
 
     The mean of a weight is known to be one. With this as a control variate (Owen and Zhou 2000),
@@ -604,12 +613,12 @@ def weighted_share(weights: Floats, counts: NDArray[np.bool_]) -> tuple[Floats, 
 
 
 def _draw_points(
-    proposals: list[_Normal],
-    n: int,
     transform: InverseTransform,
     parents: Sequence[Floats],
     respond: Callable[[Floats], Floats],
     rng: np.random.Generator,
+    proposals: list[_Normal],
+    n: int,
 ) -> _Points:
     """Draw n points, in equal parts from each proposal, and compute their responses."""
     sizes = [len(part) for part in np.array_split(np.arange(n), len(proposals))]
@@ -622,24 +631,15 @@ def _draw_points(
         transform.log_density([values[first : first + step] for values in parents], x) - central
         for first in range(0, len(parents[0]), step)
     ]
-    return _Points(sizes, proposals, z, respond(z), np.concatenate(log_ratio))
-
-
-def _concatenated(batches: Sequence[_Points]) -> _Points:
-    """Return the points of all batches."""
-    return _Points(
-        sizes=[size for batch in batches for size in batch.sizes],
-        proposals=[proposal for batch in batches for proposal in batch.proposals],
-        z=np.concatenate([batch.z for batch in batches]),
-        values=np.concatenate([batch.values for batch in batches]),
-        log_ratio=np.concatenate([batch.log_ratio for batch in batches], axis=1),
-    )
+    pairs = list(zip(proposals, sizes, strict=True))
+    return _Points(pairs, z, respond(z), np.concatenate(log_ratio))
 
 
 def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:
     """Return the normal distribution nearest to the populations above a level, if any point is.
 
-    Two of them if the points above spread wider than the population, as on both sides of it.
+    Return two of them if the points above scatter wider than the population, as on both sides of
+    it.
     """
     is_above = points.values >= level
     if not is_above.any():
@@ -648,15 +648,15 @@ def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> lis
     log_weights = points.log_weights()[is_above]
     weights = np.exp(log_weights - log_weights.max())
     total = weights.sum()
-    # Variance towards the limit. Before the limit is reached, narrow proposals slow the search;
-    # beyond four standard deviations a normal tail has a variance of .05.
+    # Bound the variance towards the limit from below. Narrow proposals would slow the search before
+    # the limit is reached. Beyond four standard deviations a normal tail has a variance of .05.
     least = 0.1 if level >= limit else 1.0
     mean = weights @ z / total
     deviation = z - mean
     covariance = (deviation.T * weights) @ deviation / total
     variances, axes = np.linalg.eigh(covariance)
-    error = np.sqrt(2 * (weights**2).sum()) / total  # of a variance of one
-    # The largest of several variances is larger by chance (Marchenko and Pastur 1967).
+    error = np.sqrt(2 * (weights**2).sum()) / total  # standard error of a variance of one
+    # The largest of several sample variances exceeds one by chance (Marchenko and Pastur 1967).
     by_chance = (1 + np.sqrt(mean.size / 2) * error) ** 2
     if variances[-1] <= max(by_chance, 1 + 3 * error):
         return [_tail_normal(z, weights, least)]
@@ -667,7 +667,7 @@ def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> lis
 def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:
     """Return a normal distribution with the mean of points, and their variance along it.
 
-    Few points do not determine a covariance of several dimensions: across the mean it is isotropic.
+    The covariance is isotropic in the other directions, because few points do not determine it.
     """
     total = weights.sum()
     mean = weights @ z / total
@@ -676,7 +676,7 @@ def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:
     deviation = z - mean
     whole = float(shares @ (deviation**2).sum(axis=1))
     along = float(shares @ (deviation @ direction) ** 2)
-    # A fifth wider across, which bounds weights far out.
+    # Inflate the other directions by 20 %, so that importance weights stay bounded in the tails.
     across = 1.2 * max((whole - along) / max(mean.size - 1, 1), 1.0)
     outer = np.outer(direction, direction)
     covariance = across * (np.eye(mean.size) - outer) + max(along, least) * outer

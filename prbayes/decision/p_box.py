@@ -131,7 +131,7 @@ def p_box(
     n_searched = 0
     if len(places) > 1:
         respond = CentralSpecimens(populations, response, output, samples[0].n_runs)
-        # Limits beyond all responses find the places with the most extreme ones.
+        # Limits beyond all responses lead to the places with the most extreme responses.
         limits = [2 * y[0] - y[-1], np.median(y), 2 * y[-1] - y[0]]
         extremes = extreme_places(inputs, places, respond, limits)
         samples += [populations.sample(response, place, output) for place in extremes]
@@ -153,7 +153,7 @@ def p_box(
         upper.append([np.where(at_bottom, most, band) for band in (high, highest)])
         means.append(mean)
         errors.append(error)
-    # A bound at y is one beyond it.
+    # Distribution functions increase, so that a bound at y also holds beyond it.
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
     data: dict[str, Any] = {
@@ -205,7 +205,7 @@ def _place(function: Floats, y: Floats, probability: float) -> float:
 
 def _evaluation_points(samples: list[ResponseSample]) -> Floats:
     """Return quantiles of the mean distributions, evenly spaced in the logit of the probability."""
-    # 200 values, from 1e-4 to 1 - 1e-4: twice as many are indistinguishable in a plot.
+    # Probabilities range from 1e-4 to 1 - 1e-4. Twice as many points look the same in a plot.
     steps = np.linspace(0, 1, 200 // len(samples) or 2)
     levels = 1 / (1 + np.exp(np.log(1e-4) * (1 - 2 * steps)))
     points = []
@@ -218,7 +218,7 @@ def _evaluation_points(samples: list[ResponseSample]) -> Floats:
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
     """Return the distribution functions of all valid populations at y, (k, m)."""
-    batches = sample.weight_batches(sample.populations.thetas)
-    parts = [distribution_function(sample.values, weights, y) for weights in batches]
-    functions = np.concatenate(parts)
+    functions = sample.evaluate(
+        lambda values, weights: distribution_function(values, weights, y), sample.populations.thetas
+    )
     return functions[np.isfinite(functions).all(axis=1)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, counted, from_json
+from prbayes._finding import Finding, as_json, counted, sentences_of
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
@@ -177,7 +178,7 @@ def plan(
     _refuse_candidates(candidates)
     if quantity is not None:
         refuse_quantity(quantity, caller)
-    # 2000 draws: standard deviations are then known to two percent.
+    # With 2000 draws standard deviations have an error of two percent.
     populations = Populations.of(
         result, model, 2000, caller, call_settings(executor, store, version)
     )
@@ -243,7 +244,7 @@ class PlanTable(Table):
                 rows.append([str(name), str(candidate), *cells])
         header = ["", "condition", "now", *(f"{k} more" for k in self["k"].values)]
         header += ["needed for the target"] if "specimens" in self else []
-        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        sentences = sentences_of(self.attrs)
         if "quantity" in self.attrs:
             sentences.append(f"quantity: {self.attrs['quantity']}.")
         heading = "Expected standard deviations after more specimens"
@@ -256,11 +257,11 @@ class Draws:
 
     thetas: Floats  # (k, d)
     unit: Floats  # (d,): the prior's spread
-    covariance: Floats  # (d, d): in that unit
+    covariance: Floats  # (d, d): covariance in that unit
 
     @classmethod
     def of(cls, thetas: Floats, unit: Floats) -> Draws:
-        """Return draws, (k, d), with a covariance in which outliers beyond 3 sd are drawn in."""
+        """Return draws, (k, d), with a covariance in which outliers are moved to 3 sd."""
         d = unit.size
         covariance = np.cov(drawn_in(thetas / unit), rowvar=False).reshape(d, d)
         return cls(thetas, unit, covariance)
@@ -268,7 +269,7 @@ class Draws:
     def with_information(self, information: Floats) -> Floats:
         """Return the draws after information, (d, d), narrowed around the same median.
 
-        Precisions add up; the map is the symmetric one between the two normal distributions.
+        Precisions add up. The map between the two normal distributions is the symmetric one.
         """
         covariance = np.linalg.inv(np.linalg.inv(self.covariance) + information)
         root = _square_root(self.covariance)
@@ -276,13 +277,13 @@ class Draws:
         matrix = inverse @ _square_root(root @ covariance @ root) @ inverse
         median = np.median(self.thetas, axis=0)
         deviation = (self.thetas - median) / self.unit
-        return np.asarray(median + (deviation @ matrix.T) * self.unit)
+        return median + (deviation @ matrix.T) * self.unit
 
 
 def _square_root(matrix: Floats) -> Floats:
     """Return the symmetric square root."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +293,7 @@ class _Forecast:
     populations: Populations
     draws: Draws
     quantity: Quantity | None
-    sample: ResponseSample | None  # of the quantity's response
+    sample: ResponseSample | None  # responses that the quantity is computed from
 
     def sd(self, information: Floats) -> dict[str, float]:
         """Return standard deviations by name after information, (d, d)."""
@@ -310,10 +311,10 @@ class _Forecast:
         """Return the standard deviation of the quantity."""
         assert self.quantity is not None
         assert self.sample is not None
-        return standard_deviation(self.sample.evaluate(self.quantity, thetas))
+        return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
     def needed(self, information: Floats, name: str, target: float | None) -> float:
-        """Return the smallest number of specimens that reaches a target; inf, NaN without one."""
+        """Return the smallest number of specimens for a target: inf if none, NaN without one."""
         if target is None:
             return np.nan
 
@@ -324,18 +325,16 @@ class _Forecast:
 
         if not exceeds(0):
             return 0.0
-        short, enough = 0, 1
+        enough = 1
         while exceeds(enough):
-            short, enough = enough, 2 * enough
-            if short > 1_000_000:
+            enough *= 2
+            if enough > 2_000_000:
                 return np.inf
-        while enough - short > 1:
-            middle = (enough + short) // 2
-            if exceeds(middle):
-                short = middle
-            else:
-                enough = middle
-        return float(enough)
+        short = enough // 2
+        smallest = bisect_left(
+            range(enough), True, lo=short + 1, key=lambda number: not exceeds(number)
+        )
+        return float(smallest)
 
 
 # -- information of one specimen -------------------------------------------------------------------
@@ -354,14 +353,20 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     if not design.has_runs:
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
-    # At least 50 specimens: smaller samples have other bandwidths.
+    # The ideal sample has specimens at equal steps of probability, at least 50 of them because
+    # smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)
-    target = (metric or node.metric).against(_ideal_sample(sample, n))
+    is_observable = observable(sample.outputs, node.target)
+    values = sample.outputs[is_observable]
+    mass = sample.masses(center[None])[0, is_observable]
+    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    rows = order[reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)]
+    target = (metric or node.metric).against(values[rows])
     bound = design.copied(design.design.with_values(sample.outputs))
     bound.target = target.metric.for_inputs(target, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
-    # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
-    # than a hundredth of the prior's information.
+    # Count directions with a standard error of up to ten prior standard deviations. Fainter ones
+    # have less than a hundredth of the prior's information.
     simulator_alone = replace(evaluator, nodes=(alone,), has_graph=False)
     local = SamplingDistribution.of(simulator_alone, center, np.ones(1), 10.0).local
     if not local.identified.size:
@@ -374,13 +379,13 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
 class ReadingErrors:
     """Errors, rounding and limits of the readings of a response."""
 
-    readings: Readings  # their errors and steps, which repeat
-    unknown: Variable[Any, Any] | None  # model variable that is the error
-    limits: tuple[Any, Any]  # lower and upper ones, infinite without a limit
+    readings: Readings  # readings whose errors and steps apply, and repeat if there are more points
+    unknown: Variable[Any, Any] | None  # model variable that is the error, if it is unknown
+    limits: tuple[Any, Any]  # lower and upper limits, infinite without a limit
 
     @classmethod
     def of(cls, sample: ResponseSample, metric: Metric | None) -> ReadingErrors | None:
-        """Return those of a metric, or of the simulator; None of exact readings."""
+        """Return the errors of a metric, or of the simulator; None if readings are exact."""
         simulator = sample.populations.evaluator.simulators[sample.k]
         assert isinstance(simulator, EmulatedSimulator)
         measurement = simulator.measurement
@@ -456,8 +461,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     unit = evaluator.hyperparameters.prior_sd
     step = 1e-3 * unit
     thetas = cross(sample.populations.center, step)
-    parents = evaluator.parents(thetas, sample.k)
-    _, weights = sample.design.populations(parents)
+    weights = sample.masses(thetas)
     outputs = sample.outputs
     if sample.emulator is None:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
@@ -469,10 +473,10 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
         scores = slopes(np.log(weights), step)
     mass = weights[0] / weights[0].sum()
     values = outputs[is_used].reshape(len(mass), -1)
-    # Bins of half the root of the number of points; equal values are in one bin.
+    # The size of bins is half the root of the number of points. Equal values share a bin.
     size = max(1, int(np.sqrt(len(mass)) / 2))
     if errors is not None:
-        copies = 16  # of each specimen, with other errors
+        copies = 16  # number of copies of each specimen, with different errors
         values = np.tile(values, (copies, 1))
         scores = np.tile(scores, (copies, 1))
         mass = np.tile(mass, copies) / copies
@@ -489,13 +493,13 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
     means = sums / np.where(share > 0, share, 1.0)
-    return np.asarray((means * share) @ means.T)
+    return (means * share) @ means.T
 
 
 def _projected(scores: Floats, values: Floats, mass: Floats) -> Floats:
     """Return scores, (n, d), as quadratic functions of the normal scores of values, (n, m)."""
     z = ndtri((rankdata(values, axis=0) - 0.5) / len(values))
-    # Eight components of many outputs, such as those of a curve.
+    # Keep eight principal components of many outputs, such as those of a curve.
     _, axes = np.linalg.eigh(z.T @ z)
     z = z @ axes[:, -8:]
     first, second = np.triu_indices(z.shape[1])
@@ -513,7 +517,7 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
     The response contains next to no information along some directions. There both factors of a
     sandwich are rounding errors, and their quotient is arbitrary.
     """
-    if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound
+    if not np.isfinite(bound).all():  # if the support moves, and the likelihood gives no bound
         return information
     d = len(bound)
     root = np.linalg.cholesky(bound + 1e-9 * np.trace(bound) * np.eye(d))
@@ -521,19 +525,6 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
     values, vectors = np.linalg.eigh(inverse @ information @ inverse.T)
     capped = (vectors * np.minimum(values, 1.0)) @ vectors.T
     return np.asarray(root @ capped @ root.T)
-
-
-def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
-    """Return n specimens at equal steps of probability of the central population."""
-    evaluator = sample.populations.evaluator
-    parents = evaluator.parents(sample.populations.center[None], sample.k)
-    _, weights = sample.design.populations(parents)
-    is_observable = observable(sample.outputs, evaluator.nodes[sample.k].target)
-    values = sample.outputs[is_observable]
-    mass = weights[0][is_observable]
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
-    steps = (np.arange(n) + 0.5) / n
-    return np.asarray(values[order][reached(mass[order], steps, normalized=True)])
 
 
 def _validated_counts(k: object) -> list[int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -40,7 +40,8 @@ class Element:
     name: str
     unit: str
     groups: Groups | None
-    # By quantity, (groups, k), or (1, k). Of an optimum the first population is the optimum's.
+    # numbers by quantity, (groups, k), or (1, k) without groups. The first population of an optimum
+    # is its own.
     numbers: dict[str, Floats]
     findings: tuple[Finding, ...] = ()
 
@@ -113,7 +114,7 @@ class PopulationReader:
             places = range(len(inputs.groups.labels))
             by_group = [points | {index: np.full(size, place)} for place in places]
         moments = InputMoments(label, inputs, list(self.levels.values()))
-        arrays = []  # (k, q, elements), by group
+        arrays = []  # (k, q, elements): numbers of each group
         for group_points in by_group:
             arrays.append(moments.numbers([group_points[str(p.name)] for p in inputs.parents]))
         numbers = np.stack(arrays)
@@ -140,13 +141,10 @@ class PopulationReader:
         for column, label in enumerate(labels):
             output = replace(sample, column=column if several else None)
             findings, _ = output.checked_quantity(by_level[-1])
-            functionals = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
+            quantities = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
-            numbers[0, :, -len(functionals) :] = np.concatenate(
-                [
-                    np.stack([f.of(output.values, weights) for f in functionals], axis=-1)
-                    for weights in output.weight_batches(self._thetas)
-                ]
+            numbers[0, :, -len(quantities) :] = output.evaluate(
+                _side_by_side(quantities), self._thetas
             )
             name = element_name(sample.responses.name, [label] if several else [])
             unit = outputs.units[column] if outputs.units else ""
@@ -188,9 +186,19 @@ class PopulationReader:
         ]
 
 
+def _side_by_side(quantities: Sequence[Quantity]) -> Callable[[Floats, Floats], Floats]:
+    """Return a functional whose last axis has the quantities."""
+
+    def functional(values: Floats, weights: Floats) -> Floats:
+        return np.stack([quantity.of(values, weights) for quantity in quantities], axis=-1)
+
+    return functional
+
+
 def _by_name(names: Sequence[str], numbers: Floats) -> dict[str, Floats]:
     """Return numbers, (groups, k, q) -> (groups, k), by quantity, and the cv."""
     by_name = dict(zip(names, np.moveaxis(numbers, -1, 0), strict=True))
     mean, sd = by_name.pop("mean"), by_name.pop("sd")
-    size = np.where(np.abs(mean) > 1e-9 * sd, np.abs(mean), np.nan)  # above rounding
+    # if the mean is larger than rounding errors
+    size = np.where(np.abs(mean) > 1e-9 * sd, np.abs(mean), np.nan)
     return {"mean": mean, "sd": sd, "cv": sd / size} | by_name

@@ -12,8 +12,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import as_json, from_json, report
-from prbayes._stats import INTERVAL
+from prbayes._finding import as_json, report, sentences_of
+from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import Floats, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import PopulationReader
 from prbayes.decision.populations import Populations, quantiles_of
@@ -25,7 +25,7 @@ from prbayes.results.predict import call_settings, width_of_epsilon
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
-# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17).
+# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17)
 BASES = {"B-basis": 0.10, "A-basis": 0.01}
 
 
@@ -157,9 +157,9 @@ def population(
             "one partition; ask for one input at a time"
         )
     n_groups = max(map(len, groups.values()), default=1)
-    # Estimate, lower and upper
+    # table, (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
-    tails = [(1 - prob) / 2, (1 + prob) / 2]
+    tails = tail_levels(prob)
     confidence = 0.95 if upper else 0.05
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
@@ -169,7 +169,10 @@ def population(
                 table[0, i, :, q] = _quantiles(draws, [confidence])[0]
                 continue
             low, high = _quantiles(draws, tails)
-            table[:, i, :, q] = [_mean(draws) if populations.are_draws else values[:, 0], low, high]
+            estimate = values[:, 0]
+            if populations.are_draws:
+                estimate = np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
+            table[:, i, :, q] = [estimate, low, high]
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -197,13 +200,8 @@ def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:
     return np.array([quantiles_of(_defined(row, np.isnan(row)), probabilities) for row in draws]).T
 
 
-def _mean(draws: Floats) -> Floats:
-    """Return means over populations, (groups, k) -> (groups,)."""
-    return np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
-
-
 def _defined(row: Floats, is_left_out: Any) -> Floats:
-    """Return the other numbers of populations; NaN where most populations are left out."""
+    """Return the numbers that are not left out, or NaN if most are."""
     numbers = row[~is_left_out]
     return numbers if numbers.size > 0.5 * row.size else np.array([np.nan])
 
@@ -257,7 +255,7 @@ class PopulationTable(Table):
         )
 
     def __repr__(self) -> str:
-        """Return a sentence for each population; of a selection what xarray shows."""
+        """Return a sentence for each population, or xarray's text for a selection."""
         if not self._is_whole:
             return super().__repr__()
         return "\n  ".join([f"{self._heading()}:", *self.sentences()])
@@ -271,7 +269,7 @@ class PopulationTable(Table):
             shown = [f"{value} ({interval})" if interval else value for value, interval in texts]
             rows.append([with_unit(name, unit), *shown])
         header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         return View(self._heading(), header, rows, sentences)
 
 

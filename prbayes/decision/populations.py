@@ -14,18 +14,17 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, from_json, report
-from prbayes._stats import INTERVAL
-from prbayes._validate import AT_ONCE, Floats, positive_integer, share
+from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
+from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
     refuse_quantity,
-    weighted_quantiles,
 )
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
@@ -55,7 +54,8 @@ from prbayes.results.predict import (
     serving,
 )
 
-# Populations at which checks and error estimates look: their quantiles are known to a few percent.
+# Number of populations for checks and error estimates, whose quantiles then have an error of a few
+# percent
 N_CHECKED = 400
 
 
@@ -65,11 +65,12 @@ class Populations:
 
     result: Any
     evaluator: Evaluator
-    thetas: Floats  # (k, d): draws of the posterior, or quantiles of an optimum's distribution
-    center: Floats  # (d,): the median, or the optimum
-    caller: str  # for messages
+    # (k, d): draws of the posterior, or Sobol points of an optimum's sampling distribution
+    thetas: Floats
+    center: Floats  # (d,): median of the draws, or the optimum
+    caller: str  # name of the caller, for messages
     are_draws: bool  # whether thetas are random draws, and not Sobol points
-    # Executor, store and version of responses that are not the model's own.
+    # settings of responses that are not the model's own: executor, store and version
     calling: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -174,12 +175,12 @@ class ResponseSample:
     """A response at the points of a design, whose weights represent each population."""
 
     populations: Populations
-    k: int  # the simulator with the design
+    k: int  # index of the simulator with the design
     design: ReweightedBound | EmulatedSample
     responses: Responses
-    outputs: Floats  # (n,) or (n, m): at the design's points
-    column: int | None  # of the output; None for a response with one number
-    emulator: EmulatedResponse | None = None  # of the response, where it is not stored
+    outputs: Floats  # (n,) or (n, m): outputs at the design's points
+    column: int | None  # column of the output; None for a response with one number
+    emulator: EmulatedResponse | None = None  # emulator of the response, where it is not stored
 
     def select(self, outputs: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""
@@ -193,9 +194,9 @@ class ResponseSample:
     def emulated(self, points: Sequence[Floats]) -> list[Floats]:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.
 
-        The rest differ from it by its error: they lack a block of the runs each, or add the error
-        of left-out runs, or that beyond the runs' range. Empty where responses are stored and not
-        emulated.
+        The others differ from it by an estimate of its error: they lack a block of the runs each,
+        or add the error of left-out runs, or the error beyond the runs' range. The list is empty if
+        responses are stored and not emulated.
         """
         if self.emulator is None:
             assert self.design.has_runs
@@ -209,7 +210,7 @@ class ResponseSample:
         ]
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
+    def _order(self) -> Indices:
         """The points that have a response, in ascending order of it."""
         values = self.select(self.outputs)
         order = np.argsort(values, kind="stable")
@@ -229,14 +230,21 @@ class ResponseSample:
         return self.design.n_runs
 
     @cached_property
-    def blocks(self) -> NDArray[np.intp]:
+    def blocks(self) -> Indices:
         """The block of the design that each of the values is in, (n,)."""
         return self.design.blocks[self._order]
 
+    def parents(self, thetas: Floats) -> list[Floats]:
+        """Return the parents of populations, (k, d) -> (k, *shape) each."""
+        return self.populations.evaluator.parents(thetas, self.k)
+
+    def masses(self, thetas: Floats) -> Floats:
+        """Return weights of all points, also of those without response, (k, d) -> (k, n)."""
+        return self.design.populations(self.parents(thetas))[1]
+
     def weights(self, thetas: Floats) -> Floats:
         """Return weights of the values in populations, (k, d) -> (k, n), with sum one."""
-        _, weights = self.design.populations(self.populations.evaluator.parents(thetas, self.k))
-        weights = weights[:, self._order]
+        weights = self.masses(thetas)[:, self._order]
         with np.errstate(invalid="ignore"):
             return weights / weights.sum(axis=1, keepdims=True)
 
@@ -256,9 +264,10 @@ class ResponseSample:
     def share_error(self, counts: Callable[[Floats], Floats]) -> Floats:
         """Return the error of the mean share of responses that count, by points and emulator.
 
-        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. Of the points
-        it is the jackknife over their blocks; if none or all of them count, one over their
-        effective number. Of the emulator it is that of emulators without a block of the runs.
+        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. The part by
+        points is the jackknife over their blocks, or one over their effective number if none or all
+        of them count. The part by emulators is the scatter of emulators without a block of the
+        runs.
         """
         is_counted = counts(self.values)
         weights = self.mean_weights()
@@ -272,26 +281,27 @@ class ResponseSample:
         error = np.where(is_same, (weights**2).sum(), error)
         outputs = self.emulated(self.points)
         if not outputs:
-            return np.asarray(error)
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
-        mass = np.nanmean(self.design.populations(parents)[1], axis=0)
+            return error
+        mass = np.nanmean(self.masses(self.populations.thinned()), axis=0)
         means = np.array([mass @ counts(values) for values in outputs])
         return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
-    def evaluate(self, quantity: Quantity, thetas: Floats) -> Floats:
-        """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
-        return np.concatenate([quantity.of(self.values, w) for w in self.weight_batches(thetas)])
+    def evaluate(self, functional: Callable[[Floats, Floats], Floats], thetas: Floats) -> Floats:
+        """Return a functional of populations, (k, d) -> (k, ...); NaN without a population.
+
+        It is a function of the values and their weights, as `Quantity.of` is.
+        """
+        return np.concatenate([functional(self.values, w) for w in self.weight_batches(thetas)])
 
     @cached_property
     def lost(self) -> float:
         """The share of a population that has no response, the median over populations."""
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
-        _, weights = self.design.populations(parents)
+        weights = self.masses(self.populations.thinned())
         return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
 
     def refuse_unsupported(self) -> None:
         """Raise if the design does not support the populations, or too many responses are NaN."""
-        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
+        parents = self.parents(self.populations.thinned())
         if self.design.has_runs:
             refuse_unsupported(self.responses.name, self.design, parents)
         else:
@@ -306,8 +316,8 @@ class ResponseSample:
     def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
         """Return findings, and the error of the quantity at the centre.
 
-        Findings are of a tail of few points, and of populations beyond the runs. Raises ValueError
-        if no response is in the tail, or specimens failed.
+        Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
+        no response is in the tail, or specimens failed.
         """
         caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
@@ -315,15 +325,15 @@ class ResponseSample:
                 f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
                 "responses; ask for a Quantile or an Exceedance"
             )
-        (value,) = self.evaluate(quantity, center)
-        # With the responses that are equal to a quantile, such as the largest.
+        (value,) = self.evaluate(quantity.of, center)
+        # Count responses that are equal to a quantile as beyond it, such as the largest one.
         at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
         if not np.isin(is_beyond, (0.0, 1.0)).all():
-            return _beyond_runs(self, quantity), self._jackknife_error(quantity)
+            return _beyond_runs(self, quantity), _jackknife_error(self, quantity)
         share = float(self.mean_weights() @ is_beyond)
         is_upper = share <= 0.5
-        if not is_upper:  # the rarer side decides how well the quantity is known
+        if not is_upper:  # because the rarer side decides how well the quantity is known
             at, side = np.nextafter(value, np.inf), "on its other side"
             share = float(self.mean_weights() @ (1 - quantity.of_specimen(self.values, at)))
         error = float(self.share_error(lambda values: quantity.of_specimen(values, at)))
@@ -346,31 +356,31 @@ class ResponseSample:
         (weights,) = self.weights(center)
         is_beyond = quantity.of_specimen(self.values, at)
         on_line = self.design.has_runs and self.design.design.on_line
-        if not on_line:  # the jackknife of few points in a tail is itself rough
+        if not on_line:  # because the jackknife of few points in a tail is itself rough
             rare = weights * (is_beyond if is_upper else 1 - is_beyond)
             error = max(error, float(np.linalg.norm(rare)))
         tails = probability_bounds(share, error, float(ndtr(-1)))
         tails *= min(quantity.probability, 1 - quantity.probability) / share
-        ends = weighted_quantiles(self.values, weights, tails, is_upper)
+        ends = ascending_quantile(self.values, weights, 1 - tails if is_upper else tails)
         error = float(np.abs(ends - value).max())
         if self.emulator is not None:
             error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
         return findings, error
 
-    def _jackknife_error(self, quantity: Quantity) -> float:
-        """Return the error of a quantity at the centre, by points and emulator."""
-        center = self.populations.center[None]
-        is_kept = self.blocks != np.arange(N_BLOCKS)[:, None]
-        rest = self.weights(center) * is_kept
-        without = quantity.of(self.values, rest / rest.sum(axis=1, keepdims=True))
-        variance = (N_BLOCKS - 1) * np.var(without)
-        outputs = self.emulated(self.points)
-        if outputs:
-            parents = self.populations.evaluator.parents(center, self.k)
-            mass = self.design.populations(parents)[1]
-            quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
-            variance += ((quantities[1:] - quantities[0]) ** 2).sum()
-        return float(np.sqrt(variance))
+
+def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
+    """Return the error of a quantity at the centre, by points and emulator."""
+    center = sample.populations.center[None]
+    is_kept = sample.blocks != np.arange(N_BLOCKS)[:, None]
+    rest = sample.weights(center) * is_kept
+    without = quantity.of(sample.values, rest / rest.sum(axis=1, keepdims=True))
+    variance = (N_BLOCKS - 1) * np.var(without)
+    outputs = sample.emulated(sample.points)
+    if outputs:
+        mass = sample.masses(center)
+        quantities = np.array([_of_unsorted(quantity, values, mass)[0] for values in outputs])
+        variance += ((quantities[1:] - quantities[0]) ** 2).sum()
+    return float(np.sqrt(variance))
 
 
 def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
@@ -379,7 +389,7 @@ def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, .
         return ()
     thetas = sample.populations.thinned()
     change = standard_deviation(_range_effect(sample, quantity, thetas)) / 2
-    if not change > 0.1 * standard_deviation(sample.evaluate(quantity, thetas)):
+    if not change > 0.1 * standard_deviation(sample.evaluate(quantity.of, thetas)):
         return ()
     text = (
         f"{quantity!r}: some populations extend beyond the range of the runs, where the response "
@@ -392,10 +402,9 @@ def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, .
 
 def _range_effect(sample: ResponseSample, quantity: Quantity, thetas: Floats) -> Floats:
     """Return by how much a steeper response beyond the runs changes a quantity, (k,)."""
-    populations = sample.populations
-    mass = sample.design.populations(populations.evaluator.parents(thetas, sample.k))[1]
+    mass = sample.masses(thetas)
     constant, *_, steeper = sample.emulated(sample.points)
-    with np.errstate(invalid="ignore"):  # both may be infinite
+    with np.errstate(invalid="ignore"):  # because both may be infinite
         return _of_unsorted(quantity, steeper, mass) - _of_unsorted(quantity, constant, mass)
 
 
@@ -408,7 +417,7 @@ def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> Floats:
 
 
 def standard_deviation(by_draw: Floats) -> float:
-    """Return that of a quantity over draws; infinite if the quantity is infinite at one of them."""
+    """Return the standard deviation over draws; infinite if one draw is infinite."""
     if np.isinf(by_draw).any():
         return np.inf
     return float(np.nanstd(by_draw))
@@ -416,16 +425,16 @@ def standard_deviation(by_draw: Floats) -> float:
 
 def quantiles_of(by_draw: Floats, levels: Sequence[float]) -> Floats:
     """Return quantiles of draws, (n,), of which some may be infinite."""
-    # The mean of two infinite neighbours is NaN.
+    # Do not interpolate between infinite neighbours, whose mean is NaN.
     method: Any = "inverted_cdf" if np.isinf(by_draw).any() else "linear"
-    return np.asarray(np.quantile(by_draw, levels, method=method))
+    return np.quantile(by_draw, levels, method=method)
 
 
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:
     r"""Return the bounds of probabilities that leave out ``tail`` on each side, (2, ...).
 
-    Those of a Poisson mean (Garwood 1936), for :math:`(p / error)^2` events: for many the normal
-    ones, and for none of n points, with an error of 1 / n, the rule of three.
+    They are those of a Poisson mean (Garwood 1936), for :math:`(p / error)^2` events: for many the
+    normal ones, and for none of n points, with an error of 1 / n, the rule of three.
     """
     probability, error = np.asarray(probability, dtype=float), np.asarray(error, dtype=float)
     rare = np.minimum(probability, 1 - probability)
@@ -433,7 +442,7 @@ def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         n_events = np.where(has_events, (rare / error) ** 2, 0.0)
         by_event = np.where(has_events, error**2 / rare, error)
-    # For so many both are the normal ones to a thousandth of an error.
+    # With so many events the bounds are the normal ones to a thousandth of an error.
     is_normal = n_events > 1e6
     n_events = np.where(is_normal, 1.0, n_events)
     low = np.where(has_events, by_event * gammaincinv(np.maximum(n_events, 1e-9), tail), 0.0)
@@ -441,7 +450,7 @@ def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) ->
     low = np.where(is_normal, rare + ndtri(tail) * error, low)
     high = np.minimum(np.where(is_normal, rare - ndtri(tail) * error, high), 1.0)
     bounds = np.array([low, high])
-    return np.asarray(np.where(probability > 0.5, 1 - bounds[::-1], bounds))
+    return np.where(probability > 0.5, 1 - bounds[::-1], bounds)
 
 
 class CentralSpecimens:
@@ -455,9 +464,10 @@ class CentralSpecimens:
         n_runs: int,
     ) -> None:
         self.populations, self.response, self.output = populations, response, output
-        # 64 calls at them cost about as much as four times the runs.
+        # The search calls the response 64 times at these specimens, which costs about four times
+        # the runs.
         self.size = min(max(n_runs // 16, 4), 32)
-        self.count = 0  # responses computed
+        self.count = 0  # number of responses computed
         self.inputs: tuple[list[Floats], list[Floats]] | None = None
 
     def __call__(self, inputs: Sequence[Any]) -> Floats:
@@ -482,16 +492,16 @@ class CentralSpecimens:
 class InverseTransform:
     """The aleatory inputs of one population as functions of standard normal numbers z.
 
-    Inverse distribution functions at Phi(z). A distribution that has none, or depends on another
-    input, raises TypeError.
+    The inputs are inverse distribution functions at Phi(z). A distribution without one, or one that
+    depends on another input, raises TypeError.
     """
 
     def __init__(self, name: str, inputs: Inputs, parents: Sequence[Floats]) -> None:
         self.inputs = inputs
-        self.parents = parents  # shapes (1, *shape)
+        self.parents = parents  # parents of the population, shapes (1, *shape)
         sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
         ends = np.cumsum([0, *sizes]).tolist()
-        self.columns = [slice(a, b) for a, b in pairwise(ends)]  # of z, by input
+        self.columns = [slice(a, b) for a, b in pairwise(ends)]  # columns of z, by input
         self.size = ends[-1]
         symbols = inputs.placeholders()
         uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
@@ -523,7 +533,7 @@ class InverseTransform:
     def has_support_of(self, parents: Sequence[Floats]) -> bool:
         """Return whether the population has a density wherever the k populations of parents do.
 
-        Looks at their ends, five standard deviations of z from the middle.
+        Their ends are compared, five standard deviations of z from the middle.
         """
         ends = self._of_populations(parents, np.array([[-5.0], [5.0]]) * np.ones(self.size))
         return not np.isneginf(self.log_density(self.parents, ends)).any()
@@ -656,9 +666,9 @@ def evaluate(
     populations = Populations.of(result, model, n_draws, caller, calling)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
     findings, error = sample.checked_quantity(quantity)
-    by_draw = sample.evaluate(quantity, populations.thetas)
-    (center,) = sample.evaluate(quantity, populations.center[None])
-    lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], [(1 - prob) / 2, (1 + prob) / 2])
+    by_draw = sample.evaluate(quantity.of, populations.thetas)
+    (center,) = sample.evaluate(quantity.of, populations.center[None])
+    lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], tail_levels(prob))
     return QuantityTable(
         {
             "estimate": np.nanmean(by_draw) if populations.are_draws else center,
@@ -695,5 +705,5 @@ class QuantityTable(Table):
             f"{self.attrs['quantity']}: {estimate:.4g}, {percentage(self.attrs['prob'])} interval "
             f"{lower:.4g} to {upper:.4g}"
         )
-        sentences = [str(finding) for finding in from_json(self.attrs["findings"])]
+        sentences = sentences_of(self.attrs)
         return View(heading, rows=rows, sentences=sentences)

@@ -10,9 +10,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, logsumexp
 
+from prbayes._stats import ascending_quantile
 from prbayes._validate import Floats, finite_number, flag, share
 from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import sobol
@@ -84,7 +84,7 @@ class Quantity(ABC):
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return the number of each specimen whose variance is attributed to the inputs.
 
-        By default the response itself; ``at`` is the quantity of the population.
+        It is the response by default. ``at`` is the quantity of the population.
         """
         return values
 
@@ -126,7 +126,7 @@ class StandardDeviation(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the standard deviations."""
-        # Relative to a central value, against cancellation.
+        # Subtract a central value, against cancellation.
         deviation = values - values[values.size // 2]
         variance = weights @ deviation**2 - (weights @ deviation) ** 2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -174,24 +174,11 @@ class Quantile(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the quantiles, by interpolation between the middles of the steps."""
-        return np.array([weighted_quantiles(values, row, self.probability) for row in weights])
+        return np.array([ascending_quantile(values, row, self.probability) for row in weights])
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the population's quantile."""
         return (values > at).astype(float)
-
-
-def weighted_quantiles(
-    values: Floats, weights: Floats, probability: ArrayLike, is_upper: bool = False
-) -> Floats:
-    """Return quantiles of ascending values (n,), between the middles of the weights' steps.
-
-    With ``is_upper`` probabilities are those above the quantiles.
-    """
-    middles = np.cumsum(weights) - 0.5 * weights
-    below = np.asarray(probability)
-    below = 1 - below if is_upper else below
-    return np.asarray(np.interp(below, middles, values))
 
 
 class Exceedance(Quantity):
@@ -242,8 +229,8 @@ class Exceedance(Quantity):
         """Return the probabilities."""
         is_beyond = self.of_specimen(values, np.nan)
         beyond, rest = weights @ is_beyond, weights @ (1 - is_beyond)
-        # Sums of weights are one up to rounding.
-        return np.asarray(beyond / (beyond + rest))
+        # Divide by the sum of the weights, which is one up to rounding.
+        return beyond / (beyond + rest)
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the limit."""
@@ -348,7 +335,7 @@ def extreme_places(
 def _kernel_width(values: Floats) -> float:
     """Return the bandwidth for responses of the same specimens, (places, n), by Silverman's rule.
 
-    Their spread is that at a place in the middle, or else that between places.
+    Their spread is the median over places of that at a place, or else that between places.
     """
     finite = np.ma.masked_invalid(values)
     within = np.ma.filled(finite.std(axis=1), 0.0)
@@ -356,7 +343,7 @@ def _kernel_width(values: Floats) -> float:
     if spread == 0:
         spread = np.ma.filled(finite.std(), 0.0)
     width = 0.9 * float(spread) * values.shape[1] ** -0.2
-    return width or 1.0  # of equal responses
+    return width or 1.0  # one if all responses are equal
 
 
 def _log_tail(distances: Floats) -> float:
@@ -373,7 +360,7 @@ def _log_tail(distances: Floats) -> float:
 def _climbed(
     height: Callable[[Sequence[float]], float], start: list[float], low: Floats, high: Floats
 ) -> list[float]:
-    """Return a place that is higher than the start, by steps along the axes that are halved."""
+    """Climb from a start by steps along the axes, which are halved where none leads higher."""
     step = (high - low) / 32 ** (1 / low.size)
     for _ in range(10):
         steps = np.diag(step)

@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._finding import Finding, as_json, report, sentences_of
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.populations import (
     InverseTransform,
@@ -33,7 +33,8 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 from prbayes.results.predict import call_settings
 
-# Independently scrambled point sets: the standard error between them is itself known to 18%.
+# Number of independently scrambled point sets. The standard error between them has an error of 18
+# %.
 REPLICATES = 16
 # Step of differences in standard normal numbers. Half or twice changes an index by less than a
 # hundredth (tests/decision/test_sensitivity.py).
@@ -157,7 +158,7 @@ def sensitivity(
     n_points = positive_integer(n_points, "n_points", minimum=2 * REPLICATES)
     flag(computed, "computed")
     seed = seed_number(random_seed)
-    # 4000 draws: margins and correlations are then known to two percent.
+    # With 4000 draws margins and correlations have an error of two percent.
     populations = Populations.of(
         result, model, 4000, caller, call_settings(executor, store, version)
     )
@@ -184,9 +185,9 @@ def sensitivity(
         },
         attrs={
             "quantity": repr(quantity),
-            "value": float(sample.evaluate(quantity, populations.center[None])[0]),
+            "value": float(sample.evaluate(quantity.of, populations.center[None])[0]),
             "value_error": error,
-            "sd": standard_deviation(sample.evaluate(quantity, populations.thetas)),
+            "sd": standard_deviation(sample.evaluate(quantity.of, populations.thetas)),
             "of_inputs": quantity.of_inputs,
             "scatter": _aleatory_share(sample, quantity),
             "responses": sample.responses.count,
@@ -216,7 +217,7 @@ class SensitivityTable(Table):
             numbers = [(float(row[key]), float(row[f"{key}_error"])) for key in _SHARES]
             cells = [f"{x:.2f} ± {error:.2f}" if np.isfinite(x) else "" for x, error in numbers]
             rows.append([str(factor), str(row["kind"].item()), *cells])
-        sentences = [str(finding) for finding in from_json(attrs["findings"])]
+        sentences = sentences_of(attrs)
         if np.isinf(attrs["sd"]):
             sentences.append("The quantity is infinite at some draws, which the shares leave out.")
         if attrs["inputs"]:
@@ -238,8 +239,8 @@ class SensitivityTable(Table):
 class Indices:
     """First-order, total-order and derivative-based indices of d factors."""
 
-    values: Floats  # (3, d)
-    errors: Floats  # (3, d): standard errors
+    values: Floats  # (3, d): indices
+    errors: Floats  # (3, d): standard errors of the indices
 
     @classmethod
     def of_replicates(cls, indices: Floats) -> Indices:
@@ -267,11 +268,11 @@ def _hyperparameter_indices(
     independent = second @ copula.root.T
 
     def evaluate(z: Floats) -> Floats:
-        return sample.evaluate(quantity, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
+        return sample.evaluate(quantity.of, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
 
     values = evaluate(z)
     infinite = 1 - np.isfinite(values).mean()
-    if infinite > 0.01:  # shares are not known to a hundredth anyway
+    if infinite > 0.01:  # because shares have an error of a hundredth anyway
         raise ValueError(
             f"prb.sensitivity: {quantity!r}: got no finite number in {infinite:.1%} of the "
             "populations, expected one in all but 1%; where specimens fail, ask for a smaller "
@@ -298,18 +299,20 @@ def input_indices(
 ) -> tuple[Indices, str]:
     """Return the indices of the inputs at the central population, and why they are not known.
 
-    Inputs are independent. The errors include the emulator's, from emulators without a block of
-    runs each.
+    Inputs are independent. The errors include that of the emulator, from emulators without a block
+    of runs.
     """
     center = sample.populations.center[None]
     unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
-    parents = sample.populations.evaluator.parents(center, sample.k)
     try:
-        transform = InverseTransform(sample.responses.name, sample.design.inputs, parents)
+        transform = InverseTransform(
+            sample.responses.name, sample.design.inputs, sample.parents(center)
+        )
     except TypeError as error:
         return unknown, str(error)
     d = transform.size
-    # Four times as many as hyperparameters: an emulator is cheaper than weights of a design.
+    # Inputs get four times as many points as hyperparameters, because an emulator is cheaper than
+    # weights of a design.
     first, second = _paired_points(4 * n_points // REPLICATES, d, seed)
     same_input, same_rest, neighbours = [], [], []
     for columns in transform.columns:
@@ -323,7 +326,7 @@ def input_indices(
     if not outputs:
         reason = "the response is not known between the runs; computed=True calls it at new ones"
         return unknown, reason
-    (at,) = sample.evaluate(quantity, center)
+    (at,) = sample.evaluate(quantity.of, center)
     replicates = []
     for values in outputs:
         numbers = quantity.of_specimen(values, at).reshape(z.shape[:-1])
@@ -384,7 +387,8 @@ def _responses_at(
     x = transform(z)
     if not (sample.design.has_runs and sample.design.design.on_line):
         return sample.emulated(x)
-    # One input: linear between the runs, and not finite where the nearest run is not.
+    # With one input interpolate between the runs, and return the response of the nearest run where
+    # that is not finite.
     (runs,) = sample.points
     values = sample.select(sample.outputs)
     order = np.argsort(runs)
@@ -397,7 +401,7 @@ def _responses_at(
 
 def _aleatory_share(sample: ResponseSample, quantity: Quantity) -> float:
     """Return the share of a new specimen's variance that is within populations."""
-    (at,) = sample.evaluate(quantity, sample.populations.center[None])
+    (at,) = sample.evaluate(quantity.of, sample.populations.center[None])
     numbers = quantity.of_specimen(sample.values, at)
     if not np.isfinite(numbers).all():
         return np.nan
@@ -454,13 +458,13 @@ def _complete_pairs(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 
 
 def _ratio(part: Floats, variance: Floats) -> Floats:
-    """Return a share of a variance; NaN of none."""
+    """Return a share of a variance, NaN if the variance is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(variance > 0, part / variance, np.nan)
 
 
 # Normal scores of the quantiles between which a margin is linear. Variances of a normal margin are
-# then right to half a percent; closer quantiles follow the noise of 4000 draws.
+# then accurate to half a percent. Closer quantiles would follow the noise of 4000 draws.
 _SCORES = np.linspace(-2.75, 2.75, 23)
 
 
@@ -468,8 +472,8 @@ _SCORES = np.linspace(-2.75, 2.75, 23)
 class Copula:
     """Theta as a monotone function of each element of a normal vector z."""
 
-    quantiles: Floats  # (q, d): of each element, at `_SCORES`; extrapolated linearly
-    correlation: Floats  # (d, d): of z
+    quantiles: Floats  # (q, d): quantiles of each element at `_SCORES`, extrapolated linearly
+    correlation: Floats  # (d, d): correlation of z
 
     @classmethod
     def of(cls, thetas: Floats) -> Copula:

@@ -14,10 +14,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._stats import distribution_function, quantile, reached
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices
 from prbayes.inference.resampling import (
     SETS,
     DataSets,
@@ -33,12 +32,12 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-# Avoids division by zero.
+# smallest positive number, which keeps quotients of vanishing variances finite
 _TINY = np.finfo(float).tiny
 
 
 def single_output_parts(target: Discrepancy) -> list[Part]:
-    """Return the parts that see one number of a specimen: of one output, the metric itself."""
+    """Return the parts that compare one number of a specimen: with one output the metric."""
     return [part for part in target.parts if not part.target.event]
 
 
@@ -55,22 +54,22 @@ class LinearArea:
 
     # (n_sets, m): simulated less observed distribution function on each interval between knots.
     gaps: Floats
-    slopes: Floats  # (d, m): derivatives of the simulated one
-    lengths: Floats  # (m,): of the intervals
-    simulated: Floats  # (m,): the simulated one
-    specimens: int  # of the correction for few specimens, or zero
+    slopes: Floats  # (d, m): derivatives of the simulated distribution function
+    lengths: Floats  # (m,): lengths of the intervals
+    simulated: Floats  # (m,): simulated distribution function
+    specimens: int  # number of specimens of the correction for few specimens; zero without it
 
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
     """Populations around theta, in the order of `numerics.derivatives.stencil`."""
 
-    step: Floats  # (d,): shorter than the nominal one where the prior is wide
-    is_wide: bool  # the nominal step is that for step functions
-    values: Floats  # (s, n), or (s, n, m) of several outputs
-    weights: Floats  # (s, n)
-    blocks: NDArray[np.intp]  # (n,): of the design's points, which may change afterwards
-    has_equal_values: bool  # the responses are the same at all points, as stored ones are
+    step: Floats  # (d,): steps, shorter than the nominal ones where the prior is wide
+    is_wide: bool  # whether the nominal step is that for step functions
+    values: Floats  # (s, n): responses, or (s, n, m) of several outputs
+    weights: Floats  # (s, n): weights of the responses
+    blocks: Indices  # (n,): blocks of the design's points, copied because the design may change
+    has_equal_values: bool  # whether the responses are the same at all points, as stored ones are
 
 
 def _stencil_around(
@@ -83,16 +82,17 @@ def _stencil_around(
     node, d = evaluator.nodes[k], theta.size
     across = slice(1 + 2 * d)  # theta and its neighbours along each element
     step = share * evaluator.hyperparameters.prior_sd
-    # Largest distance between distribution functions that a step makes: .6 sd of a normal
-    # population, over which differences are right to a few per cent.
+    # Largest distance between the distribution functions on both sides of a step. It corresponds to
+    # a shift of a normal population by .6 standard deviations, over which differences are accurate
+    # to a few per cent.
     largest = 0.24
     stencils = []
-    for _ in range(9):  # each up to ten times shorter: to 1e-11 of the prior's spread
+    for _ in range(9):  # each step is up to ten times shorter, to 1e-11 of the prior's spread
         values, weights = evaluator.populations(theta + stencil(d) * step, k)
         is_equal = np.array_equal(values[0], values[-1], equal_nan=True)
         around = Stencil(step, is_wide, values, weights, node.bound.blocks, is_equal)
         stencils.append(around)
-        moves = np.zeros(d)  # of a distribution function over a step, by element
+        moves = np.zeros(d)  # largest change of a distribution function over a step, by element
         for part in single_output_parts(node.target):
             projection = part.of(values[:1] if is_equal else values)
             is_usable = np.isfinite(projection[0]) & (weights[0] > 0)
@@ -107,55 +107,52 @@ def _stencil_around(
             moves = np.maximum(moves, gaps.reshape(2, d).max(axis=0))
         if moves.max(initial=0.0) <= largest:
             return around
-        # Populations that do not overlap give no estimate of the factor.
+        # Where populations do not overlap, the distance does not tell how much shorter the step has
+        # to be.
         factor = np.where(moves > 0.9, 0.1, 0.5 * largest / moves.clip(1e-9))
         step = np.where(moves > largest, factor, 1.0) * step
-    # A population that is one number overlaps with no other.
+    # A population that is a single number overlaps with no other at any step.
     return stencils[0]
 
 
 # -- H and J ---------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
 class Information:
     """Information about theta in one simulator's data, if they are drawn from the model there."""
 
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        k: int,
-        theta: Floats,
-        n_sets: int = SETS,
-        widened: float = 1.0,
-    ) -> None:
-        self.evaluator = evaluator
-        self.k = k  # index of the simulator
-        self.theta = theta  # (d,)
-        self.prior_sd = evaluator.hyperparameters.prior_sd  # (d,)
-        self.n_sets = n_sets  # number of simulated data sets, each of the observed size
-        # Factor of the step where the discrepancy is a step function of theta, or jumps.
-        self.widened = widened
+    evaluator: Evaluator
+    k: int  # index of the simulator
+    theta: Floats  # (d,)
+    n_sets: int = SETS  # number of simulated data sets, each of the observed size
+    widened: float = 1.0  # factor of the step where the discrepancy jumps, or has steps in theta
+
+    @property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each element, (d,)."""
+        return self.evaluator.hyperparameters.prior_sd
 
     @property
     def node(self) -> Node:
-        """The simulator, which is that of the evaluator after a pickle too."""
+        """The simulator, read from the evaluator so that both are the same after a pickle."""
         return self.evaluator.nodes[self.k]
 
     @cached_property
     def stencil(self) -> Stencil:
-        """The populations around theta, as close as the discrepancy can be differenced."""
+        """The populations around theta, at the smallest steps that suit the discrepancy."""
         target, bound = self.node.target, self.node.bound
-        # A moving edge of a support passes several points within a wide step.
+        # With a moving support the step is wide, so that the edge passes several points.
         is_smooth = not bound.support_moves if bound.stored else is_differentiable(target)
         if is_smooth:
             narrow = _stencil_around(self.evaluator, self.k, self.theta, 1e-3, is_wide=False)
-            # Of several outputs a failed one is at the end of its scale, and does not jump.
+            # With several outputs a failure is coded as the largest value and causes no jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
-            # Unless points fail: the edge of their region passes none within a narrow step, and
-            # the population without them would not change its share of failures.
+            # If points fail, the step is wide: the edge of their region passes none of them within
+            # a narrow step, so that the share of failures would not change.
             if bound.stored or is_known.all():
                 return narrow
-        # For step functions: distribution functions, jumps, moving supports.
+        # The discrepancy is a step function of theta: its differences need a wide step.
         share = 0.05 * self.widened
         return _stencil_around(self.evaluator, self.k, self.theta, share, is_wide=True)
 
@@ -170,7 +167,7 @@ class Information:
         around, target = self.stencil, self.node.target
         has_densities = [isinstance(part.target, DensityDiscrepancy) for part in target.parts]
         if around.has_equal_values and len(has_densities) > 1 and all(has_densities):
-            # Cells are filled once for all points, and not for each.
+            # The basis fills its cells once for all points of the stencil.
             features = target.basis(around.values[0]).features(around.weights)
         else:
             features = target.features(around.values, around.weights, np)
@@ -197,7 +194,7 @@ class Information:
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it.
 
-        Of a log-likelihood, its expected gain from the truth to its maximum: half for each
+        For a log-likelihood it is the expected gain from the truth to the maximum: half for each
         hyperparameter, over N (Wilks 1938, doi:10.1214/aoms/1177732360).
         """
         if not self.node.metric.distance:
@@ -223,15 +220,16 @@ class Information:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         target = self.node.target
         if target.metric.exact_likelihood:
-            return self.hessian / target.n_effective  # the information equality
+            # because the covariance of the score is the information
+            return self.hessian / target.n_effective
         if not is_additive(target) or dependent([self.node]):
             sets = self.data_sets
             gradients = self.gradients(sets.values[self.k], sets.weights[self.k])
             return np.atleast_2d(np.cov(gradients, rowvar=False))
-        # A mean over observations: the covariance of single ones, by N. Single specimens are drawn
-        # at equal steps of probability. Of several outputs half of them are drawn in proportion to
-        # the fourth power of their distance from the middle, as most of the mean square of
-        # gradients is theirs.
+        # The discrepancy is a mean over observations, so that J is the covariance of the gradient
+        # of a single specimen over N. Single specimens are drawn at equal steps of probability.
+        # With several outputs half of them are drawn in proportion to the fourth power of their
+        # distance from the middle, because these contribute most of the mean square of gradients.
         _, values, weights = self._sides
         order = np.argsort(values.reshape(len(values), -1)[:, 0])
         n, mass = 1000, weights
@@ -242,7 +240,7 @@ class Information:
             mass = mass / mass.sum()
         rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
         single = values[rows]
-        # 64 at a time, as the work grows with their square.
+        # Batches have 64 specimens, because the work grows with the square of their number.
         batches = [single[i : i + 64] for i in range(0, n, 64)]
         singles = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
         aweights = weights[rows] / mass[rows]
@@ -256,10 +254,10 @@ class Information:
         differences = hessian_of(self.discrepancies(*self._sides[1:]), step.size)
         return differences / np.outer(step, step)
 
-    def areas(self, sets: DataSets, subset: NDArray[np.bool_] | None = None) -> list[LinearArea]:
+    def areas(self, sets: DataSets, subset: Bools | None = None) -> list[LinearArea]:
         """Return a linear model of each area that the metric is a sum of, for data sets.
 
-        ``subset`` are the points of the population that count; all by default.
+        ``subset`` selects points of the population; all by default.
         """
         around = self.stencil
         observed, observed_weights = sets.values[self.k], sets.weights[self.k]
@@ -267,7 +265,7 @@ class Information:
         if subset is not None:
             weights = weights * subset
             total = weights.sum(axis=-1, keepdims=True)
-            # A population that does not reach these points has a distribution function of zeros.
+            # A population without weight on these points has a distribution function of zeros.
             weights = weights / np.where(total > 0, total, 1.0)
         areas = []
         for part in self.node.target.parts:
@@ -276,18 +274,19 @@ class Information:
             if len(part_observed) < len(observed):
                 w = w / w.sum(axis=1, keepdims=True)
             values = part.of(around.values)
-            # Values that occur, where distribution functions are exact; 400 of all.
+            # Knots are values that occur, because distribution functions are exact there; 400
+            # suffice.
             occurring = np.concatenate([values[0], part_observed])
             knots = np.unique(occurring[np.isfinite(occurring)])
             knots = knots[np.unique(np.linspace(0, knots.size - 1, 400).astype(int))]
             # Responses that are the same at all points of the stencil are sorted once.
-            if np.array_equal(values[0], values[-1], equal_nan=True):
+            if around.has_equal_values:
                 values = values[0]
             simulated = distribution_function(values, weights, knots, kind="quicksort")
             measured = distribution_function(part_observed, w, knots, kind="quicksort")
             gaps = simulated[0] - measured
             derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
-            # An interval between knots has the values at its left end.
+            # Distribution functions are constant between knots, with the value at the left knot.
             lengths = part.share * np.diff(knots)
             n = getattr(part.target, "specimens", 0)  # a metric of the user has no correction
             levels = simulated[0, :-1]
@@ -307,7 +306,7 @@ def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> 
         centered = np.where(is_finite, finite - mass @ finite, 0.0)
         variance = float(mass @ centered**2)
         squares.append(centered**2 / max(variance, _TINY))
-    return np.asarray(np.mean(squares, axis=0))
+    return np.mean(squares, axis=0)
 
 
 def identified_by_area(information: Information, weakest: float = 1.0) -> Floats:
@@ -320,31 +319,31 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
     spread = information.prior_sd[:, None]
     sets, blocks = information.data_sets, information.stencil.blocks
     areas = information.areas(sets)
-    gram: Any = 0
-    for area in areas:
-        scaled = np.asarray(area.slopes * spread)
-        gram = gram + (scaled * area.lengths) @ scaled.T
+    lengths = [area.lengths for area in areas]
+    scaled = [area.slopes * spread for area in areas]
+    pairs = zip(scaled, lengths, strict=True)
+    gram = sum((slopes * length) @ slopes.T for slopes, length in pairs)
     _, vectors = np.linalg.eigh(gram)
-    # The change of the area over one prior standard deviation along each direction.
-    change: Any = 0
-    for area in areas:
-        changes = np.abs(vectors.T @ np.asarray(area.slopes * spread))
-        change = change + (changes * area.lengths).sum(axis=-1)
+    # Change of the area over one prior standard deviation along each direction.
+    pairs = zip(scaled, lengths, strict=True)
+    change = sum((np.abs(vectors.T @ x) * length).sum(axis=-1) for x, length in pairs)
     is_identified = weakest * change > 0.5 * information.noise_floor
     if blocks.size >= 256:
-        even_areas = information.areas(sets, blocks % 2 == 0)
-        odd_areas = information.areas(sets, blocks % 2 == 1)
-        product = even_square = odd_square = np.zeros(vectors.shape[1])
-        for even, odd in zip(even_areas, odd_areas, strict=True):
-            even_change = vectors.T @ np.asarray(even.slopes * spread)
-            odd_change = vectors.T @ np.asarray(odd.slopes * spread)
-            lengths = even.lengths  # both halves have the same knots
-            product = product + (even_change * odd_change * lengths).sum(axis=-1)
-            even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
-            odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
-        # Correlation of the changes on both sides of theta.
-        is_identified &= product > 0.35 * np.sqrt(even_square * odd_square)
-    return np.asarray(vectors[:, is_identified])
+        even, odd = (
+            [vectors.T @ (area.slopes * spread) for area in information.areas(sets, half)]
+            for half in (blocks % 2 == 0, blocks % 2 == 1)
+        )
+
+        def product(first: list[Floats], second: list[Floats]) -> Any:
+            # Both halves of the points have the same knots, and so the same lengths.
+            changes = zip(first, second, lengths, strict=True)
+            return sum((a * b * length).sum(axis=-1) for a, b, length in changes)
+
+        # Require a correlation of .35 between the changes by the two halves of the points.
+        is_identified &= product(even, odd) > 0.35 * np.sqrt(
+            product(even, even) * product(odd, odd)
+        )
+    return vectors[:, is_identified]
 
 
 # -- the sampling distribution --------------------------------------------------------------------
@@ -361,7 +360,7 @@ def first_order_shifts(
     """
     directions = basis * information[0].prior_sd[:, None]
     n_sets, r = len(sets.weights[0]), basis.shape[1]
-    force = np.zeros((n_sets, r))  # minus the gradients
+    force = np.zeros((n_sets, r))  # minus the gradients at theta
     curvature = np.zeros((r, r))
     areas = []
     for item, scale in zip(information, scales, strict=True):
@@ -375,62 +374,70 @@ def first_order_shifts(
                 if not area.specimens:
                     areas.append(replace(area, slopes=along, lengths=lengths))
                     continue
-                # Its mean over data sets is smooth.
+                # The corrected area is smooth on average over data sets: use its mean derivatives.
                 expected, density = bias_and_density(area.specimens, area.simulated)
                 force -= (lengths * (np.sign(area.gaps) - expected)) @ along.T
                 curvature += (lengths * density * along) @ along.T
     shifts = np.zeros_like(force)
-    # Without an area one solution is exact.
+    # Without area metrics the system is linear: one iteration suffices.
     for _ in range(30 if areas else 1):
         matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()
         vector = force.copy()
         for area in areas:
-            # Each |gap| is a parabola through its value at the present shifts. Below a gap of 1e-4
-            # an absolute value counts as a parabola.
+            # Iterated reweighting replaces each |gap| by a parabola through its value at the
+            # present shifts. Gaps below 1e-4 are rounded off, so that weights stay finite.
             gaps = area.gaps + shifts @ area.slopes
             weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
             matrix += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
             vector -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
-        # A ridge relative to each direction's own size: priors may differ in width by far.
+        # The ridge is relative to each direction's own size, because priors may differ in width by
+        # far.
         ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]
         shifts = np.linalg.solve(matrix + ridge * np.eye(r), vector[..., None])[..., 0]
-    return np.asarray(shifts)
+    return shifts
 
 
 @dataclass(frozen=True, eq=False)
 class Local:
     """Covariance of the minimiser at one theta, in units of the prior's spread.
 
-    Elements and functions with a share above .02 in unidentified directions are not identified.
+    Elements and functions whose share in unidentified directions is above .02 count as not
+    identified.
     """
 
-    prior_sd: Floats  # (d,): the prior's spread
+    prior_sd: Floats  # (d,): standard deviations of the prior
     identified: Floats  # (d, r): orthonormal directions that the data identify
-    unidentified: Floats  # (d, d - r): the other directions
-    covariance: Floats  # (r, r): of the minimiser, along the directions identified
+    unidentified: Floats  # (d, d - r): orthonormal directions that the data do not identify
+    covariance: Floats  # (r, r): covariance of the minimiser along the identified directions
+
+    @property
+    def hidden_share(self) -> Floats:
+        """The share of each element in directions that are not identified, (d,)."""
+        return (self.unidentified**2).sum(axis=1)
 
     @property
     def in_theta(self) -> Floats:
-        """The covariance in theta, (d, d), infinite for elements with a share not identified."""
+        """The covariance in theta, (d, d); infinite for elements that are not fully identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > 0.02
+        is_hidden = self.hidden_share > 0.02
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
-        return np.asarray(covariance)
+        return covariance
 
     def variance(self, gradients: Floats) -> Floats:
         """Return the variance of functions of theta with gradients (..., d).
 
-        Infinite for those with a share not identified. A function of unidentified elements may be
-        identified, such as the standard deviation of an input whose correlation is not.
+        It is infinite for functions that are not fully identified. A function of unidentified
+        elements may be identified, such as the standard deviation of an input whose correlation is
+        not.
         """
         unit = gradients * self.prior_sd
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
         is_hidden = (across**2).sum(axis=-1) > 0.02 * (unit**2).sum(axis=-1)
-        return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
+        return np.where(is_hidden, np.inf, np.maximum(variance, 0))
 
 
 def local_sampling(information: list[Information], scales: Floats, weakest: float = 1.0) -> Local:
@@ -443,20 +450,18 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
         return _area_covariance(information, scales, weakest)
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    is_dependent = dependent(information[0].evaluator.nodes)
-    hessian, noise, gradients = (np.zeros(()) for _ in range(3))
-    for item, scale in zip(information, scales, strict=True):
-        hessian = hessian + item.hessian / scale
-        if is_dependent:
-            sets = information[0].data_sets
-            observed, weights = sets.values[item.k], sets.weights[item.k]
-            gradients = gradients + item.gradients(observed, weights) / scale
-        else:
-            noise = noise + item.sampling_covariance / scale**2
-    if is_dependent:
-        # Gradients of simulators that share specimens depend on each other.
-        noise = np.atleast_2d(np.cov(gradients, rowvar=False))
-    hessian, noise = unit * hessian, unit * noise
+    pairs = list(zip(information, scales, strict=True))
+    hessian = unit * sum(item.hessian / scale for item, scale in pairs)
+    if dependent(information[0].evaluator.nodes):
+        # Gradients of simulators that share specimens are correlated: add them for each data set.
+        sets = information[0].data_sets
+        gradients = sum(
+            item.gradients(sets.values[item.k], sets.weights[item.k]) / scale
+            for item, scale in pairs
+        )
+        noise = unit * np.atleast_2d(np.cov(gradients, rowvar=False))
+    else:
+        noise = unit * sum(item.sampling_covariance / scale**2 for item, scale in pairs)
     values, vectors, is_identified = identified_by_curvature(hessian, noise, weakest)
     identified = vectors[:, is_identified]
     inverse = identified / values[is_identified]
@@ -465,20 +470,21 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
 
 
 def _area_covariance(information: list[Information], scales: Floats, weakest: float) -> Local:
-    """Return the covariance of the shifts over simulated data sets, if there are areas."""
+    """Return the sampling distribution with area metrics, from shifts over data sets."""
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    # The space spanned by the directions of all simulators; an empty column, should none have any.
+    # Columns span the space that any simulator identifies. The column of zeros keeps the array from
+    # being empty.
     columns = [np.zeros((prior_sd.size, 1))]
     for item in information:
         if item.node.metric.minimum is Minimum.QUADRATIC:
             noise = item.sampling_covariance * unit
             _, vectors, is_identified = identified_by_curvature(item.hessian * unit, noise, weakest)
-            columns.append(np.asarray(vectors[:, is_identified]))
+            columns.append(vectors[:, is_identified])
         else:
             columns.append(identified_by_area(item, weakest))
     axes, strength, _ = np.linalg.svd(np.concatenate(columns, axis=1))
-    # An identified direction has a strength of one or more; rounding is far smaller.
+    # Singular values of identified directions are one or more, others are rounding errors.
     rank = int((strength > 0.1).sum())
     identified = axes[:, :rank]
     covariance = np.zeros((rank, rank))
@@ -492,12 +498,12 @@ def _area_covariance(information: list[Information], scales: Floats, weakest: fl
 def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]:
     """Name unidentified directions, orthonormal columns (d, q), such as 'mu[0] - 0.8 mu[1]'.
 
-    They are rotated so that elements are alone if possible.
+    They are rotated so that each has few elements.
     """
     labels = []
     space = unidentified
     while space.shape[1]:
-        # The element that lies closest to the space, projected on it.
+        # Select the element that lies closest to the space, and project it on the space.
         projector = space @ space.T
         within = np.diag(projector)
         i = int(np.argmax(within))
@@ -505,7 +511,7 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         labels.append(named_direction(direction, names))
         complement = space - np.outer(direction, direction @ space)
         axes, strength, _ = np.linalg.svd(complement, full_matrices=False)
-        # Directions of the complement have a strength of one, up to rounding.
+        # Singular values of directions in the complement are one, up to rounding.
         space = axes[:, strength > 1e-6]
     return labels
 
@@ -525,7 +531,7 @@ def named_direction(direction: Floats, names: list[str]) -> str:
     terms = []
     for i in np.argsort(-np.abs(ratios), kind="stable"):
         size = abs(ratios[i])
-        # Elements below .15 are left out, and above .95 called equal.
+        # Leave out elements below .15, and print no factor above .95.
         if size <= 0.15:
             continue
         sign = "-" if ratios[i] < 0 else "+"
@@ -536,7 +542,7 @@ def named_direction(direction: Floats, names: list[str]) -> str:
 
 def identified_by_curvature(
     hessian: Floats, noise: Floats, weakest: float = 1.0
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Bools]:
     """Return eigenvalues and eigenvectors of the Hessian, and which of them the data identify.
 
     H and J of the sandwich, (d, d), are in units of the prior's spread; ``weakest`` is an upper
@@ -544,7 +550,8 @@ def identified_by_curvature(
     """
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     noise_along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    # Along flat directions both are rounding errors, a hundredth of their ratio elsewhere.
+    # Along flat directions curvature and noise are both rounding errors: require a hundredth of
+    # their typical ratio.
     total = float(np.trace(hessian))
     floor = 0.01 * float(np.trace(noise)) / total if total > 0 else 0.0
     is_precise = noise_along < (weakest * values) ** 2

@@ -15,6 +15,7 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import observed_set
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
@@ -24,14 +25,19 @@ from prbayes.propagation.base import N_BLOCKS
 class DesignErrors:
     """Distance between the optima of two independent designs, in standard errors."""
 
-    points: float  # by their points; NaN if not known
-    emulators: float  # by the error of emulators; NaN without emulators
+    points: float  # distance because of the points; NaN if not known
+    emulators: float  # distance because of the emulators' error; NaN without emulators
 
     @property
     def whole(self) -> float:
-        """Both together; NaN if nothing is known."""
+        """Both distances together; NaN if neither is known."""
         errors = [e for e in (self.points, self.emulators) if not np.isnan(e)]
         return float(np.linalg.norm(errors)) if errors else np.nan
+
+
+def is_emulated(evaluator: Evaluator) -> bool:
+    """Return whether all designs have emulated samples; True without a design."""
+    return all(bound.design.is_emulated for bound in evaluator.reweighted.values())
 
 
 def design_error(sampling: SamplingDistribution) -> DesignErrors:
@@ -40,8 +46,8 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
     if is_stored(sampling.evaluator):
         nodes, designs = sampling.evaluator.nodes, sampling.evaluator.reweighted
         on_line = {name for name, bound in designs.items() if bound.design.on_line}
-        # Two designs differ by the root of two of one's error. Points on a line, which cut it into
-        # parts of equal mass, count as exact.
+        # The difference of two designs has the error of one times the root of two. Points on a line
+        # cut it into parts of equal mass, and count as exact.
         if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
         if [bound for bound in designs.values() if bound.design.is_emulated]:
@@ -52,8 +58,9 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
     """Return the error of the optimum by emulators, (r,).
 
-    From minima of emulators that lack a block of the runs, less the minimum of the whole by the
-    same descent, which may differ from the optimum for other reasons.
+    It is the spread of minima by emulators that lack a block of the runs, around the minimum by all
+    runs. The same descent finds that minimum, because it may differ from the optimum for other
+    reasons.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
     left_out = [
@@ -70,13 +77,13 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
         stored = [values[b] if values else None for values in left_out]
         objective = BatchObjective.of(evaluator, scales, observed, stored=stored)
         shifts.append(_minimum(sampling, objective, descent) - minimum)
-    return np.asarray(np.sqrt(np.square(shifts).sum(axis=0)))
+    return np.sqrt(np.square(shifts).sum(axis=0))
 
 
 def _error_of_points(sampling: SamplingDistribution) -> Floats:
     """Return the error of the optimum by the design's points, (r,).
 
-    The spread of the minima of blocks of the design, as if they were independent, bounds it.
+    It is bounded by the spread of the minima by blocks of the design, as if these were independent.
     """
     evaluator = sampling.evaluator
     observed = observed_set(evaluator)
@@ -94,9 +101,10 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
-    if all(bound.design.is_emulated for bound in evaluator.reweighted.values()):
-        # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
-        # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
+    if is_emulated(evaluator):
+        # This is the rate of points that fill d dimensions evenly, for functions with a jump along
+        # a surface. The rate of smooth functions is up to 1/2 + 1/d (He and Owen 2016,
+        # doi:10.1111/rssb.12132).
         rate += 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
     return np.asarray(x[is_usable].std(axis=0, ddof=1) / N_BLOCKS**rate)
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
@@ -24,7 +23,7 @@ from prbayes.metrics.multivariate import failure_caps
 from prbayes.model.data_checks import resolution
 from prbayes.model.evaluator import Evaluator
 
-# p-value below which the data do not come from the family, by convention.
+# p-value below which the family of the population is rejected, by convention
 UNLIKELY = 0.01
 
 
@@ -33,11 +32,11 @@ class FittedSets:
     """Synthetic data sets with their minimisers, and the minimiser of the observed data."""
 
     sampling: SamplingDistribution
-    center: Floats  # (r,): of the observed data, in coordinates
+    center: Floats  # (r,): minimiser of the observed data, in coordinates
     sets: DataSets
-    x: Floats  # (n_sets, r): of the data sets
-    converged: NDArray[np.bool_]  # (n_sets,)
-    observed: DataSets  # the observed data, or these without rounding
+    x: Floats  # (n_sets, r): minimisers of the data sets
+    converged: Bools  # (n_sets,): whether these minimisations converged
+    observed: DataSets  # observed data, perhaps with ties spread out
 
     @classmethod
     def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets | None:
@@ -59,7 +58,7 @@ class FittedSets:
         return cls(sampling, x[0], sets, x, converged, observed_set(sampling.evaluator))
 
     def without_rounding(self) -> FittedSets | None:
-        """Return the same with tied observations spread out; None if none are tied."""
+        """Return a copy with tied observations spread out, or None if there are no ties."""
         values = [
             np.column_stack([spread_out(column) for column in y.reshape(len(y), -1).T])
             for y in self.observed.values
@@ -70,7 +69,7 @@ class FittedSets:
             return None
         observed = replace(self.observed, values=values)
         center = self.center
-        if self.x.any():  # data sets are refitted
+        if self.x.any():  # the data sets were refitted, not taken at theta
             (center,), _ = refit(self.sampling, observed)
         return replace(self, observed=observed, center=center)
 
@@ -114,25 +113,27 @@ def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -
 def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: Floats) -> Floats:
     """Return logarithms of two distances of data sets from populations, (S, 2).
 
-    Those of Cramer-von Mises and Anderson-Darling, between the weighted values (n,), (S, n) of data
-    sets and populations (N,) or (S, N), (S, N). Only finite responses can be observed.
+    The distances are those of Cramér-von Mises and Anderson-Darling. Data sets are values (n,) with
+    weights (S, n), populations are responses (N,) or (S, N) with masses (S, N). Only finite
+    responses can be observed.
     """
     masses = np.where(np.isfinite(simulated), masses, 0.0)
     masses = masses / masses.sum(axis=1, keepdims=True)
     weights = weights / weights.sum(axis=1, keepdims=True)
     order = np.argsort(values, kind="stable")
     points, weights = values[order], weights[:, order]
-    # In the middles of the steps of both.
+    # Compare both distribution functions in the middles of their steps.
     at_most = distribution_function(simulated, masses, points)
     less = distribution_function(simulated, masses, np.nextafter(points, -np.inf))
     expected = (at_most + less) / 2
     below = np.cumsum(weights, axis=1) - weights / 2
     squares = weights * (below - expected) ** 2
-    # A mass of at least 1e-4 beyond the extremes bounds the weight of single observations there.
+    # Clip the expected values, because single observations in the tails would have unbounded
+    # weight.
     inside = np.clip(expected, 1e-4, 1 - 1e-4)
     in_the_tails = squares / (inside * (1 - inside))
     distances = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
-    return np.asarray(np.log(np.maximum(distances, 1e-300)))
+    return np.log(np.maximum(distances, 1e-300))
 
 
 def spread_out(values: Floats) -> Floats:
@@ -244,8 +245,8 @@ def population_misfit(
 def output_misfits(fitted: FittedSets) -> list[Finding]:
     """Report for each simulator of several outputs which of them, and which pairs, misfit.
 
-    Outputs by the distances of Cramer-von Mises and Anderson-Darling, pairs by the residual of
-    their correlation.
+    Outputs are tested by the distances of Cramér-von Mises and Anderson-Darling, pairs by the
+    residual of their correlation.
     """
     findings = []
     evaluator, is_fitted = fitted.sampling.evaluator, fitted.converged
@@ -286,11 +287,11 @@ def output_misfits(fitted: FittedSets) -> list[Finding]:
 class _Outputs:
     """Data sets of one simulator, and a population for each; a failure counts as the cap."""
 
-    values: Floats  # (n, m): of the data sets; NaN if an output was not measured
-    weights: Floats  # (S, n)
-    simulated: Floats  # (N, m): of all populations
-    masses: Floats  # (S, N)
-    columns: list[int]  # of the outputs that are tested
+    values: Floats  # (n, m): values of the data sets; NaN if an output was not measured
+    weights: Floats  # (S, n): weights of these values in each data set
+    simulated: Floats  # (N, m): responses of all populations
+    masses: Floats  # (S, N): weights of the responses in each population
+    columns: list[int]  # columns of the outputs that are tested
 
     @classmethod
     def of(cls, fitted: FittedSets, sets: DataSets, x: Floats, k: int) -> _Outputs:
@@ -306,7 +307,7 @@ class _Outputs:
             sets.weights[k],
             np.minimum(simulated[0][has_response], caps),
             masses / masses.sum(axis=1, keepdims=True),
-            # At most 12, from the first to the last: neighbours on a curve misfit together.
+            # Twelve outputs of a curve suffice, because neighbours misfit together.
             np.linspace(0, m - 1, min(m, 12)).round().astype(int).tolist(),
         )
 
@@ -334,6 +335,6 @@ def _correlation(values: Floats, weights: Floats) -> Floats:
     moments = weights @ np.column_stack([a, b, a * a, b * b, a * b])
     mean_a, mean_b, square_a, square_b, product = moments.T
     variances = (square_a - mean_a**2) * (square_b - mean_b**2)
-    varies = variances > 1e-20  # beyond rounding, in units of the spread
+    varies = variances > 1e-20  # larger than rounding errors in units of the spread
     root = np.sqrt(np.where(varies, variances, 1.0))
     return np.where(varies, (product - mean_a * mean_b) / root, np.nan)

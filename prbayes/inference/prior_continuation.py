@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS, Hyperparameters
 
@@ -28,13 +27,13 @@ class Continuation:
     if only beyond a, and theta if beyond none.
     """
 
-    lower: Floats  # (d,): ends a; NaN of elements without them
-    upper: Floats  # (d,): ends b
-    below: NDArray[np.bool_]  # (d,): whether populations exist there
-    above: NDArray[np.bool_]
+    lower: Floats  # (d,): lower ends a; NaN of elements without ends
+    upper: Floats  # (d,): upper ends b; NaN of elements without ends
+    below: Bools  # (d,): whether populations exist below the lower end
+    above: Bools
 
     @property
-    def is_continued(self) -> NDArray[np.bool_]:
+    def is_continued(self) -> Bools:
         """Which elements continue beyond an end, (d,)."""
         return self.below | self.above
 
@@ -47,7 +46,7 @@ class Continuation:
             result = np.where(self.below & self.above, self.lower + distance, thetas)
             result = np.where(self.above & ~self.below, np.log(distance), result)
             result = np.where(self.below & ~self.above, -np.log(remaining), result)
-        return np.asarray(result)
+        return result
 
     def values(self, coordinates: Floats) -> Floats:
         """Return values of continued elements, NaN of others, (S, d)."""
@@ -56,28 +55,32 @@ class Continuation:
             above = self.lower + np.exp(coordinates)
             below = self.upper - np.exp(-coordinates)
         result = np.where(self.above & ~self.below, above, result)
-        return np.asarray(np.where(self.below & ~self.above, below, result))
+        return np.where(self.below & ~self.above, below, result)
 
     def within(self, coordinates: Floats, margin: float = 1e-3) -> Floats:
         """Return thetas of coordinates, moved within the ends, (S, d)."""
         return self._thetas(self._shares(coordinates, margin), coordinates)
 
+    def _unbounded_shares(self, coordinates: Floats) -> Floats:
+        """Return values as shares of the interval, also those beyond its ends."""
+        return (self.values(coordinates) - self.lower) / (self.upper - self.lower)
+
     def _shares(self, coordinates: Floats, margin: float) -> Floats:
         """Return values as shares of the interval, a margin away from ends that are passed."""
-        shares = (self.values(coordinates) - self.lower) / (self.upper - self.lower)
+        shares = self._unbounded_shares(coordinates)
         least = np.where(self.below, margin, 1e-300)
         return np.clip(shares, least, np.where(self.above, 1 - margin, 1 - 1e-16))
 
     def _thetas(self, shares: Floats, coordinates: Floats) -> Floats:
-        return np.asarray(np.where(self.is_continued, logit(shares), coordinates))
+        return np.where(self.is_continued, logit(shares), coordinates)
 
     def parents(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the parents of the k-th simulator, continued linearly beyond the ends."""
-        margin = 1e-3  # part of the interval whose slope continues the parents
+        margin = 1e-3  # part of the interval from whose slope the parents are extrapolated
         shares = self._shares(coordinates, margin)
         base = evaluator.parents(self._thetas(shares, coordinates), k)
         parents = list(base)
-        beyond = (self.values(coordinates) - self.lower) / (self.upper - self.lower) - shares
+        beyond = self._unbounded_shares(coordinates) - shares
         for i in np.flatnonzero(self.is_continued):
             passed = np.abs(beyond[:, i]) > 1e-12
             if not passed.any():
@@ -138,12 +141,19 @@ class ContinuedEvaluator(Evaluator):
 
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
-    """Return coordinates with the ends beyond which populations of thetas, (S, d), exist.
+    """Return the continuation beyond those ends where populations of thetas, (S, d), exist.
 
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """
-    d = evaluator.hyperparameters.size
-    lower, upper = _logistic_ends(evaluator.hyperparameters)
+    hyperparameters = evaluator.hyperparameters
+    d = hyperparameters.size
+    base = hyperparameters.prior_thetas(2, 0)
+    _, lower, upper = ends_of_prior(hyperparameters, base[0])
+    expected = lower + (upper - lower) * expit(base)
+    if np.isfinite(expected).any():
+        values = _free_values(hyperparameters, base)
+        is_logistic = np.isclose(values, expected, rtol=1e-9).all(axis=0)
+        lower, upper = (np.where(is_logistic, ends, np.nan) for ends in (lower, upper))
     bounded = np.isfinite(upper - lower)
     below, above = bounded.copy(), bounded.copy()
     for side, sign in ((below, -1), (above, 1)):
@@ -155,7 +165,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
             middle, half = (upper[i] + lower[i]) / 2, (upper[i] - lower[i]) / 2
             points[:, i] = middle + sign * 1.05 * half
             continued = ContinuedEvaluator.continuing(evaluator, trial)
-            # Populations are possible where they have weights.
+            # A population exists there if its weights are finite and not all zero.
             weights = [continued.populations(points, k)[1] for k in range(len(evaluator.nodes))]
             side[i] = all(np.isfinite(w).all() and bool((w.sum(axis=1) > 0).all()) for w in weights)
     return Continuation(lower, upper, below, above)
@@ -164,10 +174,11 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
 def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floats, Floats, Floats]:
     """Return values of elements in the users' own units, and the ends of their ranges, (d,) each.
 
-    NaN where there is no end, or elements have no values of their own, as those of a simplex.
+    They are NaN where there is no end, and for all elements if one variable is a simplex.
     """
     d = theta.size
-    # A transform is at its end if a point far out has the value of one much farther out.
+    # A transform has reached its end if a point far out and one much farther out have the same
+    # value.
     spread = np.diag(hyperparameters.prior_sd)
     far = [theta + size * spread for size in (-1e6, -1e3, 1e3, 1e6)]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -179,18 +190,6 @@ def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floa
     lower = np.where((low == outermost) & np.isfinite(low), low, np.nan)
     upper = np.where((high == uppermost) & np.isfinite(high), high, np.nan)
     return values[0], lower, upper
-
-
-def _logistic_ends(hyperparameters: Hyperparameters) -> tuple[Floats, Floats]:
-    """Return the ends, (d,) each, of elements that are logistic functions of theta, else NaN."""
-    base = hyperparameters.prior_thetas(2, 0)
-    _, lower, upper = ends_of_prior(hyperparameters, base[0])
-    expected = lower + (upper - lower) * expit(base)
-    is_logistic = np.zeros(lower.size, dtype=bool)
-    if np.isfinite(expected).any():
-        values = _free_values(hyperparameters, base)
-        is_logistic = np.isclose(values, expected, rtol=1e-9).all(axis=0)
-    return np.where(is_logistic, lower, np.nan), np.where(is_logistic, upper, np.nan)
 
 
 def _free_values(hyperparameters: Hyperparameters, thetas: Floats) -> Floats:

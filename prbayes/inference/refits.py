@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._progress import progress
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
 from prbayes.inference.asymptotics import (
     Information,
     Local,
@@ -27,12 +26,12 @@ from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, 
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
 from prbayes.metrics.density import is_differentiable
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
+from prbayes.numerics.batched_minimisers import Descent, descend, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 from prbayes.numerics.threads import one_thread
 
-# Smallest share of refits that converge. Without the outermost tenth at one end, a normal sampling
-# distribution is too narrow by 16 %.
+# Smallest share of refits that has to converge. If the outermost tenth at one end is missing, a
+# normal sampling distribution is too narrow by 16 %.
 MIN_CONVERGED = 0.9
 
 
@@ -42,13 +41,13 @@ class SamplingDistribution:
 
     evaluator: Evaluator
     theta: Floats  # (d,)
-    scales: Floats  # (k,): the simulators' discrepancies are divided by them before they are added
-    information: list[Information]  # by simulator
+    scales: Floats  # (k,): divisors of the simulators' discrepancies before they are added
+    information: list[Information]  # information of each simulator
     local: Local
     # (d, r): principal axes of the sampling distribution along the directions that the data
     # identify, orthonormal in units of the prior's spread.
     axes: Floats
-    stderr: Floats  # (r,): standard errors along them
+    stderr: Floats  # (r,): standard errors along the axes
 
     @classmethod
     def of(
@@ -56,9 +55,9 @@ class SamplingDistribution:
     ) -> SamplingDistribution:
         """Return the distribution at theta.
 
-        From the metrics' derivatives, to first order; from refits if a metric declares nothing.
-        Directions with a standard error above ``weakest`` prior standard deviations are not
-        identified.
+        It is of first order, from the metrics' derivatives, or from refits if a metric does not
+        declare its minimum. Directions with a standard error above ``weakest`` prior standard
+        deviations are not identified.
         """
         nodes = range(len(evaluator.nodes))
         information = [Information(evaluator, k, theta) for k in nodes]
@@ -68,19 +67,25 @@ class SamplingDistribution:
             local = local_sampling(information, scales, weakest)
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = oriented(local.identified @ vectors)
-        # Rounding may leave a variance of zero or less.
+        # A variance may be zero or less by rounding.
         stderr = np.sqrt(np.maximum(variances, 1e-300))
         return cls(evaluator, theta, scales, information, local, axes, stderr)
+
+    @property
+    def noise(self) -> float:
+        """The part of the objective that sampling explains."""
+        pairs = zip(self.information, self.scales, strict=True)
+        return float(sum(item.noise_floor / scale for item, scale in pairs))
 
     def coordinates(self, thetas: Floats) -> Floats:
         """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
         shifts = (thetas - self.theta) / self.local.prior_sd
-        return np.asarray(shifts @ self.axes / self.stderr)
+        return shifts @ self.axes / self.stderr
 
     def thetas(self, x: Floats) -> Floats:
         """Return thetas, (..., d), of coordinates (..., r)."""
         shifts = (x * self.stderr) @ self.axes.T
-        return np.asarray(self.theta + shifts * self.local.prior_sd)
+        return self.theta + shifts * self.local.prior_sd
 
     def linear_estimates(self, sets: DataSets) -> Floats:
         """Return minimisers of data sets, (S, r) in coordinates, to first order."""
@@ -92,8 +97,9 @@ def sampling_of_functions(sampling: SamplingDistribution) -> Local:
     """Return the first-order distribution with directions that are weakly identified as well.
 
     The data may identify a function of theta, such as a standard deviation, but not its elements,
-    such as those of a Cholesky factor. Directions count up to 10 prior standard deviations; any
-    value from 3 to 30 gives the same (tests/test_correlated_inputs.py).
+    such as those of a Cholesky factor. Directions count if their standard error is at most 10 prior
+    standard deviations. Any limit from 3 to 30 gives the same results
+    (tests/test_correlated_inputs.py).
     """
     if not sampling.local.unidentified.size or needs_refits(sampling.evaluator):
         return sampling.local
@@ -111,7 +117,7 @@ def jumping_simulators(sampling: SamplingDistribution) -> list[int]:
         for item in sampling.information
         if is_differentiable(item.node.target)
         and not item.node.bound.stored
-        and item.stencil.is_wide  # as points lose their response close to theta
+        and item.stencil.is_wide  # because points lose their response close to theta
     ]
     if not jumping:
         return []
@@ -134,12 +140,12 @@ def refit(
     start: Floats | None = None,
     *,
     is_rough: bool = False,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-    With stored responses by an exact minimisation from ``start``, the optimum by default, without a
-    new response; otherwise to first order. ``is_rough``: a few hundredths of a standard error
-    suffice, in half of the time.
+    Stored responses are minimised exactly from ``start``, by default the optimum, without a new
+    response. Others give first-order estimates. With ``is_rough`` the error is a few hundredths of
+    a standard error, in half of the time.
     """
     if not is_stored(sampling.evaluator):
         x = sampling.linear_estimates(sets)
@@ -151,7 +157,7 @@ def refit(
         len(node.target.parts) * max(node.bound.n_points, len(values))
         for node, values in zip(sampling.evaluator.nodes, sets.values, strict=True)
     )
-    at_once = max(1, 2 * AT_ONCE // points)  # data sets that fit into memory
+    at_once = max(1, 2 * AT_ONCE // points)  # number of data sets that fit into memory
     descent = None
     results = []
     with progress("refits", n_sets) as advance:
@@ -159,7 +165,7 @@ def refit(
             rows = slice(i, i + at_once)
             batch = DataSets(sets.values, [w[rows] for w in sets.weights])
             objective = BatchObjective.of(sampling.evaluator, sampling.scales, batch)
-            if descent is None:  # the curvature of the first batch serves all of them
+            if descent is None:  # the curvature of the first batch serves all batches
                 descent = descent_of(sampling, objective, is_rough=is_rough)
             results.append(minimise_sets(sampling, objective, descent, start[rows]))
             advance(len(results[-1][1]), "")
@@ -178,7 +184,7 @@ def is_prepared_by_data(evaluator: Evaluator) -> bool:
 
 def refit_prepared(
     sampling: SamplingDistribution, sets: DataSets, minimisers: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimiser of the metric prepared for each data set, and which converged.
 
     The minimisers of the metric prepared for the observed data (`refit`) remain if the metric
@@ -195,7 +201,7 @@ def refit_prepared(
             data, weights = one_set(evaluator, sets, i)
             try:
                 prepared = evaluator.observing(data, weights=weights)
-            except ValueError:  # as where all specimens of a set are alike
+            except ValueError:  # such as a data set of specimens that are all alike
                 continue
             objective = BatchObjective.of(prepared, scales, observed_set(prepared))
             starts = np.stack([np.zeros_like(minimiser), minimiser])
@@ -216,32 +222,34 @@ def descent_of(
 ) -> Descent:
     """Return the minimisation of data sets whose objectives have about the same curvature."""
     r = sampling.stderr.size
-    step = 0.02  # of differences, in standard errors
-    if r == 0 or needs_refits(sampling.evaluator):  # it is not used then
-        return Descent(np.eye(r), 0.0, step)
-    # Steps of one standard error along uncorrelated directions, in coordinates: along correlated
-    # axes the large curvature across them hides the small one along.
+    step = 0.02  # step of the differences, in standard errors
+    if r == 0 or needs_refits(sampling.evaluator):  # because the descent is not used then
+        return partial(descend, curvature=np.eye(r), tolerance=0.0, step=step)
+    # Take differences along uncorrelated directions of one standard error: along correlated axes
+    # the large curvature across a ridge hides the small one along it.
     along = sampling.axes.T @ sampling.local.identified / sampling.stderr[:, None]
     try:
-        root = np.asarray(np.linalg.cholesky(along @ sampling.local.covariance @ along.T))
-    except np.linalg.LinAlgError:  # a variance of zero, by rounding
+        root = np.linalg.cholesky(along @ sampling.local.covariance @ along.T)
+    except np.linalg.LinAlgError:  # if a variance is zero by rounding
         root = np.eye(r)
 
     def mean_objective(z: Floats) -> Floats:
-        # A first guess of the curvature: 50 data sets suffice.
-        return np.asarray(objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0))
+        # Fifty data sets suffice for a first guess of the curvature.
+        return objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0)
 
-    # Positive definite: as a first guess, no direction is flatter than a twentieth of the steepest.
+    # Bound the curvatures from below by a twentieth of the largest, so that the first guess is
+    # positive definite.
     curvatures, vectors = np.linalg.eigh(second_differences(mean_objective, r))
     lowest = 0.05 * max(np.nanmax(curvatures), 1e-300)
     positive = np.maximum(np.nan_to_num(curvatures), lowest)
     across = np.linalg.inv(root)
     curvature = across.T @ ((vectors * positive) @ vectors.T) @ across
-    # What an error of one standard error costs in any direction: the harmonic mean, as with
-    # correlated estimates the mean curvature is that of a direction with hardly any error.
+    # Take the harmonic mean of the curvatures as the cost of an error of one standard error. With
+    # correlated estimates the arithmetic mean would be that of a direction with hardly any error.
     cost = r / np.trace(np.linalg.inv(curvature))
-    # A gain of 1e-4 is an error of about a hundredth of a standard error.
-    return Descent(curvature, (1e-3 if is_rough else 1e-4) * cost, step)
+    # A tolerance of 1e-4 corresponds to an error of about a hundredth of a standard error.
+    tolerance = (1e-3 if is_rough else 1e-4) * cost
+    return partial(descend, curvature=curvature, tolerance=tolerance, step=step)
 
 
 def minimise_sets(
@@ -249,7 +257,7 @@ def minimise_sets(
     objective: BatchObjective,
     descent: Descent,
     start: Floats | None = None,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the minimisers of data sets along the axes, by default from the optimum on."""
 
     def value(x: Floats, rows: Any) -> Floats:
@@ -258,10 +266,10 @@ def minimise_sets(
     r = sampling.stderr.size
     if start is None:
         start = np.zeros((objective.n_sets, r))
-    if r == 0:  # no direction is identified
+    if r == 0:  # because no direction is identified
         return start, np.ones(len(start), dtype=bool)
     if needs_refits(sampling.evaluator):
-        # In standard errors; the second simplex starts at the end of the first.
+        # Edges are in standard errors. The second simplex starts at the end of the first one.
         x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
         return x, converged
     minima = descent(value, start)
@@ -275,7 +283,7 @@ def minimise_sets(
 class SimplexRefits:
     """Data sets drawn from the model at one theta, and the minimiser of each."""
 
-    objective: BatchObjective  # of the data sets
+    objective: BatchObjective  # sum of the discrepancies against each data set
     theta: Floats  # (d,)
     prior_sd: Floats  # (d,)
     shifts: Floats  # (n_sets, d): minimisers less theta, in units of the prior's spread
@@ -287,29 +295,30 @@ class SimplexRefits:
         A direction is identified if the minimisers scatter along it by less than ``weakest`` prior
         standard deviations, and if the discrepancy rises along it: its second derivative, averaged
         over data sets, is more than twice the mean gain of one identified direction over
-        ``weakest**2``. For a quadratic discrepancy both say the same; along a flat one a minimiser
-        stays close to its start, and only the second says so.
+        ``weakest**2``. For a quadratic discrepancy both conditions are equivalent. Along a flat
+        direction a minimiser stays close to its start, and only the second condition fails.
         """
-        # Second differences of the mean discrepancy at theta. Steps are the minimisers' standard
-        # errors, over which kinks at different places average out, and half a prior standard
-        # deviation where these are large.
+        # Steps of the second differences are the minimisers' standard errors, because kinks at
+        # different places average out over them. They are half a prior standard deviation where
+        # standard errors are large.
         axes, sd = principal_axes(self.shifts)
         steps = np.minimum(np.where(sd > 0.1, 0.5, sd), 0.5)
 
         def mean(x: Floats) -> Floats:
             thetas = self.theta + (x * steps) @ axes.T * self.prior_sd
-            return np.asarray(self.objective(thetas, slice(None)).mean(axis=0))
+            return self.objective(thetas, slice(None)).mean(axis=0)
 
-        back = axes / steps  # to derivatives in units of the prior's spread
+        back = axes / steps  # map to derivatives in units of the prior's spread
         hessian = back @ np.nan_to_num(second_differences(mean, steps.size)) @ back.T
         curvatures, vectors = np.linalg.eigh(hessian)
-        # The largest curvature first.
+        # Sort by curvature, the largest first.
         curvatures, vectors = curvatures[::-1], vectors[:, ::-1]
         number = np.arange(1, curvatures.size + 1)
         rises = curvatures * weakest**2 > 2 * self.gain / number
         rank = int(number[rises].max(initial=0))
         rising, level = vectors[:, :rank], vectors[:, rank:]
-        # Of those, the ones along which the minimisers scatter little enough.
+        # Of the rising directions, keep those along which the minimisers scatter by less than the
+        # limit.
         axes, sd = principal_axes(self.shifts @ rising)
         is_narrow = sd < weakest
         identified = rising @ axes[:, is_narrow]
@@ -329,7 +338,7 @@ def simplex_refits(
     The last results are cached: standard errors, epsilon and the adjustment use the same refits.
     """
     indices = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
-    # Minimisers depend on the ratios of scales only.
+    # The cache has ratios of scales, because minimisers depend on nothing else.
     ratios = scales / scales[indices[0]]
     designs = tuple(
         hash(bound.design.sample.values.tobytes()) for bound in evaluator.reweighted.values()
@@ -337,7 +346,7 @@ def simplex_refits(
     return _cached_refits(evaluator, tuple(theta), tuple(ratios), indices, designs)
 
 
-@lru_cache(maxsize=4)  # of the optimum, and for epsilon of a few simulators each
+@lru_cache(maxsize=4)  # entries: the optimum, and a few simulators by themselves for epsilon
 def _cached_refits(
     evaluator: Evaluator,
     theta: tuple[float, ...],
@@ -359,9 +368,9 @@ def _cached_refits(
 
     start = np.zeros((SETS, d))
     at_theta = value(start[:, None], np.arange(SETS))[:, 0]
-    # In spreads of the prior: an ordinary step.
+    # The first simplex has edges of half a prior standard deviation.
     shifts, _, _ = descend_by_simplex(value, start, sizes=[0.5])
-    # The second simplices start along the principal axes of the first minimisers.
+    # The second simplices have their edges along the principal axes of the first minimisers.
     axes, sd = principal_axes(shifts)
     x, at_minimum, _ = descend_by_simplex(value_along, shifts @ axes / sd, sizes=[1.0])
     is_finite = np.isfinite(at_theta)
@@ -369,7 +378,7 @@ def _cached_refits(
     return SimplexRefits(objective, center, prior_sd, (x * sd) @ axes.T, gain)
 
 
-# Ends and middle of the central 89 %, whose width is 3.2 standard deviations of a normal.
+# Ends and middle of the central 89 %, which is 3.2 standard deviations wide if normal
 _QUANTILES = (0.055, 0.5, 0.945)
 
 
@@ -385,7 +394,7 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     axes = oriented(np.linalg.eigh(covariance)[1])
     low, _, high = np.quantile(points @ axes, _QUANTILES, axis=0)
     sd = (high - low) / 3.2
-    # None so small that a division by it fails.
+    # Bound the spreads from below, because they are divisors.
     largest = sd.max()
     return axes, np.maximum(sd, 1e-4 * largest if largest > 0 else 1.0)
 
@@ -405,12 +414,12 @@ def drawn_in(points: Floats) -> Floats:
 class BatchObjective:
     """The sum of d_k / scale_k against each of B data sets; no response is computed."""
 
-    evaluator: Evaluator  # all its responses are stored
-    scales: Floats  # (K,): by simulator of the model
+    evaluator: Evaluator  # evaluator whose responses are all stored
+    scales: Floats  # (K,): divisors of the discrepancies of all simulators of the model
     simulators: tuple[int, ...]  # indices of the simulators in the sum
-    targets: list[Discrepancy]  # by simulator in the sum, each against all B data sets
-    values: list[Floats]  # (n_k,) or (n_k, m): the stored responses
-    bases: list[Basis]  # from weights of stored responses to features
+    targets: list[Discrepancy]  # discrepancy of each simulator in the sum, against all B data sets
+    values: list[Floats]  # stored responses, (n_k,) or (n_k, m)
+    bases: list[Basis]  # maps from weights of stored responses to features
 
     @classmethod
     def of(
@@ -422,13 +431,14 @@ class BatchObjective:
         simulators: Sequence[int] | None = None,
         stored: Sequence[Floats | None] = (),
     ) -> BatchObjective:
-        """Prepare the observed sides of all data sets; of all simulators by default.
+        """Prepare the discrepancies against all data sets, by default of all simulators.
 
         ``stored``, by simulator, replaces the responses at the designs' points unless it is None.
         """
         if simulators is None:
             simulators = range(len(evaluator.nodes))
-        # Copied row by row: sums over rows then do not depend on the layout of the weights.
+        # The indexing copies the weights row by row, so that sums over rows do not depend on their
+        # layout in memory.
         rows = np.arange(len(sets.weights[0]))
         targets, values, bases = [], [], []
         for k in simulators:
@@ -456,7 +466,7 @@ class BatchObjective:
         With thetas of shape (1, s, d) all data sets are compared with the same populations. NaN,
         as where a design has no point, becomes infinite.
         """
-        # In portions whose weights stay in the cache.
+        # Work in portions whose weights stay in the cache.
         most = max(len(values) for values in self.values) * thetas.shape[1]
         at_once = max(1, IN_CACHE // most)
         if len(thetas) <= at_once:

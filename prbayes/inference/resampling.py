@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
@@ -25,10 +25,10 @@ from prbayes.response.distributions import PopulationSampler
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
-# ten million weights at most.
+# Number of points of a resimulated population from which data sets are drawn, so that hundreds of
+# data sets have ten million weights at most
 _MAX_POINTS = 1 << 15
-# Data sets for a sampling distribution: standard errors then have an error of 5 %.
+# Number of data sets for a sampling distribution, with which standard errors have an error of 5 %
 SETS = 200
 
 
@@ -36,17 +36,17 @@ SETS = 200
 class DataSets:
     """Data sets for all simulators of a model, as weights on fixed values."""
 
-    # By simulator (n_k,), or (n_k, m) of several outputs: all values that occur. NaN is an output
-    # that was not measured.
+    # All values that occur, by simulator: (n_k,), or (n_k, m) of several outputs. NaN marks an
+    # output that was not measured.
     values: list[Floats]
-    # By simulator (n_sets, n_k): the weight of each value in each data set; they sum to one.
+    # Weights of the values in each data set, by simulator: (n_sets, n_k), with sum one
     weights: list[Floats]
 
 
 # -- specimens in common ---------------------------------------------------------------------------
 
 
-def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.intp]], int]:
+def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[Indices], int]:
     """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     An observation without a label is a specimen of its own.
@@ -74,7 +74,7 @@ def dependent(nodes: Sequence[Node]) -> bool:
 
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return indices of simulators, in groups that share specimens, even through a third one."""
+    """Return groups of simulators that share specimens, as indices, also by a third one."""
     from scipy.sparse.csgraph import connected_components
 
     if all(node.specimens is None for node in nodes):
@@ -86,7 +86,7 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share a design, by specimens or groups."""
+    """Return names, and those of all simulators that share a design with them."""
     result = set(names)
     for group in [*groups(nodes), *families(nodes)]:
         members = {nodes[k].name for k in group}
@@ -96,7 +96,7 @@ def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
 
 
 def families(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return indices of simulators whose specimens are of the same groups, together."""
+    """Return lists of indices of simulators that belong to groups of the same specimens."""
     by_inputs: dict[int, list[int]] = {}
     for k, node in enumerate(nodes):
         if node.group:
@@ -157,7 +157,8 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
 def _are_countable(evaluator: Evaluator, responses: list[Floats]) -> bool:
     """Return whether it suffices, and is faster, to draw how often each point occurs.
 
-    The observations are different specimens, measured alike, and more than points.
+    This requires that observations are different specimens, measured alike, and more than the
+    points.
     """
     nodes = evaluator.nodes
     for node in nodes:
@@ -186,7 +187,7 @@ def _drawn_counts(
 def _counted_sets(
     evaluator: Evaluator, responses: list[Floats], counts: list[NDArray[np.int64]]
 ) -> DataSets:
-    """Return the data sets in which points occur so often."""
+    """Return data sets from the numbers of times that each point occurs."""
     values, weights = [], []
     for node, response, count in zip(evaluator.nodes, responses, counts, strict=True):
         is_observable = observable(response, node.target)
@@ -198,7 +199,7 @@ def _counted_sets(
 def sets_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
 ) -> tuple[DataSets, list[csr_array]]:
-    """Draw one data set at each theta; return how often each point occurs, by group, too.
+    """Draw one data set at each theta, and return it with counts of each point, by group.
 
     Points are those of stored responses: counts have shape (n, points).
     """
@@ -213,7 +214,7 @@ def sets_along(
         return sets, [csr_array(count.astype(np.float64)) for count in drawn_counts]
     numbers, total = specimens(nodes)
     size = (len(thetas), total)
-    points: dict[int, NDArray[np.intp]] = {}
+    points: dict[int, Indices] = {}
     counts = []
     for group in _aligned_groups(nodes):
         is_observable = _observable_by_all(evaluator, responses, group)
@@ -225,7 +226,7 @@ def sets_along(
             for i, mass in enumerate(weights * is_observable, start=first):
                 drawn[i] = _points_of(mass, uniform[i])
         points |= dict.fromkeys(group, drawn)
-        # How often each stored response is a specimen of each data set.
+        # Count how often each stored response is a specimen of each data set.
         places = drawn[:, np.unique(np.concatenate([numbers[k] for k in group]))]
         n_sets, n = places.shape
         ends = n * np.arange(n_sets + 1)
@@ -244,7 +245,7 @@ def simulated_points(
     seed: int,
     *,
     more: int = 0,
-) -> list[NDArray[np.intp]]:
+) -> list[Indices]:
     """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each.
 
     Populations are responses and weights by simulator, (1, n) each.
@@ -253,9 +254,10 @@ def simulated_points(
     rng = np.random.default_rng([seed, 1])
     size = specimens(nodes)[1] + more
     responses = [values[0] for values, _ in populations]
-    points: dict[int, NDArray[np.intp]] = {}
+    points: dict[int, Indices] = {}
     for group in _aligned_groups(nodes):
-        # Simulators that share specimens have the same points, with the same weights.
+        # Draw once for the group, because simulators that share specimens have the same points and
+        # weights.
         mass = populations[group[0]][1][0] * _observable_by_all(evaluator, responses, group)
         drawn = np.empty((n_sets, size), dtype=np.intp)
         for rows in _blocks(n_sets, size):
@@ -264,44 +266,42 @@ def simulated_points(
     return [points[k] for k in range(len(nodes))]
 
 
-def _observable_by_all(
-    evaluator: Evaluator, responses: list[Floats], group: list[int]
-) -> NDArray[np.bool_]:
+def _observable_by_all(evaluator: Evaluator, responses: list[Floats], group: list[int]) -> Bools:
     """Return which points all simulators of a group can observe, (n,)."""
     columns = [observable(responses[k], evaluator.nodes[k].target) for k in group]
-    return np.asarray(np.all(columns, axis=0))
+    return np.all(columns, axis=0)
 
 
-def _points_of(mass: Floats, uniform: Floats) -> NDArray[np.intp]:
+def _points_of(mass: Floats, uniform: Floats) -> Indices:
     """Return points of a population at levels of its cumulated weights, (n,), (...) -> (...)."""
     below = np.cumsum(mass / mass.sum())
-    # On the right of equal sums, so that no point without weight is drawn.
+    # Search on the right of equal sums, so that no point without weight is drawn.
     points = np.searchsorted(below / below[-1], uniform, side="right")
-    return np.minimum(points, mass.size - 1)  # a product may be rounded up to the whole
+    return np.minimum(points, mass.size - 1)  # because a level may be rounded up to one
 
 
-def sets_at(
-    evaluator: Evaluator, populations: list[Floats], points: list[NDArray[np.intp]]
-) -> DataSets:
-    """Return the data sets that are measured on specimens, given as points of responses (n,)."""
+def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indices]) -> DataSets:
+    """Return data sets of specimens, which are given as indices of the responses (n,)."""
     numbers, _ = specimens(evaluator.nodes)
     values, weights = [], []
     for k, (node, responses) in enumerate(zip(evaluator.nodes, populations, strict=True)):
         is_observable = observable(responses, node.target)
-        # The index of each point among those that can be observed.
+        # Number the points that can be observed.
         index = np.cumsum(is_observable) - 1
         cells = index[points[k][:, numbers[k]]]
         occurring = responses[is_observable]
         observed = node.target.observed
         if observed.ndim > 1:
-            # Each specimen has the outputs of the observed one in its place, NaN for the rest.
+            # A synthetic specimen has the outputs that were measured of the observed one in its
+            # place, and NaN for the rest.
             patterns, row = np.unique(~np.isnan(observed), axis=0, return_inverse=True)
             if len(patterns) > 1:
                 size = len(occurring)
                 pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
                 cells = places.reshape(cells.shape)
                 occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
-        # The observations' weights, added up by value; the data sets of a block in one row.
+        # Add up the observations' weights by value. One call of bincount serves all data sets of a
+        # block.
         size = len(occurring)
         summed = np.empty((len(cells), size))
         for rows in _blocks(len(cells), cells.shape[1]):
@@ -321,7 +321,7 @@ def _blocks(n_sets: int, size: int) -> Iterator[slice]:
         yield slice(first, min(first + step, n_sets))
 
 
-def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
+def observable(responses: Floats, target: Discrepancy) -> Bools:
     """Return which points can be observed, (n,) or (n, m) -> (n,).
 
     A failed specimen is observed as such, if the metric counts failures.
@@ -353,10 +353,11 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
         for k, node in zip(group, members, strict=True):
             sampler = PopulationSampler(node.bound.inputs)
             parents = evaluator.parents(theta[None], k)
-            # Four for each specimen; the same for all simulators of the group.
+            # Draw four candidates for each specimen. The copied generator gives all simulators of
+            # the group the same candidates.
             aleatory, epistemic = sampler(parents, 4 * total, copy.deepcopy(generator))
             columns.append(np.asarray(node.bound.responses(aleatory, epistemic)[0]))
-        # A specimen that one simulator cannot measure is measured by none.
+        # Leave out specimens that any simulator of the group cannot measure.
         targets = [node.target for node in members]
         is_observable = np.all(list(map(observable, columns, targets)), axis=0)
         for k, node, column in zip(group, members, columns, strict=True):

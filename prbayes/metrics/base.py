@@ -29,6 +29,7 @@ from prbayes._validate import (
     simulated_sample,
 )
 from prbayes.metrics.grid import product
+from prbayes.numerics.mixtures import effective_sample_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,7 @@ class Discrepancy(ABC):
     @property
     def n_effective(self) -> float:
         """Effective number of observations, 1 / sum(weights**2)."""
-        return float(1 / (self.weights**2).sum())
+        return float(effective_sample_size(self.weights))
 
     @property
     def n_drawn(self) -> int:

@@ -8,25 +8,31 @@ largest difference of two distribution functions, or flat pieces; a simplex only
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
+
+# function of points, (A, s, r), and of the rows of the functions there, (A,), that returns values,
+# (A, s)
+type Values = Callable[[Floats, Any], Floats]
 
 
 class Minima(NamedTuple):
-    """Ends of descents."""
+    """Minima at the ends of descents."""
 
-    x: Floats  # (B, r)
+    x: Floats  # (B, r): ends of the descents
     values: Floats  # (B,)
-    converged: NDArray[np.bool_]  # (B,)
+    converged: Bools  # (B,)
+
+
+# minimiser of functions from starts, (B, r)
+type Descent = Callable[[Values, Floats], Minima]
 
 
 def descend(
-    value: Callable[[Floats, Any], Floats],
+    value: Values,
     start: Floats,
     curvature: Floats,
     *,
@@ -53,15 +59,16 @@ def descend(
     rows = np.arange(size)
     f, g = problem(x, rows)
     converged = np.zeros(size, dtype=bool)
-    # Rows without a finite value and gradient at the start stay there.
+    # Leave rows without a finite value and gradient at their start.
     rows = rows[np.isfinite(f) & np.isfinite(g).all(axis=-1)]
     for iteration in range(max_iterations):
-        # Quasi-Newton steps, and twice their predicted gain.
+        # The product of a quasi-Newton step and the gradient is twice the predicted gain.
         with np.errstate(over="ignore", invalid="ignore"):
             steps = -np.einsum("bij,bj->bi", inverse[rows], g[rows])
             gain = -(steps * g[rows]).sum(axis=-1)
             length = np.abs(steps).max(axis=-1)
-            # A quadratic model is wrong beyond a few standard errors, or prior standard deviations.
+            # Limit the length, because a quadratic model is wrong beyond a few units of the
+            # parameters.
             steps = steps * (3.0 / np.maximum(length, 3.0))[:, None]
         is_finite = np.isfinite(gain) & np.isfinite(length)
         is_flat = is_finite & (gain < 2 * tolerance)
@@ -73,7 +80,7 @@ def descend(
         # Line search: halve the steps of rows until they gain enough.
         new_x, new_f, new_g = x[rows], f[rows], g[rows]
         waiting = np.arange(rows.size)
-        for halvings in range(8):  # 1/256 of a step is no worse than none
+        for halvings in range(8):  # a step of 1/256 is as good as none
             factor = 0.5**halvings
             trial = x[rows[waiting]] + factor * steps[waiting]
             trial_f, trial_g = problem(trial, rows[waiting])
@@ -88,33 +95,34 @@ def descend(
             waiting = waiting[~accepted]
             if not waiting.size:
                 break
-        # The form of the first guess of a Hessian may be better than its size.
+        # The first update also scales the guess of the Hessian, whose form may be better than its
+        # size.
         inverse[rows] = _bfgs(inverse[rows], new_x - x[rows], new_g - g[rows], iteration == 0)
         x[rows], f[rows], g[rows] = new_x, new_f, new_g
-        # No shorter step helps the rows that still wait.
+        # Rows that still wait have converged, because no shorter step gains enough.
         converged[rows[waiting]] = True
         rows = np.delete(rows, waiting)
     return Minima(x, f, converged)
 
 
 def _by_differences(
-    value: Callable[[Floats, Any], Floats], step: float, curvature: Floats, is_central: bool
-) -> Callable[[Floats, NDArray[np.intp]], tuple[Floats, Floats]]:
+    value: Values, step: float, curvature: Floats, is_central: bool
+) -> Callable[[Floats, Indices], tuple[Floats, Floats]]:
     """Return a function of points (A, r) and rows that returns values (A,) and gradients (A, r)."""
     r = len(curvature)
-    # Axes, of a mean length of one, along which a typical function has equal curvature: along
-    # the coordinates of correlated parameters it is larger, and a one-sided difference would
-    # move the minimum by as much.
+    # Difference along axes of a mean length of one, along which a typical function has equal
+    # curvature. The curvature along the coordinates of correlated parameters is larger, and the
+    # bias of one-sided differences as well.
     axes = np.linalg.inv(np.linalg.cholesky(curvature))
     axes *= np.sqrt(r) / np.linalg.norm(axes)
     mean_curvature = float(np.trace(axes @ curvature @ axes.T)) / r
     sides = [step * axes, -step * axes] if is_central else [step * axes]
     stencil = np.concatenate([np.zeros((1, r)), *sides])
     to_gradient = np.linalg.inv(axes).T
-    # Of one-sided differences for a function of typical curvature.
+    # bias of one-sided differences of a function with typical curvature
     bias = step * mean_curvature / 2
 
-    def problem(x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    def problem(x: Floats, rows: Indices) -> tuple[Floats, Floats]:
         values = value(x[:, None] + stencil, rows)
         center, up, down = np.split(values, [1, 1 + r], axis=1)
         with np.errstate(invalid="ignore"):
@@ -128,39 +136,26 @@ def _bfgs(inverse: Floats, s: Floats, y: Floats, is_first: bool) -> Floats:
     """Return updated inverse Hessians, (B, r, r), from steps s and changes y of gradients, (B, r).
 
     Nocedal and Wright, eq. 6.17; first guesses get the size of a first step, eq. 6.20, with the
-    guess in place of the identity. Hessians stay where they would not be positive definite.
+    guess in place of the identity. Hessians are not updated where they would not be positive
+    definite.
     """
     sy = (s * y).sum(axis=-1)
-    # Nearly orthogonal steps and changes would spoil the inverse Hessian.
+    # Update only if step and change of the gradient are not nearly orthogonal, which would spoil
+    # the inverse Hessian.
     is_curved = sy > 1e-4 * np.linalg.norm(s, axis=-1) * np.linalg.norm(y, axis=-1)
     sy = np.where(is_curved, sy, 1.0)
     if is_first:
         expected = np.einsum("bi,bij,bj->b", y, inverse, y)
         inverse = (sy / np.where(is_curved, expected, 1.0))[:, None, None] * inverse
-    # rho = 0 leaves the matrix as it is.
+    # With rho = 0 the inverse Hessian does not change.
     rho = np.where(is_curved, 1 / sy, 0.0)
     column = rho[:, None, None] * s[:, :, None]
     projector = np.eye(s.shape[-1]) - column * y[:, None, :]
     transposed = np.swapaxes(projector, -1, -2)
-    return np.asarray(projector @ inverse @ transposed + column * s[:, None, :])
+    return projector @ inverse @ transposed + column * s[:, None, :]
 
 
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """A minimiser of many functions of coordinates at once."""
-
-    curvature: Floats  # (r, r): the Hessian of a typical function
-    tolerance: float  # gain that a minimum may miss
-    step: float  # of the differences
-
-    def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
-        """Return minimisers from starts (B, r) on."""
-        return descend(value, start, self.curvature, step=self.step, tolerance=self.tolerance)
-
-
-def descend_by_simplex(
-    value: Callable[[Floats, Any], Floats], start: Floats, *, sizes: Sequence[float]
-) -> Minima:
+def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) -> Minima:
     """Minimise B functions of r parameters by simplices, from starts (B, r), all in step.
 
     ``value`` is as in `descend`; ``sizes`` are lengths of the first edges of one simplex after the
@@ -182,16 +177,17 @@ def descend_by_simplex(
         simplices = x[:, None] + np.concatenate([np.zeros((1, r)), size * np.eye(r)])
         points, all_values = _sorted(simplices, value(simplices, np.arange(n_rows)))
         converged = np.zeros(n_rows, dtype=bool)
-        # In 60 iterations for each parameter a simplex shrinks about a millionfold.
+        # A simplex shrinks about a millionfold in 60 iterations for each parameter.
         for _ in range(60 * r):
             best = all_values[:, 0]
-            with np.errstate(invalid="ignore"):  # infinite less infinite counts as nothing
+            # infinite less infinite is NaN, and counts as no gain
+            with np.errstate(invalid="ignore"):
                 gains = np.where(np.isfinite(first), first, best) - best
                 spread = all_values[:, -1] - best
-            # At a parabola's minimum a thousandth of the mean gain is 3% of the distance.
+            # Near the minimum of a parabola a thousandth of the mean gain is 3 % of the distance.
             is_level = spread <= 1e-3 * float(np.nan_to_num(gains).mean())
             length = np.abs(points - points[:, :1]).max(axis=(1, 2))
-            # Rows that have converged stay as they are.
+            # Continue with the rows that have not converged.
             converged |= is_level | (length <= 1e-3 * abs(size))
             rows = np.flatnonzero(~converged)
             if not rows.size:
@@ -209,31 +205,33 @@ def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _step(
-    value: Callable[[Floats, Any], Floats],
+    value: Values,
     points: Floats,
     values: Floats,
-    rows: NDArray[np.intp],
+    rows: Indices,
 ) -> tuple[Floats, Floats]:
     """Replace the worst point of each sorted simplex, or shrink it towards the best."""
-    # The factors of Gao and Han (2012) for r parameters, at least two.
+    # The factors are those of Gao and Han (2012) for r parameters, at least two.
     n = max(points.shape[-1], 2)
     expansion = 1 + 2 / n
     contraction = 0.75 - 1 / (2 * n)
-    # Four trials, (A, 4, r), in one call: the worst point reflected at the centre of the others,
-    # farther, nearer, and nearer on its side.
+    # One call evaluates four trials, (A, 4, r): the worst point reflected at the centre of the
+    # others, then farther, nearer, and nearer on its own side.
     center = points[:, :-1].mean(axis=1)
     lengths = np.array([1.0, expansion, contraction, -contraction])
     steps = lengths[:, None] * (center - points[:, -1])[:, None]
-    trials = np.asarray(center[:, None] + steps)
+    trials = center[:, None] + steps
     trial_values = value(trials, rows)
-    # The reflected point, a farther one if that is better still, else a nearer one on either side.
+    # Take the reflected point, the farther one if that is better still, else a nearer one on either
+    # side.
     reflected, expanded = trial_values[:, 0], trial_values[:, 1]
     best, second, worst = values[:, 0], values[:, -2], values[:, -1]
     trial = np.where(reflected < second, 0, 2)
     trial = np.where((reflected < best) & (expanded < reflected), 1, trial)
     trial = np.where(reflected >= worst, 3, trial)
     selected = np.arange(len(points)), trial
-    # A nearer point has to beat the reflected one, or the worst where that was not better either.
+    # A nearer point has to be better than the reflected one, or than the worst if the reflected one
+    # is not better.
     limit = np.where(trial == 2, reflected, np.inf)
     limit = np.where(trial == 3, worst, limit)
     is_accepted = (trial_values[selected] <= limit) & (trial_values[selected] < worst)

@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 
 
 def inside(points: Floats) -> Floats:
@@ -21,14 +20,14 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     Source: Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
     """
-    from scipy.stats import qmc  # takes longer to import than the whole package
+    from scipy.stats import qmc  # imported here, because it takes longer than the whole package
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random(1) if n == 1 else engine.random_base2(int(np.ceil(np.log2(n))))[:n]
     return inside(points)
 
 
-def lattice(place: NDArray[np.intp], count: NDArray[np.intp], dimensions: int) -> Floats:
+def lattice(place: Indices, count: Indices, dimensions: int) -> Floats:
     """Return points of lattices in the unit cube, (n, dimensions), at places 0 to count - 1.
 
     The first coordinates are place / count. The others are multiples of powers of the root of

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from threading import Lock
 from typing import Any
 
-# The number of threads is global: a second caller does not change it.
+# lock of the number of threads, which is global: a second caller does not change it
 _setting = Lock()
-# The libraries of linear algebra, once they are loaded.
+# controller of the libraries of linear algebra, once they are loaded
 _libraries: list[Any] = []
 
 

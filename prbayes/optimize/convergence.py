@@ -23,18 +23,18 @@ from prbayes.metrics.density import overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
-from prbayes.optimize.objective import Method, Objective, Ridge, SpentError, StalledError
+from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
 
-# Relative gain that no longer counts: far below the noise of any data, which is 1 / N.
+# Relative gain that is negligible: far below the noise of any data, which is 1 / N
 _NEGLIGIBLE_GAIN = 1e-4
-# Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
-# step^2, are both below the tolerance.
+# Step of differences in prior standard deviations. The errors of rounding, 1e-16 / step, and of
+# curvature, step^2, are both below the tolerance.
 _STEP = 1e-4
-# Evaluations, for each parameter, of a simplex that settles a line search.
+# Number of evaluations, for each parameter, of the simplex after a failed line search
 _SIMPLEX_EVALUATIONS = 60
-# Overlap of two densities below which the area metric leads, and up to which it is followed; from
-# far starts half and twice lead to the same optima (benchmarks/landscapes.py).
+# Overlap of two densities below which the area metric is minimised first, and overlap at which that
+# ends. Half and twice these values give the same optima from far starts (benchmarks/landscapes.py).
 OVERLAP = 0.02
 OVERLAP_ENOUGH = 0.5
 
@@ -66,9 +66,9 @@ class Trace:
     """The points that minimisers evaluated."""
 
     thetas: tuple[Floats, ...] = ()  # (d,)
-    values: tuple[float, ...] = ()  # the objective
-    counts: tuple[int, ...] = ()  # evaluations up to each point
-    count: int = 0  # evaluations in all
+    values: tuple[float, ...] = ()  # values of the objective at the points
+    counts: tuple[int, ...] = ()  # numbers of evaluations up to each point
+    count: int = 0  # number of evaluations in all
 
     def extended(self, objective: Objective) -> Trace:
         """Return the trace with the points of one more minimisation."""
@@ -87,14 +87,16 @@ class Fit:
     theta: Floats  # (d,)
     result: Result
     details: str  # sentences with the numbers behind the result
-    trace: Trace  # with the points of earlier minimisations
-    center: Floats  # (d,): the start
-    scales: Floats  # (k,): by which discrepancies are divided
-    lowest: float  # the objective at theta
-    size: float  # its typical size
-    ridge: Ridge | None = None  # on directions that designs do not identify
-    sampling: SamplingDistribution | None = None  # None where it is not known
-    design_error: float = np.nan  # in standard errors; NaN where it is not known
+    trace: Trace  # points of this minimisation and earlier ones
+    center: Floats  # (d,): start of the minimisation
+    scales: Floats  # (k,): divisors of the discrepancies
+    lowest: float  # value of the objective at theta
+    size: float  # typical size of the objective
+    ridge: Ridge | None = None  # penalty on directions that designs do not identify
+    # sampling distribution; None where it is not known
+    sampling: SamplingDistribution | None = None
+    # error of the optimum by the design, in standard errors; NaN where it is not known
+    design_error: float = np.nan
     pilot: Floats | None = None  # (m, d): thetas around which designs grow
 
     @property
@@ -111,26 +113,25 @@ class Search:
 
     evaluator: Evaluator
     prior_sd: Floats  # (d,): unit of the parameters
-    method: Method
-    prior: bool  # whether minus the log prior is added
-    tolerance: float  # of the standardised problem
-    max_evaluations: int  # in all
-    ridge: Ridge | None = None  # added to the objective
+    settings: Minimisation
+    ridge: Ridge | None = None  # penalty that is added to the objective
     uses_gradient: bool = field(init=False)  # whether the method receives gradients
-    has_kinks: bool = field(init=False)  # gradients jump: line searches end in ever smaller steps
+    # whether gradients jump, so that line searches end in ever smaller steps
+    has_kinks: bool = field(init=False)
 
     def __post_init__(self) -> None:
         nodes = self.evaluator.nodes
         random = [node.name for node in nodes if node.bound.random]
-        if random and self.method.gradient and isinstance(self.method.method, str):
+        method = self.settings.method
+        if random and method.gradient and isinstance(method.method, str):
             raise TypeError(
                 f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-                f"{self.method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
+                f"{method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
                 "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
-        object.__setattr__(self, "uses_gradient", self.method.gradient and not random)
+        object.__setattr__(self, "uses_gradient", method.gradient and not random)
         object.__setattr__(self, "has_kinks", has_kinks)
 
     def size(self, theta: Floats, scales: Floats) -> float:
@@ -151,11 +152,11 @@ class Search:
         if gradient:
             # The response, or an inverse distribution function, may have no gradient.
             with suppress(NotImplementedError, NullTypeGradError):
-                exact = self.evaluator.objective(prior=self.prior, gradient=True)
+                exact = self.evaluator.objective(prior=self.settings.prior, gradient=True)
 
         def values(thetas: Floats) -> Floats:
-            if not self.prior:
-                return self.evaluator.total(thetas, scales)  # needs no compilation
+            if not self.settings.prior:
+                return self.evaluator.total(thetas, scales)  # which needs no compilation
             single = self.evaluator.objective(prior=True, gradient=False)
             return np.array([float(single(theta, scales)[0]) for theta in thetas])
 
@@ -164,7 +165,8 @@ class Search:
                 return values(theta[None])[0], None, 1
             if exact is not None:
                 value, slope = exact(theta, scales)
-                # PyMC's gradient of a truncated normal is NaN at points that are cut off.
+                # Differences replace PyMC's gradient of a truncated normal, which is NaN at points
+                # that are cut off.
                 if np.isfinite(slope).all() or not np.isfinite(value):
                     return value, slope, 1
             return differences(values, _STEP * self.prior_sd)(theta)
@@ -175,7 +177,7 @@ class Search:
             self.prior_sd,
             size,
             gradient=gradient,
-            max_evaluations=self.max_evaluations - spent,
+            max_evaluations=self.settings.max_evaluations - spent,
             ridge=self.ridge,
         )
 
@@ -185,13 +187,14 @@ def minimise(
 ) -> Fit:
     """Minimise from theta with the remaining evaluations.
 
-    At kinks a line search is stopped soon, unless it is to be ``patient``.
+    If the metric has kinks, a line search is stopped soon, unless it is ``patient``.
     """
     size = search.size(theta, scales)
     gradient = search.uses_gradient
     objective = search.objective(theta, scales, size, trace.count, gradient=gradient)
-    if str(search.method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
-        # Successful line searches take fewer evaluations without progress.
+    method = search.settings.method
+    if str(method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
+        # Line searches that succeed make progress within fewer evaluations.
         objective.patience = 15
         if search.has_kinks and not patient:
             objective.patience = 4
@@ -201,8 +204,8 @@ def minimise(
         objective,
         np.zeros_like(theta),
         jac=gradient or None,
-        method=search.method.method,
-        options=search.method.settings(search.tolerance, theta.size),
+        method=method.method,
+        options=method.settings(search.settings.tolerance, theta.size),
     )
     return Fit(
         theta=objective.best,
@@ -221,14 +224,14 @@ def _run_scipy(
     search: Search, objective: Objective, start: Floats, **settings: Any
 ) -> tuple[Result, str]:
     """Run a minimiser of scipy; return the result and its details."""
-    # Takes longer to import than the whole package.
+    # Import here, because SciPy's minimisers take longer to import than the whole package.
     from scipy.optimize import minimize as scipy_minimize
 
     try:
         with progress("evaluations") as objective.report:
             outcome = scipy_minimize(objective, start, **settings)
     except SpentError:
-        return Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."
+        return Result.MAX_EVALUATIONS, f"max_evaluations = {search.settings.max_evaluations}."
     except BudgetError:
         if not np.isfinite(objective.lowest):
             raise
@@ -243,12 +246,12 @@ def _run_scipy(
 
 
 def settle(search: Search, fit: Fit) -> Fit:
-    """Decide whether a line search that gave up, at a kink or rounding, has converged.
+    """Decide whether a line search that gave up, because of kinks or rounding, has converged.
 
-    It has if gradients around its end promise next to nothing, or else if a simplex gains nothing,
-    after a more patient line search if the first was stopped soon.
+    It has converged if gradients around its end predict no gain, or else if a simplex gains
+    nothing. At kinks a more patient line search comes before the simplex.
     """
-    most = search.max_evaluations
+    most = search.settings.max_evaluations
     if fit.result.converged or fit.trace.count >= most or not search.uses_gradient:
         return fit
     is_jumping = _loses_responses(search, fit.theta)
@@ -263,12 +266,12 @@ def settle(search: Search, fit: Fit) -> Fit:
             return fit
     objective = search.objective(fit.center, fit.scales, fit.size, fit.trace.count, gradient=False)
     start = (fit.theta - fit.center) / search.prior_sd
-    # In spreads of the prior; wide enough to step over a jump.
+    # Edges are in prior standard deviations; at a jump they are wide enough to step over it.
     edge = 0.5 if is_jumping else 0.01
     options = {
         "initial_simplex": np.vstack([start, start + edge * np.eye(start.size)]),
         "maxfev": _SIMPLEX_EVALUATIONS * start.size,
-        "xatol": 1e-4,  # coarse, as the gain decides
+        "xatol": 1e-4,  # coarse, because the gain decides
         "fatol": 1e-7,
     }
     result, _ = _run_scipy(search, objective, start, method="Nelder-Mead", options=options)
@@ -300,18 +303,19 @@ def _loses_responses(search: Search, theta: Floats) -> bool:
 
 
 def _follow_gradients(search: Search, fit: Fit) -> Fit:
-    """Take Newton steps from gradients a distance apart, which count kinks as curvature.
+    """Take Newton steps from gradients a distance apart, so that kinks count as curvature.
 
-    Converged if such a step neither promises nor brings a gain, and the objective is higher a
-    quarter of the prior's spread downhill: kinks make small minima on a slope.
+    The fit has converged if such a step neither predicts nor brings a gain, and if the objective is
+    higher a quarter of the prior's spread downhill, because kinks make small minima on a slope.
     """
     spent = fit.trace.count
     objective = search.objective(fit.center, fit.scales, fit.size, spent, gradient=True)
-    # Gradients by differences may take as many evaluations as a simplex.
+    # Limit the evaluations, because gradients by differences may take as many as a simplex.
     limit = _SIMPLEX_EVALUATIONS * fit.theta.size
     objective.max_evaluations = min(objective.max_evaluations, limit)
     best, lowest, result, details = fit.theta, fit.lowest, fit.result, ""
-    apart = 0.0025  # in spreads of the prior: wider than kinks of a thousand points
+    # distance in prior standard deviations, wider than the kinks of a thousand points
+    apart = 0.0025
     try:
         for _ in range(5):
             start = (best - fit.center) / search.prior_sd
@@ -334,8 +338,9 @@ def _follow_gradients(search: Search, fit: Fit) -> Fit:
         if np.isfinite(promise):
             details = f"By gradients, a better value would be lower by {promise:.1e} of it."
     except SpentError:
-        if spent + objective.count >= search.max_evaluations:
-            result, details = Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."
+        most = search.settings.max_evaluations
+        if spent + objective.count >= most:
+            result, details = Result.MAX_EVALUATIONS, f"max_evaluations = {most}."
     except BudgetError:
         result = Result.STOPPED
     return replace(
@@ -353,7 +358,7 @@ def _relative_gain(lowest: float, objective: Objective) -> float:
 
 
 def _newton_step(objective: Objective, t: Floats, apart: float) -> tuple[Floats, float, Floats]:
-    """Return a Newton step from gradients around a point, its expected gain, and ways downhill.
+    """Return a Newton step from gradients around a point, its gain, and downhill directions.
 
     The gain is infinite if the minimum is farther away than ten times the distance of the
     gradients, if there is none, or if the objective is not finite at one of them.
@@ -371,7 +376,8 @@ def _newton_step(objective: Objective, t: Floats, apart: float) -> tuple[Floats,
         full = np.where(curvatures > 0, -slope / curvatures, np.where(slope > 0, -np.inf, np.inf))
     full[(curvatures == 0) & (slope == 0)] = 0.0
     shift = np.clip(full, -reach, reach)
-    if not (np.abs(full) <= reach).all():  # as on a saddle
+    # the minimum is far away, or there is none, as on a saddle
+    if not (np.abs(full) <= reach).all():
         return axes @ shift, np.inf, downhill
     gain = -(slope @ shift) - 0.5 * curvatures @ shift**2
     return axes @ shift, float(gain), downhill
@@ -384,7 +390,6 @@ def approach(
     search: Search,
     theta: Floats,
     scales: Floats,
-    seed: int,
     trace: Trace,
     least: float = OVERLAP,
 ) -> tuple[Floats, Trace]:
@@ -397,7 +402,7 @@ def approach(
     evaluator = search.evaluator
     if [node for node in evaluator.nodes if node.bound.random]:
         return theta, trace
-    # A weight effective sample size below two: the design does not reach the population at all.
+    # With a weight effective sample size below two the design does not reach the population at all.
     ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]
     if not [n for n in ess if n < 2.0]:
         _, overlaps = overlapping_populations(evaluator, theta[None])
@@ -405,7 +410,8 @@ def approach(
             return theta, trace
     guide = AreaGuide(evaluator, scales)
     if not evaluator.responses_per_theta:
-        candidates = np.vstack([theta, evaluator.hyperparameters.prior_points(THETAS, seed)])
+        points = evaluator.hyperparameters.prior_points(THETAS, search.settings.random_seed)
+        candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
     objective = Objective(
         differences(guide, _STEP * search.prior_sd),
@@ -413,7 +419,7 @@ def approach(
         search.prior_sd,
         len(evaluator.nodes),
         gradient=True,
-        max_evaluations=search.max_evaluations - trace.count,
+        max_evaluations=search.settings.max_evaluations - trace.count,
     )
 
     def stop_with_overlap(t: Floats) -> None:
@@ -427,10 +433,10 @@ def approach(
         np.zeros_like(theta),
         jac=True,
         method="BFGS",
-        options={"gtol": 1e-2},  # coarse: the area metric is left before it converges
+        options={"gtol": 1e-2},  # coarse, because the area metric is left before it converges
         callback=stop_with_overlap,
     )
-    # The trace has values of the model's own objective.
+    # Record the values of the model's own objective in the trace, not the areas.
     objective.values = [guide.records[t.tobytes()][1] for t in objective.thetas]
     return objective.best, trace.extended(objective)
 
@@ -445,7 +451,7 @@ class AreaGuide:
             n.metric.like(AreaMetric()).against(n.target.observed, n.target.weights)
             for n in evaluator.nodes
         ]
-        # By theta: the smallest overlap, and the model's own objective.
+        # smallest overlap of a simulator, and the model's own objective, by theta
         self.records: dict[bytes, tuple[float, float]] = {}
 
     def __call__(self, thetas: Floats) -> Floats:
@@ -464,11 +470,11 @@ class AreaGuide:
             objective = objective + node.target.of(*population) / scale
         for theta, *numbers in zip(thetas, overlaps.min(axis=0), objective, strict=True):
             self.records[theta.tobytes()] = (numbers[0], numbers[1])
-        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+        return np.nan_to_num(total, nan=np.inf, posinf=np.inf)
 
 
 def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
-    """Return the theta with the smallest objective, or area where no population meets the data.
+    """Return the theta with the smallest objective, or with the smallest area without any overlap.
 
     Without overlap density metrics are the same everywhere, up to rounding.
     """

@@ -13,7 +13,7 @@ from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information, oriented
 from prbayes.inference.checks.identification import unidentified_names
-from prbayes.inference.design_error import DesignErrors, design_error
+from prbayes.inference.design_error import DesignErrors, design_error, is_emulated
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
 from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
@@ -34,22 +34,22 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches of runs after which a design is refused.
+# Number of batches of runs after which a design is refused
 MAX_ROUNDS = 8
-# Share of it for points and for emulators: together they then have it all.
+# Share of the allowed error for points, and for emulators: both together are the whole
 _SHARE = np.sqrt(0.5)
-# Largest difference between optima of independent designs, in standard errors: a tenth adds half a
+# Largest difference between optima of independent designs, in standard errors. A tenth adds half a
 # percent to the width of an interval.
 AGREE = 0.1
-# Error of an emulator, in the response's spread, that makes it another response.
+# Error of an emulator, in standard deviations of the response, above which more runs are made
 _POOR_EMULATOR = 0.25
-# Data sets for noise floors that only end a pilot or compare optima.
+# Number of data sets for noise floors that only end a pilot or compare optima
 FEW_SETS = 50
 
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """Where to minimise again on designs that have grown."""
+    """Start of the next minimisation, on designs that have grown."""
 
     theta: Floats  # (d,)
     pilot: Floats | None
@@ -58,7 +58,7 @@ class Restart:
 
 
 def refine_designs(
-    search: Search, fit: Fit, round_: int, seed: int, advance: Callable[[int, str], None]
+    search: Search, fit: Fit, round_: int, advance: Callable[[int, str], None]
 ) -> tuple[Fit, Restart | None]:
     """Add points where designs are too small for a fit; return it with the design's error.
 
@@ -68,21 +68,22 @@ def refine_designs(
     evaluator = search.evaluator
     if not evaluator.reweighted:
         return fit, None
-    nearby = neighbourhood(evaluator, fit, seed)
+    nearby = neighbourhood(evaluator, fit, search.settings.random_seed)
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
-        # A minimiser follows what is not identified until no design supports it.
+        # Name directions that are not identified, because a minimiser follows them beyond any
+        # design.
         names = []
         if fit.sampling is not None:
             names = unidentified_names(evaluator, fit.sampling.local)
         refuse(short, evaluator, names)
     if short:
-        return fit, _cover(search, fit, nearby, seed)
+        return fit, _cover(search, fit, nearby)
     overlap = stored_overlap(evaluator, fit.theta)
     is_apart = overlap < OVERLAP
     if round_ < MAX_ROUNDS and overlap < OVERLAP_ENOUGH:
         # The design supports this point, but the fit is poor: continue along the area metric.
-        theta, _ = approach(search, fit.theta, fit.scales, seed, fit.trace, OVERLAP_ENOUGH)
+        theta, _ = approach(search, fit.theta, fit.scales, fit.trace, OVERLAP_ENOUGH)
         if refine_at(evaluator, theta[None]):
             alternative = None if is_apart else fit.theta
             return fit, Restart(theta, fit.pilot, fit.ridge, alternative)
@@ -105,18 +106,18 @@ def refine_designs(
 def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     """Return thetas around a fit that designs have to support, (m, d).
 
-    Those of the pilot; or normal thetas with the covariance of the fit, no wider than the prior,
-    where emulated samples follow the fit anywhere or a ridge is on unidentified directions.
+    They are those of the pilot, unless emulated samples can follow the fit anywhere, or a ridge
+    penalises unidentified directions: then they are normal with the covariance of the fit, no wider
+    than the prior.
     """
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
     local = None if fit.sampling is None else fit.sampling.local
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if fit.ridge is not None and local is not None:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-    elif fit.pilot is None or (is_emulated and local is not None):
-        # As wide as the prior along elements whose variance is not known.
+    elif fit.pilot is None or (local is not None and is_emulated(evaluator)):
+        # Take the prior's variance for elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
         relative = np.where(is_finite, covariance / np.outer(prior_sd, prior_sd), 0.0)
@@ -130,12 +131,12 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     return np.asarray(thetas[hyperparameters.in_support(thetas)])
 
 
-def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
+def _cover(search: Search, fit: Fit, nearby: Floats) -> Restart:
     """Add points to designs that do not support a fit, around a pilot and its optimum."""
     evaluator, thetas = search.evaluator, fit.pilot
     if thetas is None:
-        thetas = nearby = pilot(evaluator, fit.scales, seed=seed)
-    elif (ridge := _ridge(search, fit, thetas, seed)) is not None:
+        thetas = nearby = pilot(evaluator, fit.scales, seed=search.settings.random_seed)
+    elif (ridge := _ridge(search, fit, thetas)) is not None:
         refine_at(evaluator, ridge.center[None] if fit.ridge is None else nearby)
         return Restart(ridge.center, thetas, ridge)
     elif not refine_at(evaluator, nearby):
@@ -144,8 +145,8 @@ def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
     return Restart(theta, thetas, fit.ridge)
 
 
-def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge | None:
-    """Return a penalty on directions that are not identified, or None if there are none.
+def _ridge(search: Search, fit: Fit, pilot_thetas: Floats) -> Ridge | None:
+    """Return a penalty on directions that are not identified, or None if all are identified.
 
     Along them a minimiser follows the error of the design, which grows with the distance. The
     penalty is the sampling noise at one spread of the prior.
@@ -156,17 +157,20 @@ def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge |
     def noise(theta: Floats) -> float:
         return float((noise_floors(evaluator, theta, FEW_SETS) / fit.scales).sum())
 
-    if search.prior:
+    if search.settings.prior:
         return None
     center = fit.theta
     if fit.ridge is None or shortcomings(evaluator, center[None]):
-        # Of thetas that fit as well as the best, the one closest to the prior's median.
+        # Center the penalty at the theta closest to the prior's median, of those that fit as well
+        # as the best.
         values = evaluator.total(pilot_thetas, fit.scales)
         is_as_good = values <= values.min() + noise(pilot_thetas[np.argmin(values)])
         candidates = pilot_thetas[is_as_good]
-        median = np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
+        median = np.median(
+            hyperparameters.prior_thetas(THETAS, search.settings.random_seed), axis=0
+        )
         distances = (((candidates - median) / hyperparameters.prior_sd) ** 2).sum(axis=1)
-        center = np.asarray(candidates[np.argmin(distances)])
+        center = candidates[np.argmin(distances)]
     sampling = sampling_distribution(evaluator, center, fit.scales)
     if sampling is None or not sampling.local.unidentified.size:
         return None
@@ -206,7 +210,7 @@ def refine_at(
     while is_drawn and names:
         names &= set(shortcomings(evaluator, thetas))
         is_drawn = draw_samples(evaluator, nearby, names, larger=True, same_surfaces=True)
-    # Runs, where samples do not suffice or the emulator is poor.
+    # Add runs where larger samples do not suffice or the emulator is poor.
     for name in short:
         emulator = evaluator.reweighted[name].design.emulator
         if emulator is not None and emulator.error > _POOR_EMULATOR:
@@ -218,7 +222,7 @@ def refine_at(
 def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     """Add points to all designs until their error is expected to be small enough.
 
-    Returns whether any were added; ``thetas``, (P, d), are where the populations in question are.
+    ``thetas``, (P, d), are those of the populations to support. Returns whether points were added.
     """
     _log.info(
         "the optima of independent designs would differ by %.2f standard errors, more than the "
@@ -227,10 +231,10 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    if not is_emulated or errors.emulators > _SHARE * AGREE:
-        # The error of a design of several inputs is taken to fall with the power .65 of its size.
-        # At most twice as many runs at a time: the estimate of the error is itself uncertain.
+    if not is_emulated(evaluator) or errors.emulators > _SHARE * AGREE:
+        # Assume that the error of a design of several inputs falls with the power .65 of its size.
+        # Add at most as many runs as there are, because the estimate of the error is itself
+        # uncertain.
         factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))
         if _add_runs(evaluator, thetas, names, factor):
             return True
@@ -282,14 +286,14 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     rng = np.random.default_rng(seed)
     thetas = evaluator.hyperparameters.prior_thetas(4 * THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
-        # Keep the best.
+        # Keep the best quarter of the thetas.
         evaluation = evaluator(thetas)
         values = (evaluation.discrepancies / scales).sum(axis=-1) - evaluation.log_other
         values = np.where(np.isfinite(evaluation.log_prior), values, np.inf)
         order = np.argsort(values)[:THETAS]
         is_apart = stored_overlap(evaluator, thetas[order[0]]) < OVERLAP
         if is_apart:
-            # Discrepancies are equal, up to rounding.
+            # Rank by the area, because without overlap discrepancies are equal up to rounding.
             order = np.argsort(AreaGuide(evaluator, scales)(thetas))[:THETAS]
         best = thetas[order]
         # Extend the designs that support fewer than half of these populations. Emulated samples
@@ -334,10 +338,10 @@ def draw_samples(
     larger: bool = False,
     same_surfaces: bool = False,
 ) -> bool:
-    """Redraw emulated samples for the populations at thetas; return whether there are any.
+    """Redraw emulated samples for the populations at thetas; return whether any was drawn.
 
-    Those of the designs named, and of simulators that share their specimens. ``larger`` samples are
-    not drawn beyond the largest size, and then do not count.
+    The samples are those of the named designs, and of simulators that share their specimens.
+    ``larger`` ones have at most the largest size.
     """
     names = siblings(evaluator.nodes, names)
     is_drawn = False
@@ -357,7 +361,7 @@ def draw_samples(
 def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Redraw emulated samples for the populations at thetas within the context.
 
-    Those of designs of a model that was never calibrated, which cover the prior alone.
+    These are the samples of models that were never calibrated, which cover the prior alone.
     """
     bounds = evaluator.reweighted.items()
     names = {name for name, bound in bounds if len(bound.design.groups) == 1}
@@ -377,7 +381,7 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
 
 def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     """Report a large error of the optimum by the design, in standard errors."""
-    # An estimate from eight blocks is itself uncertain by a quarter.
+    # Allow for the uncertainty of the estimate from eight blocks, which is a quarter.
     if not error > 1.5 * AGREE:
         return []
     designs = [bound.design for bound in evaluator.reweighted.values()]
@@ -435,7 +439,7 @@ def refuse(
 
 
 def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
-    """Raise if too much of a population, by simulator without a design, has no response."""
+    """Raise if too much of the population of a simulator without a design has no response."""
     for node in evaluator.nodes:
         if node.reweighted is None:
             share, limit = lost.get(node.name, 0.0), node.bound.max_lost

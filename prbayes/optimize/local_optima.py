@@ -12,20 +12,20 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
-from prbayes.optimize.convergence import Fit
+from prbayes.optimize.convergence import Fit, Search
 from prbayes.optimize.design_refinement import FEW_SETS, noise_floors, refine_at
 from prbayes.optimize.objective import Ridge
 from prbayes.optimize.optimum import point_text
 
-# Share of the noise floor that is about the difference of the discrepancy between the fit of the
-# data and the truth.
+# Difference of the discrepancy between the fit of the data and the truth, as a share of the noise
+# floor
 _NOISE_SHARE = 0.3
-# Difference, in multiples of the noise, up to which data could come from either optimum: three make
-# about the noise floor.
+# Difference, in multiples of the noise, up to which data could come from either optimum. Three
+# multiples are about the noise floor.
 _COMPARABLE = 3.0
-# Multiples of the noise that are nothing: descents stop there.
+# Gain, in multiples of the noise, at which descents stop
 _NEGLIGIBLE = 0.01
-# Points of the prior that are compared for each start.
+# Number of points of the prior that are compared for each start
 _POINTS_PER_START = 8
 
 
@@ -34,12 +34,12 @@ class LocalOptimum:
     """A local optimum other than the best."""
 
     theta: Floats  # (d,)
-    value: float  # of the objective
+    value: float  # value of the objective
     comparable: bool  # whether it is as good as the best up to sampling noise
     better: bool  # whether it is better than the reference
 
     def finding(self, evaluator: Evaluator) -> Finding:
-        """Report that the data could as well come from here."""
+        """Report that the data could as well come from this optimum."""
         return Finding(
             "second-mode",
             f"Another optimum fits about as well, {point_text(evaluator, self.theta)}: its "
@@ -55,8 +55,10 @@ class Reference:
 
     evaluator: Evaluator
     theta: Floats  # (d,)
-    scales: Floats  # (k,)
-    local: Local  # optima are reported at theta along the directions that are not identified
+    scales: Floats  # (k,): divisors of the discrepancies
+    # sampling distribution at theta; other optima have theta's values along its unidentified
+    # directions
+    local: Local
     noise: float  # difference of the objective that sampling explains
     ridge: Ridge | None = None
 
@@ -69,7 +71,7 @@ class Reference:
         return values.reshape(thetas.shape[:-1])
 
     def descend(self, shifts: Floats, curvature: Floats) -> tuple[Floats, Floats]:
-        """Return the minima below shifts from theta, (n, d), all at once, and their values.
+        """Return the minima that descents from shifts, (n, d), reach, and their values.
 
         Shifts and curvature, (d, d), are in units of the prior's spread.
         """
@@ -84,7 +86,7 @@ class Reference:
         return ends, values
 
     def polish(self, thetas: Floats) -> tuple[Floats, Floats]:
-        """Return the minima near thetas, (n, d), and their values, from the reference's Hessian."""
+        """Return the minima near thetas, (n, d), and values, by the Hessian of the reference."""
         local = self.local
         covariance = local.identified @ local.covariance @ local.identified.T
         inverse = (covariance + local.unidentified @ local.unidentified.T) / self.noise
@@ -99,7 +101,8 @@ class Reference:
 
     def has_barrier(self, a: Floats, value_a: float, b: Floats, value_b: float) -> bool:
         """Return whether the objective between two optima exceeds both by more than the noise."""
-        shares = np.linspace(0, 1, 11)[1:-1, None]  # a narrower barrier is missed
+        # nine points between, which miss barriers narrower than a tenth of the way
+        shares = np.linspace(0, 1, 11)[1:-1, None]
         between = self(a + shares * (b - a))
         return bool(np.max(between) - max(value_a, value_b) > self.noise)
 
@@ -123,31 +126,30 @@ class Reference:
         ]
 
 
-def find_local_optima(
-    evaluator: Evaluator, fit: Fit, starts: int, seed: int, *, refine: bool
-) -> list[LocalOptimum]:
+def find_local_optima(search: Search, fit: Fit, starts: int) -> list[LocalOptimum]:
     """Return other optima than a fit, sorted by value; refine designs where they fall short."""
     if fit.sampling is None:
         return []
+    evaluator, settings = search.evaluator, search.settings
     floors = noise_floors(evaluator, fit.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / fit.scales).sum())
     reference = Reference(evaluator, fit.theta, fit.scales, fit.sampling.local, noise, fit.ridge)
     undersampled: list[Floats] = []
-    for remaining in (2, 1, 0):  # most need one search
-        candidates = optima_from_prior(reference, starts, seed, undersampled)
+    for remaining in (2, 1, 0):  # most designs need one search
+        candidates = optima_from_prior(reference, starts, settings.random_seed, undersampled)
         optima = [o for o in candidates if not shortcomings(evaluator, o.theta[None])]
         undersampled = [
             optimum.theta
             for optimum in candidates
             if (optimum.better or optimum.comparable) and optimum not in optima
         ]
-        if not undersampled or not refine or not remaining:
+        if not (undersampled and settings.refine and remaining):
             break
         refine_at(evaluator, undersampled[0][None], beside=fit.theta[None])
     if len(floors) < 2 or not optima:
         return optima
-    # Not comparable where one simulator alone excludes an optimum: the noise of several simulators
-    # together grows with their number, and would hide it.
+    # An optimum is not comparable if a single simulator excludes it: the noise of the sum grows
+    # with the number of simulators, and would hide it.
     thetas = np.array([fit.theta, *(optimum.theta for optimum in optima)])
     discrepancies = evaluator(thetas).discrepancies
     increase = discrepancies[1:] - discrepancies[0]
@@ -167,7 +169,7 @@ def optima_from_prior(
     """
     points = reference.evaluator.hyperparameters.prior_points(_POINTS_PER_START * starts, seed)
     values = reference(points)
-    # The better half of the points, thinned.
+    # Start from the better half of the points, thinned.
     ranked = np.argsort(values, kind="stable")
     thinned = ranked[: len(ranked) // 2 : max(_POINTS_PER_START // 2, 1)]
     # Typical size of the objective among the prior's points.
@@ -179,7 +181,7 @@ def optima_from_prior(
     first = (np.vstack([points[thinned[:starts]], *candidates]) - theta) / prior_sd
     ends, values = reference.descend(first, size * np.eye(theta.size))
     lowest = float(reference(theta[None])[0])
-    # To the reference along unidentified directions, if that is as good.
+    # Move to the reference along unidentified directions where the value remains as good.
     unidentified = reference.local.unidentified
     aligned = ends - ends @ unidentified @ unidentified.T
     aligned_values = reference(theta + aligned * prior_sd)
@@ -191,7 +193,7 @@ def optima_from_prior(
         return []
     thetas = np.stack([optimum.theta for optimum in optima])
     values = np.array([optimum.value for optimum in optima])
-    # A descent in a bent valley may end before it has learned how flat the valley is.
+    # Repeat the descents, because one in a bent valley may end before its Hessian is accurate.
     for _ in range(8):
         previous = values
         thetas, values = reference.polish(thetas)

@@ -16,20 +16,18 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
-from prbayes._validate import Floats
-from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
+from prbayes._validate import Bools, Floats
+from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
     refuse_lost_specimens,
     replaced_findings,
 )
-from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
+from prbayes.inference.checks.prior import elements_at_prior_ends
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
-from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
     only_through_prior,
@@ -46,7 +44,8 @@ from prbayes.model.specimen_preparation import (
     prepared,
     specimen_data,
 )
-from prbayes.numerics.points import farthest_rows
+from prbayes.numerics.mixtures import normalised_weights
+from prbayes.numerics.modes import far_apart
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
@@ -68,10 +67,11 @@ class Mode:
     theta: Floats  # (d,)
     value: float
     # (d, d): inverse Hessian; infinite along directions without curvature, NaN at the edge of a
-    # support.
+    # support
     covariance: Floats
     converged: bool
-    steps: slice = slice(0)  # of the objective's trace, without those of the Hessian
+    # part of the objective's trace, without the evaluations for the Hessian
+    steps: slice = slice(0)
 
 
 def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
@@ -90,7 +90,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         if objective.count > settings.max_evaluations:
             break
     preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
-    # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
+    # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
     errors = [
         max(preparation.points.difference, likelihood.options.half_difference)
         for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
@@ -107,7 +107,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
-    n_known = len(modes) if is_supported.any() else 1  # the others are spurious
+    n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious
     if not is_supported.any():
         findings += report(_UNSUPPORTED)
     findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
@@ -156,21 +156,19 @@ _UNSUPPORTED = Finding(
 )
 
 
-def _supported(
-    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 0.5, of_specimen: float = 0.1
-) -> NDArray[np.bool_]:
-    """Return which optima have a log-likelihood that is known to ``largest`` nats.
+def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
+    """Return which optima have a log-likelihood that is known to half a nat.
 
     Where points lie farther apart than a population is wide, a few points that lie close to each
     other make a spurious maximum. Of many specimens with rounded readings, which are known to .06
-    nats, each may be uncertain by ``of_specimen``.
+    nats, each may be uncertain by a tenth of a nat.
     """
     size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
-    largest = max(largest, of_specimen * float(np.sqrt(size)))
+    largest = max(0.5, 0.1 * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
-    return np.asarray(np.sqrt(variance) <= largest)
+    return np.sqrt(variance) <= largest
 
 
 def mode_weights(
@@ -178,7 +176,8 @@ def mode_weights(
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
-    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass.
+    ``log_prior``, (M,), is added if the optima are those of the likelihood. ``prior_sd``, (d,),
+    then bounds the mass.
     """
     logs = np.array([-mode.value for mode in modes])
     if log_prior is not None:
@@ -196,8 +195,7 @@ def mode_weights(
         elif not is_unidentified.any():
             sign, log_det = np.linalg.slogdet(covariance)
             logs[k] += log_det / 2 if sign > 0 else 0.0
-    weights = np.exp(logs - logs.max())
-    return np.asarray(weights / weights.sum())
+    return normalised_weights(logs)
 
 
 class _Objective:
@@ -216,7 +214,8 @@ class _Objective:
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Return value and gradient at theta; +inf outside the support."""
-        with np.errstate(over="ignore", invalid="ignore"):  # +inf far from the data
+        # because the value is +inf far from the data
+        with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self.function(theta, np.empty(0))
         value = float(value) if np.isfinite(value) else np.inf
         self.thetas.append(theta.copy())
@@ -244,11 +243,10 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     order = order[np.isfinite(values[order])]
     if not order.size:
         return [hyperparameters.initial], n_screened
-    # The best one, and points of the better quarter that are far from each other.
+    # Start at the best point, and at points of the better quarter that are far from each other.
     n_starts = 8 if settings.starts is None else max(1, settings.starts)
-    candidates = thetas[order[: max(n_starts, order.size // 4)]] / hyperparameters.prior_sd
-    rows = farthest_rows(candidates, min(n_starts, len(candidates)))
-    return list(candidates[rows] * hyperparameters.prior_sd), n_screened
+    candidates = thetas[order[: max(n_starts, order.size // 4)]]
+    return list(far_apart(candidates, n_starts, hyperparameters.prior_sd)), n_screened
 
 
 def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
@@ -269,10 +267,10 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
         method="BFGS",
         options={"gtol": settings.tolerance * 100, "maxiter": remaining},
     )
-    theta = np.asarray(result.x) * unit
+    theta = result.x * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
-        # The optimum of a moving support is at a jump: continue without gradients.
+        # With a moving support the optimum is at a jump: continue without gradients.
         simplex = scipy_minimize(
             lambda u: objective(u * unit)[0],
             theta / unit,
@@ -280,7 +278,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
             options={"maxfev": min(remaining, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
         )
         if simplex.fun < value - 1e-6:
-            theta = np.asarray(simplex.x) * unit
+            theta = simplex.x * unit
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
@@ -299,11 +297,12 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     values, vectors = np.linalg.eigh(hessian * np.outer(unit, unit))
     if values.min() < -1e-3 * max(values.max(), 1.0):
         return unknown, np.inf
-    # A curvature below a twenty-fifth of the prior's identifies nothing.
+    # Directions with less than a twenty-fifth of the prior's curvature are not identified.
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
-    # In units of the prior along flat directions: with a slope there it is no optimum.
+    # Measure the slope along flat directions in units of the prior, because a point with a slope
+    # there is no optimum.
     _, gradient = objective(theta)
     along = vectors.T @ (gradient * unit)
     slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
@@ -363,7 +362,7 @@ def _widened(objective: _Objective, theta: Floats, step: Floats, hessian: Floats
         curvature = unit @ hessian @ unit
         if curvature > 1.0 / 25:
             rises = _values_beside(objective, theta, unit / np.sqrt(curvature)) - value
-            if not rises.mean() < 0.25:  # half of what curvature gives
+            if not rises.mean() < 0.25:  # half of the rise that the curvature predicts
                 continue
         for width in 2.0 ** np.arange(-12, 1):
             rises = _values_beside(objective, theta, width * unit) - value
@@ -405,9 +404,10 @@ def share_mode(
     second: Mode,
     barrier: float,
 ) -> bool:
-    """Return whether two optima are of one mode: no barrier in nats lies between them.
+    """Return whether two optima belong to one mode: no barrier, in nats, lies between them.
 
-    The profile along the straight line has the smallest value across it: a ridge is one mode.
+    The profile along the straight line takes the smallest value across it, so that a ridge is one
+    mode.
     """
     from scipy.linalg import null_space
     from scipy.optimize import minimize as scipy_minimize
@@ -420,11 +420,12 @@ def share_mode(
         value, gradient = objective((at + across @ u) * unit)
         return value, across.T @ (gradient * unit)
 
-    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):  # a barrier is likely in the middle
+    # begins in the middle, where a barrier is likely
+    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):
         at, offset = start + share * step, np.zeros(across.shape[1])
         value, _ = profile(offset, at)
         if value > height and offset.size:
-            # Off the line, on which a symmetric objective has no slope.
+            # Start off the line, on which a symmetric objective has no slope.
             value = scipy_minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
         if value > height:
             return False
@@ -438,11 +439,11 @@ def _findings(
     best = modes[0]
     refuse_lost_specimens(evaluator, best.theta)
     is_flat = np.isinf(np.diag(best.covariance))
-    # Three nats: a likelihood ratio of twenty.
+    # A rise of three nats is a likelihood ratio of twenty.
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = [*failing_region_findings(evaluator, best.theta)]
     findings += replaced_findings(evaluator, best.theta)
-    findings += [*few_specimens(evaluator), *prior_end_findings(ends)]
+    findings += few_specimens(evaluator)
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(
@@ -455,13 +456,12 @@ def _findings(
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     is_direct = ~only_through_prior(evaluator)
-    unidentified = names[np.isinf(np.diag(best.covariance)) & is_direct].tolist()
+    unidentified = names[is_flat & is_direct].tolist()
     bounds = one_sided_bounds(
         evaluator, best.theta, is_flat & is_direct, partial(_signed_root, objective, best)
     )
-    bounds = [bound for bound in bounds if bound.name not in {end.name for end in ends}]
-    findings += bound_findings(bounds)
-    excluded = {end.name for end in ends} | {bound.name for bound in bounds}
+    one_sided, excluded = end_and_bound_findings(ends, bounds)
+    findings += one_sided
     flat = [name for name in unidentified if name not in excluded]
     if flat:
         findings.append(
@@ -498,37 +498,38 @@ def _findings(
     return findings
 
 
-def _too_small_errors(
-    hyperparameters: Hyperparameters, objective: _Objective, best: Mode
-) -> NDArray[np.bool_]:
+def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, best: Mode) -> Bools:
     """Return which standard errors, (d,), are less than a third as wide as the likelihood.
 
     The root of the profile likelihood ratio four standard errors away is compared with four, or
     with the distance in the user's units where that is shorter, as from a spread to zero. Where a
     population is normal, the root is at least half as large, also with three specimens.
     """
+
+    def value_at(theta: Floats, i: int) -> float:
+        return float(ends_of_prior(hyperparameters, theta)[0][i])
+
     size = best.theta.size
     is_too_small = np.zeros(size, dtype=bool)
     for i in range(size):
         variance = best.covariance[i, i]
         if not 0 < variance < np.inf:
             continue
-        # Other elements follow as they would under a normal likelihood.
+        # Move the other elements to their conditional optima under a normal likelihood.
         step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
-        value = ends_of_prior(hyperparameters, best.theta)[0][i]
-        near = ends_of_prior(hyperparameters, best.theta + 0.01 * step)[0][i]
-        unit = max(np.abs(near - value) / 0.01, 1e-300)  # a transform may saturate
+        value = value_at(best.theta, i)
+        near = value_at(best.theta + 0.01 * step, i)
+        unit = max(abs(near - value) / 0.01, 1e-300)  # bounded, because a transform may saturate
         for shift in (-4.0, 4.0):
             theta = best.theta + shift * step
-            far = ends_of_prior(hyperparameters, theta)[0][i]
-            distance = np.fmin(np.abs(far - value) / unit, 4.0)
+            distance = np.fmin(abs(value_at(theta, i) - value) / unit, 4.0)
             if _signed_root(objective, best, theta, i) < distance / 3:
                 is_too_small[i] = True
     return is_too_small
 
 
 def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> float:
-    """Return the root of the likelihood ratio of the best mode to theta, given its i-th element."""
+    """Return the signed root of the profile likelihood ratio at theta's i-th element."""
     from scipy.optimize import minimize as scipy_minimize
 
     rest = np.arange(theta.size) != i
@@ -611,16 +612,10 @@ def specimen_pool(
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
     drawn = draw_readings(likelihood, rng, values, copies * n)[0].reshape(copies * n, -1)
-    observed, shape = likelihood.readings, drawn.shape
-    missing = np.full(shape, np.nan)
-    readings = Readings(
-        np.where(np.resize(observed.is_measured, shape), drawn, np.nan),
-        np.resize(observed.error, shape),
-        np.resize(observed.step, shape),
-        missing,
-        missing,
-        np.resize(observed.is_relative, shape),
-    )
+    observed = likelihood.readings.rows(np.tile(np.arange(n), copies))
+    missing = np.full(drawn.shape, np.nan)
+    drawn = np.where(observed.is_measured, drawn, np.nan)
+    readings = replace(observed, values=drawn, lower=missing, upper=missing)
     data, preparation = specimen_data(likelihood), prepared(likelihood)
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
     tolerance = data.options.half_difference * np.sqrt(copies)
@@ -699,7 +694,7 @@ class SpecimenRefits:
         if np.isfinite(self.covariance).all():
             values, vectors = np.linalg.eigh(self.covariance)
             if values.min() > 0:
-                return np.asarray(vectors * np.sqrt(values))
+                return vectors * np.sqrt(values)
         return np.diag(self.evaluator.hyperparameters.prior_sd)
 
     def fit(self, weights: Sequence[Floats] | None = None) -> tuple[Floats, bool]:
@@ -743,7 +738,7 @@ class SpecimenRefits:
                 theta, converged = self.fit()
             yield theta, converged, data
 
-    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.
 
         ``weights``, (S, n_k), are of the specimens of each of `Evaluator.emulated`, with any sum.
@@ -760,7 +755,7 @@ class SpecimenRefits:
                     np.add.at(count, specimens, 1)
             factors /= count
             stated = likelihood.measurements[0].weights
-            if stated is not None:  # which are in the likelihood, and in the weights
+            if stated is not None:  # the likelihood contains stated weights, and so do the factors
                 factors = factors / np.where(stated > 0, stated, 1.0)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]

@@ -41,12 +41,12 @@ from prbayes.inference.checks.metric_suitability import (
     smoothing_bias,
 )
 from prbayes.inference.checks.one_sided import (
-    bound_findings,
     bounds_by_metric,
+    end_and_bound_findings,
     is_far_from_data,
 )
 from prbayes.inference.checks.population import replaced_findings
-from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
+from prbayes.inference.checks.prior import ends_by_metric
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import (
@@ -294,14 +294,15 @@ def minimize(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised, and the fits so far."""
+    """State of a minimisation: its search, and the fits so far."""
 
     search: Search
-    settings: Minimisation
-    advance: Callable[[int, str], None]  # of the progress bar: number of runs, and a note
-    n_previous: int  # responses computed before, without those of designs
-    record: SearchRecord  # of the start
-    fits: list[Fit] = field(default_factory=list)  # of each step; a spent budget reports the last
+    # update of the progress bar by a number of runs, with a note
+    advance: Callable[[int, str], None]
+    n_previous: int  # number of responses computed before, without those of designs
+    record: SearchRecord  # record of the start of the search
+    # fits of all steps; if a budget is spent the last one is reported
+    fits: list[Fit] = field(default_factory=list)
 
 
 def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
@@ -312,14 +313,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
     hyperparameters = evaluator.hyperparameters
-    search = Search(
-        evaluator,
-        hyperparameters.prior_sd,
-        settings.method,
-        settings.prior,
-        settings.tolerance,
-        settings.max_evaluations,
-    )
+    search = Search(evaluator, hyperparameters.prior_sd, settings)
     n_previous = evaluator.n_responses - n_design_runs(evaluator)
     n_screened, details = 0, ""
     with progress("runs") as advance:
@@ -331,16 +325,16 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         elif not evaluator.responses_per_theta:
             points = hyperparameters.prior_points(THETAS, settings.random_seed)
             candidates = np.concatenate([theta[None], points])
-            theta = np.asarray(candidates[np.argmin(evaluator.total(candidates, scales))])
+            theta = candidates[np.argmin(evaluator.total(candidates, scales))]
             n_screened = len(candidates)
-        theta, trace = approach(search, theta, scales, settings.random_seed, Trace())
+        theta, trace = approach(search, theta, scales, Trace())
         if trace.count:
             details = (
                 "At the start hardly any simulated response was near the data: the area metric "
                 f"was minimised first, in {trace.count} evaluations."
             )
         record = SearchRecord(Result.STOPPED, details, settings.prior, n_screened=n_screened)
-        problem = _Problem(search, settings, advance, n_previous, record)
+        problem = _Problem(search, advance, n_previous, record)
         try:
             fit, optima = _optimise(problem, theta, scales, trace)
             optimum = _report(problem, fit, optima)
@@ -368,15 +362,14 @@ def _optimise(
     problem: _Problem, theta: Floats, scales: Floats, trace: Trace
 ) -> tuple[Fit, list[LocalOptimum]]:
     """Minimise on designs that grow until they support the minimum, then compare local optima."""
-    search, settings = problem.search, problem.settings
-    evaluator, seed = search.evaluator, settings.random_seed
+    search, evaluator = problem.search, problem.search.evaluator
     fit = _fit(problem, theta, scales, trace)
-    for round_ in count() if settings.refine else ():
-        fit, restart = refine_designs(search, fit, round_, seed, problem.advance)
+    for round_ in count() if search.settings.refine else ():
+        fit, restart = refine_designs(search, fit, round_, problem.advance)
         if restart is None:
             break
         pilot, ridge = restart.pilot, restart.ridge
-        theta, trace = approach(search, restart.theta, fit.scales, seed, fit.trace)
+        theta, trace = approach(search, restart.theta, fit.scales, fit.trace)
         fit = _fit(problem, theta, fit.scales, trace, pilot, ridge)
         if restart.alternative is not None:
             # An earlier minimum may be better on the grown designs.
@@ -386,7 +379,7 @@ def _optimise(
                 fit = _fit(problem, restart.alternative, fit.scales, fit.trace, pilot, ridge)
     problem.fits.append(fit)
     if fit.ridge is not None and fit.sampling is not None:
-        # Without the ridge along directions that grown designs have come to identify.
+        # Minimise without the ridge along directions that the grown designs identify.
         directions = fit.sampling.local.unidentified
         if directions.shape[1] < fit.ridge.directions.shape[1]:
             rest = replace(fit.ridge, directions=directions) if directions.size else None
@@ -409,7 +402,7 @@ def _fit(
     pilot: Floats | None = None,
     ridge: Ridge | None = None,
 ) -> Fit:
-    """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
+    """Minimise from theta; with several simulators again, scaled by the noise at the pilot."""
     search = replace(problem.search, ridge=ridge)
     evaluator = search.evaluator
     fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
@@ -425,7 +418,7 @@ def _fit(
 
 def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum]]:
     """Search for other optima; move to a better one."""
-    evaluator, settings = problem.search.evaluator, problem.settings
+    evaluator, settings = problem.search.evaluator, problem.search.settings
     n_starts = settings.starts
     if n_starts is None:
         n_starts = _starts_by_cost(problem.search, fit)
@@ -433,9 +426,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
             return fit, []
-        optima = find_local_optima(
-            evaluator, fit, n_starts, settings.random_seed, refine=settings.refine
-        )
+        optima = find_local_optima(problem.search, fit, n_starts)
         if not (is_first and optima and optima[0].better):
             break
         search = replace(problem.search, ridge=fit.ridge)
@@ -450,18 +441,23 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
 def _starts_by_cost(search: Search, fit: Fit) -> int:
     """Return the number of starts in search of other optima.
 
-    Where responses are simulated again, a few if the fit is poor and they take half a minute.
+    Where responses are simulated again, it is four if the fit is poor and the search takes less
+    than half a minute.
     """
     evaluator = search.evaluator
     if not evaluator.responses_per_theta:
         return 32
-    if fit.sampling is None or search.prior or not is_far_from_data(fit.sampling, fit.lowest):
+    if (
+        fit.sampling is None
+        or search.settings.prior
+        or not is_far_from_data(fit.sampling, fit.lowest)
+    ):
         return 0
     evaluator.total(fit.theta[None], fit.scales)  # the first call compiles
     start = time.perf_counter()
     evaluator.total(fit.theta[None], fit.scales)
     seconds = time.perf_counter() - start
-    # Four starts take 200 populations for each element of theta, about, and a few more.
+    # Four starts take about 200 populations for each element of theta.
     return 4 if 400 * fit.theta.size * seconds < 30 else 0
 
 
@@ -470,13 +466,15 @@ def _settle(problem: _Problem, fit: Fit) -> Fit:
     search = replace(problem.search, ridge=fit.ridge)
     evaluator = search.evaluator
     end = settle(search, fit)
-    if problem.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
-        # A simplex may move to where few points have a lower value by accident.
+    if search.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
+        # The simplex may have moved to where few points have a low value by chance: settle again on
+        # the refined designs.
         end = settle(search, fit)
         if shortcomings(evaluator, end.theta[None]):
             end = fit
     shift = np.abs(end.theta - fit.theta)
-    # Standard errors change less than the theta of a settled line search.
+    # Standard errors are computed again only if theta has moved by a hundredth of the prior's
+    # spread.
     if end.sampling is not None and (shift > 0.01 * search.prior_sd).any():
         end = replace(end, sampling=sampling_distribution(evaluator, end.theta, end.scales))
     if end.sampling is None or not (np.isnan(end.design_error) or shift.any()):
@@ -504,8 +502,8 @@ def _report(
             fit.theta,
             fit.scales,
             size=search.size(fit.theta, fit.scales),
-            tolerance=search.tolerance,
-            seed=problem.settings.random_seed,
+            tolerance=search.settings.tolerance,
+            seed=search.settings.random_seed,
         )
         at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
@@ -535,7 +533,8 @@ def _report(
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
     local = None if fit.sampling is None else fit.sampling.local
     unknown = [] if at_edge or at_jump else [*optimum.stderr.items()]
-    first = [finding for node in evaluator.nodes for finding in node.bound.findings]  # are logged
+    # findings that are logged already
+    first = [finding for node in evaluator.nodes for finding in node.bound.findings]
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
@@ -572,7 +571,7 @@ def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     indirect = names[only_through_prior(evaluator)]
-    if indirect.size and not search.prior:
+    if indirect.size and not search.settings.prior:
         sentences.append(
             f"The data inform {', '.join(indirect)} only through other hyperparameters and the "
             "prior, which is not minimised: their values are arbitrary; use prb.sample_smc."
@@ -594,14 +593,10 @@ def optimum_findings(
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
         findings += few_specimens(evaluator)
-        ends = ends_by_metric(sampling)
+        ends, bounds = ends_by_metric(sampling), bounds_by_metric(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
-        findings += prior_end_findings(ends, page)
-        names = {end.name for end in ends}
-        bounds = bounds_by_metric(sampling)
-        if bounds is not None:
-            findings += bound_findings([b for b in bounds if b.name not in names])
-            names |= {bound.name for bound in bounds}
+        one_sided, names = end_and_bound_findings(ends, bounds or [], page)
+        findings += one_sided
         findings += unidentified_findings(
             evaluator, sampling.local, names, has_bounds=bounds is not None
         )

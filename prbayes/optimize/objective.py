@@ -13,7 +13,7 @@ import numpy as np
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 
-# Theta (d,) -> value, gradient (d,) or None, number of evaluations.
+# function of theta, (d,), that returns value, gradient (d,) or None, and number of evaluations
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
 
 
@@ -30,23 +30,23 @@ class Ridge:
     """Quadratic penalty that regularises directions which the data do not identify."""
 
     center: Floats  # (d,)
-    directions: Floats  # (d, q): orthonormal in units of the prior's spread
-    weight: float  # of half the squared distance, in units of the objective
+    directions: Floats  # (d, q): directions, orthonormal in units of the prior's spread
+    weight: float  # factor of half the squared distance, in units of the objective
 
     def __call__(self, thetas: Floats, prior_sd: Floats) -> Floats:
         """Return the penalty at thetas, (..., d) -> (...)."""
         along = (thetas - self.center) / prior_sd @ self.directions
-        return np.asarray(0.5 * self.weight * (along**2).sum(axis=-1))
+        return 0.5 * self.weight * (along**2).sum(axis=-1)
 
     def gradient(self, thetas: Floats, prior_sd: Floats) -> Floats:
         """Return the gradient of the penalty at thetas, (..., d)."""
         along = (thetas - self.center) / prior_sd @ self.directions
-        return np.asarray(self.weight * (along @ self.directions.T) / prior_sd)
+        return self.weight * (along @ self.directions.T) / prior_sd
 
 
 @dataclass(eq=False)
 class Objective:
-    """A function in standardised parameters t and values, theta = center + t * prior_sd."""
+    """A function of standardised parameters t, theta = center + t * prior_sd."""
 
     function: Function
     center: Floats  # (d,)
@@ -55,13 +55,15 @@ class Objective:
     gradient: bool  # whether the gradient is returned as well
     max_evaluations: int
     ridge: Ridge | None = None
-    patience: float = np.inf  # points without progress after which a line search has stalled
-    least_gain: float = 0.0  # relative, that counts as progress
+    # number of points without progress after which a line search has stalled
+    patience: float = np.inf
+    least_gain: float = 0.0  # smallest relative gain that counts as progress
     report: Callable[[int, str], None] = field(default=lambda done, note: None)
     count: int = field(default=0, init=False)
     thetas: list[Floats] = field(default_factory=list, init=False)
     values: list[float] = field(default_factory=list, init=False)
-    counts: list[int] = field(default_factory=list, init=False)  # evaluations up to each point
+    # numbers of evaluations up to each point
+    counts: list[int] = field(default_factory=list, init=False)
     best: Floats = field(init=False)  # theta of the lowest value, or the center
     lowest: float = field(default=np.inf, init=False)  # smallest finite value
     _since_progress: int = field(default=0, init=False)
@@ -92,7 +94,7 @@ class Objective:
             self.lowest, self.best = value, theta
         self.report(cost, f"discrepancy {self.lowest:.4g}")
         value = value / self.size
-        # A relative gain below 1e-10 is rounding of a sum over thousands of points.
+        # Relative gains below 1e-10 are rounding errors of a sum over thousands of points.
         least = max(1e-10, self.least_gain * abs(self._value_at_progress))
         is_first = not np.isfinite(self._value_at_progress)
         if is_first or value < self._value_at_progress - least:
@@ -105,7 +107,7 @@ class Objective:
             return value if np.isfinite(value) else 1e300
         slope = np.asarray(gradient) * self.prior_sd / self.size
         if not np.isfinite(value) or not np.isfinite(slope).all():
-            # Leads back to the start without breaking a line search.
+            # A bowl around the start leads a line search back, where infinite values would end it.
             return 1e10 + float(t @ t), 2 * t
         return value, slope
 
@@ -113,14 +115,14 @@ class Objective:
 def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     """Return the first divisors of the discrepancies, (k,): epsilons, or typical sizes.
 
-    One for a simulator alone. Raises ValueError if log-densities are added to discrepancies
-    without an epsilon of each.
+    The divisor of a single simulator is one. Raises ValueError if log-densities are added to
+    discrepancies without an epsilon of each.
     """
     terms = ""
     if prior:
         terms = "minus the log prior (prior=True)"
     elif evaluator.other_terms:
-        # Terms that only exclude hyperparameters do not count.
+        # Terms that only exclude hyperparameters are constant elsewhere, and do not count.
         values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
         finite = values[np.isfinite(values)]
         if finite.size and np.ptp(finite) > 0:
@@ -140,7 +142,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     return np.where(np.isnan(evaluator.epsilon), sizes, evaluator.epsilon)
 
 
-# Scipy's minimisers that need no Hessian.
+# SciPy's minimisers that need no Hessian
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
 
@@ -153,7 +155,8 @@ class Method:
     """
 
     method: str | Callable[..., Any] = "BFGS"
-    options: Mapping[str, Any] = field(default_factory=dict)  # replace those of `settings`
+    # options that replace those of `settings`
+    options: Mapping[str, Any] = field(default_factory=dict)
     gradient: bool = field(init=False)  # whether the method uses gradients
 
     def __post_init__(self) -> None:
@@ -182,12 +185,12 @@ class Method:
         """Raise for options that scipy's method does not have, of which it only warns."""
         if not all(isinstance(name, str) for name in self.options):
             raise TypeError(f"options: got {list(self.options)} as names, expected texts")
-        # Takes longer to import than the whole package.
+        # Import here, because SciPy's minimisers take longer to import than the whole package.
         from scipy.optimize import OptimizeWarning
         from scipy.optimize import minimize as scipy_minimize
 
-        # Scipy checks names when it runs: here from the minimum of a parabola. Bad values raise
-        # later, on the problem itself.
+        # SciPy checks the names of options when it runs: minimise a parabola from its minimum.
+        # Invalid values raise an error later, on the problem itself.
         options = {name: value for name, value in self.options.items() if name != "disp"}
         with warnings.catch_warnings(record=True) as caught, suppress(Exception):
             warnings.simplefilter("always")
@@ -208,9 +211,9 @@ class Method:
         """
         if not isinstance(self.method, str):
             return dict(self.options)
-        most = 10**9  # never reached
-        # First step of methods without gradient, in spreads of the prior: larger than most standard
-        # errors, and within the prior.
+        most = 10**9  # a limit that is never reached
+        # The first step of methods without gradient is larger than most standard errors, and within
+        # the prior.
         step = 0.2
         defaults: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance},

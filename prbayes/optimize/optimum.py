@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -57,7 +58,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.convergence import OVERLAP, Fit, Result, Search, stored_overlap
 
-# A smaller share is displayed as 0.0%.
+# Smallest share that is not displayed as 0.0%
 SMALLEST_SHARE = 5e-4
 NO_RESPONSE = "have no response (NaN) and are left out"
 
@@ -153,10 +154,17 @@ def _rows(optimum: Optimum) -> list[list[str]]:
         if not has_rows or value.size > 20:
             rows.append([name, short(value), short(error)])
             continue
-        values, errors = single_elements({name: value}), single_elements({name: error})
-        for element in optimum_elements({name: value}, {name: error}):
-            rows.append([element, short(values[element]), short(errors[element])])
+        for element, *numbers in _elements({name: value}, {name: error}):
+            rows.append([element, *map(short, numbers)])
     return rows
+
+
+def _elements(
+    point: Mapping[Any, xr.DataArray], stderr: Mapping[Any, xr.DataArray]
+) -> list[tuple[str, float, float]]:
+    """Return name, estimate and standard error of each element in a table."""
+    values, errors = single_elements(point), single_elements(stderr)
+    return [(name, values[name], errors[name]) for name in optimum_elements(point, stderr)]
 
 
 def _failures_and_findings(optimum: Optimum) -> list[str]:
@@ -177,7 +185,7 @@ def _text(optimum: Optimum) -> str:
 
 
 def _html(optimum: Optimum) -> str:
-    """Return the same for a notebook, as a table."""
+    """Return estimates, cost and findings as a table for a notebook."""
     header = ["", "estimate", "standard error"]
     return view(
         _heading(optimum),
@@ -315,13 +323,9 @@ class Optimum:
 
         point = labelled(self.evaluator, self.point, {}).data_vars
         stderr = labelled(self.evaluator, self.stderr, {}).data_vars
-        values, errors = single_elements(point), single_elements(stderr)
-        names = optimum_elements(point, stderr)
-        columns = {
-            "estimate": [values[name] for name in names],
-            "standard error": [errors[name] for name in names],
-        }
-        return pd.DataFrame(columns, index=pd.Index(names, name="hyperparameter"))
+        columns = ["hyperparameter", "estimate", "standard error"]
+        rows = _elements(point, stderr)
+        return pd.DataFrame(rows, columns=columns).set_index("hyperparameter")
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.
@@ -370,16 +374,16 @@ class Optimum:
 def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) -> Optimum:
     """Return the optimum of a fit, without findings, local optima and design error.
 
-    ``n_previous`` responses were computed for something else. None is computed if a budget has
-    stopped the search.
+    ``n_previous`` responses were computed before the search. No response is computed if a budget
+    has stopped it.
     """
     evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
     hyperparameters = evaluator.hyperparameters
     covariance = fit.covariance
     functions = None if fit.sampling is None else sampling_of_functions(fit.sampling)
     point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
-    # How the search ended, unless its end is no minimum. A variance of rounding errors is as
-    # suspect as an infinite one; the discrepancy decides.
+    # Report how the search ended, unless its end is no minimum. If all variances are infinite or
+    # rounding errors, check whether the discrepancy changes at all.
     is_affordable = not (record.stopped and evaluator.responses_per_theta)
     variance = np.diag(covariance) / hyperparameters.prior_sd**2
     is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
@@ -391,16 +395,16 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.AT_EDGE
     elif is_flat:
         result = Result.NO_INFORMATION
-    elif is_affordable and not search.prior and stored_overlap(evaluator, theta) < OVERLAP:
-        # Such a minimum is one of the mass beyond the grid, and no fit.
+    elif is_affordable and not search.settings.prior and stored_overlap(evaluator, theta) < OVERLAP:
+        # Without overlap the minimum is one of the mass beyond the metric's grid, and no fit.
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.prior or evaluator.other_terms:
+    elif len(scales) > 1 or search.settings.prior or evaluator.other_terms:
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales
-    n_responses = evaluator.n_responses - n_previous  # without those of the support
+    n_responses = evaluator.n_responses - n_previous  # counted before the support computes any
     support = {
         name: {key: float(value[0]) for key, value in numbers.items()}
         for name, numbers in evaluator.support(theta[None]).items()
@@ -409,7 +413,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         if node.reweighted is None and is_affordable:
             support[node.name] = missing_mass(evaluator, theta, k)
     names = [node.name for node in evaluator.nodes]
-    identity = identity_of(evaluator, prior_minimised=search.prior)
+    identity = identity_of(evaluator, prior_minimised=search.settings.prior)
     return Optimum(
         point=point,
         stderr=stderr,
@@ -445,7 +449,7 @@ def n_computed(evaluator: Evaluator) -> int:
 def point_text(evaluator: Evaluator, theta: Floats) -> str:
     """Return the free variables at theta in words, without constants."""
     hyperparameters = evaluator.hyperparameters
-    # Beside a second point, so that constants can be recognised.
+    # Constants are recognised by a comparison with a second point.
     points = hyperparameters.constrained(np.stack([theta, hyperparameters.initial]))
     names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
@@ -467,7 +471,7 @@ def point_and_stderr(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     hyperparameters = evaluator.hyperparameters
-    step = 1e-4 * hyperparameters.prior_sd  # any small step: transforms are smooth
+    step = 1e-4 * hyperparameters.prior_sd  # any small step will do, because transforms are smooth
     values = hyperparameters.constrained(cross(theta, step))
     prior = hyperparameters.constrained(hyperparameters.prior_thetas(THETAS, seed=0))
     deterministics = {str(variable.name) for variable in evaluator.model.deterministics}
@@ -476,11 +480,12 @@ def point_and_stderr(
         gradients = slopes(value, step)
         errors = delta_method(gradients, covariance)
         if functions is not None and name in deterministics:
-            # Functions of unidentified elements may be identified: if better than by their prior.
+            # Functions of unidentified elements may be identified: require a smaller error than the
+            # prior's spread.
             faint = np.sqrt(functions.variance(gradients))
             upper, lower = np.quantile(prior[name], [0.84, 0.16], axis=0)
             errors = np.where(np.isinf(errors) & (faint < (upper - lower) / 2), faint, errors)
-        # Constants up to rounding, such as the diagonal of a correlation matrix.
+        # Constants, such as the diagonal of a correlation matrix, vary by rounding alone.
         ranges = np.ptp(np.concatenate([value, prior[name]]), axis=0)
         is_constant = ranges <= 1e-12 * np.abs(value[0])
         stderr[name] = _number(np.where(is_constant, 0.0, errors))
@@ -494,10 +499,10 @@ def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
     size = np.abs(gradients)
     is_touched = np.einsum("...i,ij,...j->...", size, is_infinite.astype(float), size) > 0
-    # At a bound of the support nothing moves a function, and its error is not known.
+    # At a bound of the support the gradient of a function vanishes, and its error is not known.
     is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
     variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
-    return np.asarray(np.sqrt(np.where(is_at_bound, np.nan, variance)))
+    return np.sqrt(np.where(is_at_bound, np.nan, variance))
 
 
 def _number(value: Any) -> Any:
@@ -509,7 +514,7 @@ def _number(value: Any) -> Any:
 
 
 def refuse_model(result: object, caller: str) -> None:
-    """Raise if a model stands where a result is expected."""
+    """Raise if a model is passed instead of a result."""
     if isinstance(result, pm.Model):
         raise TypeError(
             f"{caller}: got a Model, expected a result of prb.minimize or prb.sample; pass the "
@@ -564,13 +569,18 @@ def identity_in(result: Any) -> Identity | None:
     return from_attributes(result[group].attrs) if group in result.children else None
 
 
+def element_order(optimum: Optimum, evaluator: Evaluator) -> list[int]:
+    """Return the places of an evaluator's elements in an optimum, whose model may be a clone."""
+    names = optimum.evaluator.hyperparameters.names
+    return [names.index(name) for name in evaluator.hyperparameters.names]
+
+
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
     """Return the optimum and comparable local optima, (M, d), in the evaluator's order of elements.
 
     The order may differ in a clone of the optimum's model.
     """
-    names = optimum.evaluator.hyperparameters.names
-    order = [names.index(name) for name in evaluator.hyperparameters.names]
+    order = element_order(optimum, evaluator)
     modes = [mode["theta"] for mode in optimum.local_optima if mode["comparable"]]
     return np.array([optimum.theta, *modes])[:, order]
 
@@ -578,41 +588,66 @@ def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
 # -- storage ---------------------------------------------------------------------------------------
 
 
+def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
+    """Return name, settings and runs of each simulator, log-likelihoods by specimen last."""
+    records = [
+        {
+            "simulator": node.name,
+            "metric": without_addresses(node.metric),
+            "compared": components_summary(node.target),
+            "is_likelihood": 0,
+            "n_runs": node.bound.n_runs,
+        }
+        for node in evaluator.nodes
+    ]
+    for measurement in evaluator.measurements:
+        emulation = prepared(likelihood_of(evaluator, measurement)).emulation
+        record = {
+            "simulator": measurement.name,
+            "metric": without_addresses(measurement.metric),
+            "compared": "",
+            "is_likelihood": 1,
+            "n_runs": len(emulation.z),
+        }
+        records.append(record)
+    return records
+
+
+def by_simulator(records: list[dict[str, Any]]) -> xr.Dataset:
+    """Return records as variables of one dimension, NaN where a simulator has no number."""
+    keys = dict.fromkeys(key for record in records for key in record)
+    return xr.Dataset(
+        {key: ("simulator", [record.get(key, np.nan) for record in records]) for key in keys}
+    )
+
+
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
-    evaluator = optimum.evaluator
-    nodes, measurements = evaluator.nodes, evaluator.measurements
-    names = [node.name for node in nodes] + [m.name for m in measurements]
+    """Return the figures of the simulators at the optimum, and its covariance."""
+    evaluator, records = optimum.evaluator, simulator_records(optimum.evaluator)
     likelihoods = specimen_log_likelihoods(evaluator, optimum.theta[None])
-    discrepancies = {name: -float(v.sum()) for name, v in likelihoods.items()}
-    discrepancies |= optimum.discrepancies
-    n_runs = [node.bound.n_runs for node in nodes]
-    n_runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
-    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
-    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
-    by_simulator: dict[str, list[Any]] = {
-        "discrepancy": [discrepancies[name] for name in names],
-        "scale": [optimum.scales.get(name, 1.0) for name in names],
-        "metric": [without_addresses(metric) for metric in metrics],
-        "compared": compared,
-        "is_likelihood": [0] * len(nodes) + [1] * len(measurements),
-        "n_runs": n_runs,
-    }
-    for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
-        by_simulator[key] = [
-            optimum.search.support.get(name, {}).get(key, np.nan) for name in names
-        ]
     failing = failing_share(evaluator, optimum.theta)
-    by_simulator["failing_share"] = [failing.get(name, np.nan) for name in names]
-    variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
-    variables["theta"] = ("element", optimum.theta)
-    variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    names_of_elements = evaluator.hyperparameters.names
-    elements = {"element": names_of_elements, "other_element": names_of_elements}
-    return xr.Dataset(variables, coords={"simulator": names, **elements})
+    for record in records:
+        name = record["simulator"]
+        if name in optimum.discrepancies:
+            discrepancy = optimum.discrepancies[name]
+        else:
+            discrepancy = -float(likelihoods[name].sum())
+        support = optimum.search.support.get(name, {})
+        record |= {"discrepancy": discrepancy, "scale": optimum.scales.get(name, 1.0)}
+        for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
+            record[key] = support.get(key, np.nan)
+        record["failing_share"] = failing.get(name, np.nan)
+    names = evaluator.hyperparameters.names
+    variables = {
+        "theta": ("element", optimum.theta),
+        "covariance": (["element", "other_element"], optimum.covariance),
+    }
+    figures = by_simulator(records).assign_coords(element=names, other_element=names)
+    return figures.assign(variables)
 
 
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
-    """Return how simulators compare their outputs, where not one by one."""
+    """Return how simulators compare several outputs together."""
     if "compared" not in calibration:
         return ()
     clauses = calibration["compared"].values.tolist()

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from prbayes._progress import shown
-from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
+from prbayes._validate import Bools, Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.asymptotics import unidentified_directions
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
@@ -124,7 +123,7 @@ def bootstrap(
 
 def _specimen_estimates(
     optimum: Optimum, draws: int, seed: int, *, parametric: bool
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
     require_minimiser(optimum, "bootstrap")

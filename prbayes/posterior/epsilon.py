@@ -27,6 +27,7 @@ from prbayes.model.fingerprint import Identity, identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import AnySimulator, simulators
 from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
+from prbayes.numerics.mixtures import normalised_weights
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 _log = logging.getLogger("prbayes")
@@ -113,7 +114,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
 
 def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
-    """Return the ratio of variances of the minimiser with shared and with different specimens."""
+    """Return the variance of the minimiser with shared specimens over that with different ones."""
     minima = [item.node.metric.minimum for item in information]
     if len(minima) < 2 or Minimum.UNKNOWN in minima:
         return 1.0
@@ -122,12 +123,12 @@ def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
         return 1.0
     sets = information[0].data_sets
     variances = []
-    # Different specimens are the same data sets, exchanged between the simulators.
+    # Exchange the data sets between the simulators, so that their specimens are different.
     for shift in range(5):
         weights = [np.roll(w, shift * k, axis=0) for k, w in enumerate(sets.weights)]
         shifts = first_order_shifts(information, epsilon, basis, DataSets(sets.values, weights))
         variances.append(np.atleast_2d(np.cov(shifts, rowvar=False)))
-    # The mean of several has a negligible error.
+    # The mean over four exchanges has a negligible error.
     ratio = np.linalg.solve(np.mean(variances[1:], axis=0), variances[0])
     return float(np.trace(ratio) / len(ratio))
 
@@ -172,8 +173,8 @@ def _by_sandwich(information: Information) -> float | None:
 def _by_refits(information: Information) -> float | None:
     """Return the mean of delta . grad d / p, delta from the sampling distribution.
 
-    The derivative along delta is the difference between one and a half and half of it: exact for a
-    discrepancy that grows like a square or like an absolute value.
+    The derivative along delta is the difference between 1.5 delta and .5 delta, which is exact for
+    a discrepancy that grows like a square or like an absolute value.
     """
     scales = np.ones(len(information.evaluator.nodes))
     refits = simplex_refits(
@@ -183,7 +184,7 @@ def _by_refits(information: Information) -> float | None:
     p = local.identified.shape[1]
     if not p:
         return None
-    # A delta for each data set, and its opposite, in units of the prior's spread.
+    # Draw a delta for each data set, in units of the prior's spread, and use its opposite as well.
     z = np.random.default_rng(0).standard_normal((len(refits.shifts), p))
     root = np.linalg.cholesky(local.covariance)
     delta = z @ root.T @ local.identified.T
@@ -192,15 +193,15 @@ def _by_refits(information: Information) -> float | None:
     values = refits.objective(refits.theta + steps * refits.prior_sd, slice(None))
     far, near, opposite, far_opposite = values.T
     slopes = ((far - near) + (far_opposite - opposite)) / 2
-    # Populations outside the design's reach have none.
+    # Leave out populations that the design does not reach, whose slopes are not finite.
     return float(slopes[np.isfinite(slopes)].mean() / p)
 
 
 def _by_coverage(information: Information) -> float | None:
-    """Solve for the epsilon whose posteriors cover, with features that are linear in theta."""
-    # The strongest directions are last. The information of a sample of one response beyond two
-    # directions, close to its location and spread, is of the order of the error of derivatives of
-    # stored weights; m outputs have as many locations, spreads and correlations.
+    """Solve for the epsilon whose posteriors have the nominal coverage, with linear features."""
+    # Keep the strongest directions, which are the last: two for one output, close to its location
+    # and spread, because further information is of the order of the error of derivatives of stored
+    # weights. With m outputs they are as many as locations, spreads and correlations.
     (m,) = information.node.target.event or (1,)
     basis = identified_by_area(information)[:, -m * (m + 3) // 2 :]
     if not basis.shape[1]:
@@ -209,26 +210,26 @@ def _by_coverage(information: Information) -> float | None:
     covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
     variances, vectors = np.linalg.eigh(covariance)
     axes = basis @ (vectors * np.sqrt(np.maximum(variances, 0)))
-    directions = axes * information.prior_sd[:, None]  # (d, r), a standard error long
-    # Thetas around the optimum, three times as wide as the sampling distribution, to reach all
-    # posteriors.
+    # (d, r): axes in theta, each one standard error long
+    directions = axes * information.prior_sd[:, None]
+    # Thetas around the optimum scatter three times as wide as the sampling distribution, to reach
+    # the posteriors of all data sets.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
-    distances: Any = 0  # (n_sets, M)
+    distances: Any = 0  # (n_sets, M): discrepancies of the data sets at the thetas
     for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
         levels = interpolated(correction_table(area.specimens), area.simulated + change)
         distances = distances + np.array(rows) - (levels * area.lengths).sum(axis=-1)
     log_proposal = -0.5 * (z**2).sum(axis=-1)
-    # Coverage grows with epsilon.
+    # Bisect the logarithm of epsilon, because coverage grows with it.
     low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))
-    for _ in range(40):  # to rounding
+    for _ in range(40):  # enough to reach rounding errors
         middle = float(np.sqrt(low * high))
         logs = -distances / middle - log_proposal
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-        weights /= weights.sum(axis=1, keepdims=True)
-        # The posterior probability below the optimum, which is at zero, by axis and data set.
+        weights = normalised_weights(logs)
+        # below: posterior probability below the optimum, which is at zero, by axis and data set
         below = np.stack([(weights * (column < 0)).sum(axis=1) for column in z.T])
         coverage = float(np.mean(np.abs(below - 0.5) < INTERVAL / 2))
         low, high = (middle, high) if coverage < INTERVAL else (low, middle)

@@ -24,7 +24,7 @@ from prbayes._validate import Floats, called, positive_integer, real_array, shar
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
 from prbayes.model.parameters import Hyperparameters
-from prbayes.posterior.importance import LogDensity
+from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
 from prbayes.response.store import StoreError, replace_files
@@ -34,17 +34,19 @@ from prbayes.response.store import StoreError, replace_files
 class KernelOptions:
     """Limits of the mutation."""
 
-    # Mean absolute correlation with the previous particles, below which draws are new: .036 among
-    # 500 independent ones.
+    # Mean absolute correlation with the previous particles below which particles count as new. It
+    # is .036 for 500 independent ones.
     correlation: float = 0.05
-    tempered_correlation: float = 0.3  # before the last stage; later stages forget the rest
-    # Beside the hard ends of a uniform population 25 steps leave posteriors a tenth too wide.
+    # same limit before the last stage, because later stages remove the rest
+    tempered_correlation: float = 0.3
+    # Largest number of steps. With 25 steps posteriors at the hard ends of a uniform population are
+    # a tenth too wide.
     steps: int = 60
 
 
 _OPTIONS = KernelOptions()
 
-# Attributes of the kernel that are a part of its state.
+# Names of the attributes of the kernel that belong to its state
 _STATE = ("stages", "beta", "log_marginal_likelihood", "iteration")
 
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
@@ -106,7 +108,7 @@ class BatchedKernel(SMC_KERNEL):
         evaluator: Evaluator | None = None,
         log_likelihood: LogDensity | None = None,
     ) -> None:
-        # PyMC's constructor compiles functions of single particles, which this kernel never calls.
+        # PyMC's constructor is not called, because it compiles functions of single particles.
         self.draws = positive_integer(draws, "draws")
         if random_seed is not None:
             positive_integer(random_seed, "random_seed", minimum=0)
@@ -130,7 +132,7 @@ class BatchedKernel(SMC_KERNEL):
         self._reset_state()
 
     def _take(self, particles: Particles) -> None:
-        """Take particles over, also to the attributes that PyMC reads."""
+        """Replace the particles, and the attributes that PyMC reads."""
         self.particles = particles
         self.tempered_posterior = particles.thetas
         self.prior_logp = particles.log_prior
@@ -190,25 +192,27 @@ class BatchedKernel(SMC_KERNEL):
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that preserve the tempered posterior."""
         start = self.particles.thetas
-        # The normal distribution fitted to the particles; identical ones have a covariance, too.
+        # Fit a normal distribution to the particles. The jitter keeps the covariance of identical
+        # particles positive definite.
         mean = start.mean(axis=0)
         covariance = np.atleast_2d(np.cov(start, rowvar=False))
         jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
         root = np.linalg.cholesky(covariance + jitter)
         limit = _OPTIONS.correlation if self.beta == 1 else _OPTIONS.tempered_correlation
-        # The best scale for normal targets, steered to an acceptance rate between those for many
-        # dimensions and for one (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254).
+        # Begin with the best scale for normal targets, and adapt it to an acceptance rate between
+        # those for many dimensions and for one (Roberts, Gelman and Gilks 1997,
+        # doi:10.1214/aoap/1034625254).
         scale = 2.38 / np.sqrt(start.shape[1])
         remaining = 1.0
         rates = []
         for step in range(1, _OPTIONS.steps + 1):
             noise = self.rng.standard_normal(start.shape)
-            if step % 2:  # independent proposals
+            if step % 2:  # odd steps have independent proposals
                 standard = np.linalg.solve(root, (self.particles.thetas - mean).T)
                 log_ratio = 0.5 * ((noise**2).sum(axis=1) - (standard**2).sum(axis=0))
                 rates.append(self._accept(mean + noise @ root.T, log_ratio))
                 continue
-            # Random-walk proposals, which are symmetric.
+            # Even steps have random-walk proposals, which are symmetric.
             moved = self.particles.thetas + scale * noise @ root.T
             rate = self._accept(moved, np.zeros(len(noise)))
             rates.append(rate)
@@ -222,7 +226,7 @@ class BatchedKernel(SMC_KERNEL):
         self.n_steps = step
 
     def _accept(self, thetas: Floats, log_ratio: Floats) -> float:
-        """Accept or reject, given the log ratio of the proposal's densities there and back."""
+        """Accept or reject, given the log ratio of the proposal's densities in both directions."""
         current, proposed = self.particles, self._evaluate(thetas)
         with np.errstate(invalid="ignore"):
             tempered = self.beta * (proposed.log_likelihood - current.log_likelihood)
@@ -252,7 +256,7 @@ class BatchedKernel(SMC_KERNEL):
         """Return the state that the next stage depends on."""
         note = {name: getattr(self, name) for name in _STATE}
         note["generator"] = self.rng.bit_generator.state
-        # Evaluations so far determine random responses.
+        # Random responses depend on the number of evaluations so far.
         note["evaluations"] = [node.bound.draws for node in self.evaluator.nodes]
         return self.particles._asdict(), note
 
@@ -300,13 +304,14 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
                 f"start: {name}: got shape {value.shape}, expected {expected}, a value for each "
                 "particle"
             )
-    # Variables in their own units first; the initial point replaces transformed ones.
+    # Transform the variables in their own units first. The initial point stands for those that are
+    # given as transformed values.
     initial = hyperparameters.constrained(hyperparameters.initial[None])
     own_units = [
         np.broadcast_to(values.get(name, initial[name]), (draws, *shape))
         for name, shape in rv_shapes.items()
     ]
-    with np.errstate(all="ignore"):  # values outside the support are refused below
+    with np.errstate(all="ignore"):  # because values outside the support are refused below
         thetas = hyperparameters.thetas_of(own_units)
     first = 0
     for name, shape in hyperparameters.shapes.items():
@@ -324,16 +329,16 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
     return thetas
 
 
-_FORMAT = 6  # of the content of a file; files of other formats are refused
+_FORMAT = 6  # version of a file's content; files of other versions are refused
 _DIGEST = hashlib.sha256
 
 
 class Checkpoint:
     """Arrays and a JSON note in one netCDF file, which each save replaces at once.
 
-    ``settings`` are what the draws depend on besides the problem; an ``entropy`` of None is that of
-    the file, or a new one. A file that cannot be read, or of another problem or settings, raises
-    StoreError and remains as it is.
+    The draws depend on the problem and on ``settings``. An ``entropy`` of None is replaced by that
+    of the file, or by a new one. A file that cannot be read, or of another problem or settings,
+    raises StoreError and remains as it is.
     """
 
     def __init__(
@@ -344,19 +349,11 @@ class Checkpoint:
         self.settings = dict(settings)
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
-        self.digest = b""  # of the file as this run has read or written it last
+        self.digest = b""  # digest of the file as this run has read or written it last
         if self.path.exists():
             self._read()
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = str(np.random.SeedSequence().entropy)
-
-    def arrays_of(self, prefix: str) -> dict[str, Floats]:
-        """Return the arrays whose names begin with a prefix, by the rest of their names."""
-        return {
-            name.removeprefix(prefix): array
-            for name, array in self.arrays.items()
-            if name.startswith(prefix)
-        }
 
     def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Replace the file; it is safe on disk when this returns."""
@@ -371,13 +368,13 @@ class Checkpoint:
             "note": json.dumps(note),
         }
         data = xr.Dataset(variables, attrs=attributes)
-        # Made in memory: HDF5 may end the process where the disk is full.
+        # Build the file in memory, because HDF5 may end the process if the disk is full.
         content = bytes(data.to_netcdf(engine="h5netcdf"))
         digest = _DIGEST(content).digest()
         if self.path.exists() and self.path.read_bytes()[-len(digest) :] != self.digest:
             raise StoreError(self._refusal("belongs to another run, which is writing to it"))
         try:
-            # netCDF allows bytes after its end.
+            # The digest follows the netCDF data, whose readers ignore bytes after its end.
             replace_files({self.path: content + digest}, "checkpoint")
         except OSError as error:
             raise StoreError(error.strerror) from error
@@ -388,7 +385,7 @@ class Checkpoint:
             sealed = self.path.read_bytes()
             size = len(sealed) - _DIGEST().digest_size
             content = sealed[: max(size, 0)]
-            # HDF5 may hang on a damaged file.
+            # Compare the digest before reading, because HDF5 may hang on a damaged file.
             if _DIGEST(content).digest() != sealed[len(content) :]:
                 raise ValueError("it is damaged, or of another version: no digest at its end")
             with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as file:

@@ -13,7 +13,6 @@ import xarray as xr
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, called, flag
 from prbayes.inference.checks.population import failing_share
-from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import (
     arviz_attributes,
     as_attribute,
@@ -34,24 +33,27 @@ from prbayes.model.measurement import specimen_labels
 from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
+from prbayes.optimize.optimum import by_simulator, simulator_records
 from prbayes.propagation.base import MAX_LOST
 from prbayes.response.outputs import is_missing
 
-_BY_DRAW = ["chain", "draw", "simulator"]
+AT_BEST = ("discrepancy_error", "lost_mass_at_best", "failed_mass_at_best")
 
 
 @dataclass(frozen=True, eq=False)
 class Chains:
     """Chains of draws with the diagnostics of their sampler."""
 
-    thetas: Floats  # (chains, draws, d)
-    sampler: Mapping[str, Any]  # attributes: the name of the sampler, and diagnostics
+    thetas: Floats  # (chains, draws, d): draws in unconstrained space
+    sampler: Mapping[str, Any]  # attributes of the result: name of the sampler, and diagnostics
     sample_stats: xr.Dataset
-    log_likelihood: Floats | None = None  # (chains, draws), up to a constant; None by specimen
-    discrepancies: Floats | None = None  # (chains, draws, k); NaN if they would cost responses
+    # (chains, draws): log-likelihood up to a constant; None for log-likelihoods by specimen
+    log_likelihood: Floats | None = None
+    # (chains, draws, k): discrepancies; NaN if they would cost responses
+    discrepancies: Floats | None = None
     lost: Floats | None = None  # (chains, draws, k): share without response; NaN if stored
-    # By simulator, at the best draw: error of the discrepancy, and lost and failed shares of the
-    # population.
+    # Error of the discrepancy, and lost and failed shares of the population, at the best draw: the
+    # numbers `AT_BEST` by simulator.
     at_best: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
 
@@ -104,86 +106,58 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 
 
 def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
-    """Return figures and settings of the simulators, by draw and over all draws."""
-    nodes = evaluator.nodes
+    """Return figures and settings of the simulators, by draw and over all draws.
+
+    Log-likelihoods by specimen are the last; their discrepancies are minus log-likelihoods.
+    """
+    records = simulator_records(evaluator)
     n_chains, n_draws, d = chains.thetas.shape
-    keys = ("weight_ess", "mean_weight", "lost_mass", "failed_mass")
-    by_draw = {key: np.full((n_chains, n_draws, len(nodes)), np.nan) for key in keys}
-    by_draw["lost_mass"][:] = chains.lost  # without a design
-    supports = evaluator.support(chains.thetas.reshape(-1, d))
-    for k, node in enumerate(nodes):
+    rows = chains.thetas.reshape(-1, d)
+    keys = ("discrepancy", "weight_ess", "mean_weight", "lost_mass", "failed_mass")
+    by_draw = {key: np.full((n_chains, n_draws, len(records)), np.nan) for key in keys}
+    discrepancies, lost = by_draw["discrepancy"], by_draw["lost_mass"]
+    n_nodes = len(evaluator.nodes)
+    discrepancies[:, :, :n_nodes] = chains.discrepancies
+    lost[:, :, :n_nodes] = chains.lost  # shares of populations without a design
+    supports = evaluator.support(rows)
+    unknown = dict.fromkeys(("lossy_draws", "required_ess", *AT_BEST), np.nan)
+    for k, node in enumerate(evaluator.nodes):
+        bound = node.bound
         for key, values in supports.get(node.name, {}).items():
             by_draw[key][:, :, k] = values.reshape(n_chains, n_draws)
-    lost = by_draw["lost_mass"]
-    bounds = [node.bound for node in nodes]
-    designs = [node.reweighted for node in nodes]
-    at_best = [chains.at_best.get(node.name, {}) for node in nodes]
-    by_simulator = {
-        "lossy_draws": [
-            share_of_lossy(lost[:, :, k], bound.max_lost) for k, bound in enumerate(bounds)
-        ],
-        "discrepancy_error": [values.get("discrepancy_error", np.nan) for values in at_best],
-        "lost_mass_at_best": [values.get("lost_mass", np.nan) for values in at_best],
-        "failed_mass_at_best": [values.get("failed_mass", np.nan) for values in at_best],
-        "epsilon": evaluator.epsilon,
-        "required_ess": [np.nan if bound is None else bound.required_ess for bound in designs],
-        "max_lost": [bound.max_lost for bound in bounds],
-        "metric": [without_addresses(node.metric) for node in nodes],
-        "compared": [components_summary(node.target) for node in nodes],
-        "propagation": [without_addresses(node.propagation) for node in nodes],
-        "n_points": [bound.n_points for bound in bounds],
-        "n_runs": [bound.n_runs for bound in bounds],
-        "is_likelihood": np.zeros(len(nodes), dtype=int),
-    }
+        records[k] |= unknown | {
+            "lossy_draws": share_of_lossy(lost[:, :, k], bound.max_lost),
+            "epsilon": node.epsilon_value,
+            "max_lost": bound.max_lost,
+            "propagation": without_addresses(node.propagation),
+            "n_points": bound.n_points,
+            **chains.at_best.get(node.name, {}),
+        }
+        if node.reweighted is not None:
+            records[k]["required_ess"] = node.reweighted.required_ess
+    if evaluator.measurements:
+        failing = failing_share(evaluator, rows.mean(axis=0))
+        log_likelihoods = specimen_log_likelihoods(evaluator, rows)
+    for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
+        name = measurement.name
+        discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=1).reshape(n_chains, n_draws)
+        records[k] |= unknown | {
+            "epsilon": 1.0,
+            "failing_share": failing.get(name, np.nan),
+            "max_lost": MAX_LOST,
+            "propagation": f"emulator of {records[k]['n_runs']} runs",
+            "n_points": prepared(likelihood_of(evaluator, measurement)).points.log_a.size,
+        }
     coords = {
-        "simulator": [node.name for node in nodes],
         "element": evaluator.hyperparameters.names,
         "chain": np.arange(n_chains),
         "draw": np.arange(n_draws),
     }
     variables = {
-        "discrepancy": (_BY_DRAW, chains.discrepancies),
         "theta": (["chain", "draw", "element"], chains.thetas),
-        **{key: (_BY_DRAW, values) for key, values in by_draw.items()},
-        **{key: ("simulator", values) for key, values in by_simulator.items()},
+        **{key: (["chain", "draw", "simulator"], values) for key, values in by_draw.items()},
     }
-    by_metric = xr.Dataset(variables, coords=coords)
-    if not evaluator.likelihoods:
-        return by_metric
-    return xr.concat(
-        [by_metric, _by_specimen(evaluator, chains.thetas, by_metric)],
-        "simulator",
-        data_vars="minimal",
-        coords="minimal",
-        compat="override",
-        join="outer",
-    )
-
-
-def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) -> xr.Dataset:
-    """Return the same variables of log-likelihoods by specimen, as minus discrepancies."""
-    chains, draws, d = thetas.shape
-    measurements = evaluator.measurements
-    values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
-    names = [m.name for m in measurements]
-    discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
-    preparations = [prepared(likelihood_of(evaluator, m)) for m in measurements]
-    n_runs = [len(preparation.emulation.z) for preparation in preparations]
-    failing = failing_share(evaluator, thetas.reshape(-1, d).mean(axis=0))
-    by_simulator = {
-        "epsilon": np.ones(len(names)),
-        "failing_share": [failing.get(name, np.nan) for name in names],
-        "max_lost": np.full(len(names), MAX_LOST),
-        "metric": [without_addresses(m.metric) for m in measurements],
-        "compared": [""] * len(names),
-        "propagation": [f"emulator of {n} runs" for n in n_runs],
-        "n_points": [preparation.points.log_a.size for preparation in preparations],
-        "n_runs": n_runs,
-        "is_likelihood": np.ones(len(names), dtype=int),
-    }
-    variables: dict[str, Any] = {key: ("simulator", x) for key, x in by_simulator.items()}
-    variables["discrepancy"] = (_BY_DRAW, discrepancies.reshape(chains, draws, -1))
-    return xr.Dataset(variables, coords={**by_metric.coords, "simulator": names})
+    return by_simulator(records).assign_coords(coords).assign(variables)
 
 
 def share_of_lossy(lost: Floats, max_lost: float) -> float:
@@ -249,7 +223,8 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     )
     return xr.Dataset(
         {
-            # ArviZ functions that need a number for each observation show these names.
+            # The names explain themselves, because ArviZ functions that need a number for each
+            # observation show them.
             "one_number_for_all_specimens": (
                 dims,
                 (chains.log_likelihood - other_terms).reshape(shape),
@@ -271,7 +246,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
         name = likelihood.measurements[-1].name
         dim = str(observed[name].dims[0])
         labels = specimen_labels(likelihood)
-        if labels is not None:  # by specimen, not by reading
+        if labels is not None:  # the numbers are those of specimens, not of readings
             dim = f"{name}_specimen"
             coords[dim] = labels
         variables[name] = (["chain", "draw", dim], values[name].reshape(n_chains, n_draws, -1))
@@ -314,7 +289,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
             if not valid.size:
                 continue
             values, weights = node.bound.populations([parent[valid] for parent in parents])
-            points = values[0]  # of all populations
+            points = values[0]  # responses that all populations share
             cumulative = np.cumsum(np.where(is_missing(points), 0.0, weights), axis=1)
             for place, row in zip(first + valid, cumulative, strict=True):
                 if row[-1] > 0:

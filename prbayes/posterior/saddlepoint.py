@@ -19,9 +19,8 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
@@ -36,7 +35,7 @@ from prbayes.model.evaluator import Evaluator, coarser_evaluator
 from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
-from prbayes.optimize.optimum import Optimum, optima_of
+from prbayes.optimize.optimum import Optimum, element_order, optima_of
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,13 @@ class SaddlepointOptions:
     iterations: int = 40  # largest number of Newton steps
     tolerance: float = 1e-5  # largest gradient by specimen, in standard deviations of the score
     # Smallest determinant of the tilted covariance, to the power of one over its dimension,
-    # relative to that at the estimate. Below, the tilted distribution is nearly one atom.
+    # relative to that at the estimate. Below this limit the tilted distribution is nearly a single
+    # atom.
     smallest_variance: float = 1e-4
-    smallest_value: float = -1000.0  # of the cumulant function; below, the density is zero
-    smallest_eigenvalue: float = 1e-6  # of the correlation matrix of scores that vary
+    # value of the cumulant function below which the density is zero
+    smallest_value: float = -1000.0
+    # smallest eigenvalue of the correlation matrix of scores that vary
+    smallest_eigenvalue: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -58,18 +60,21 @@ class EstimateLikelihoodOptions:
 
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
-    # Times that metrics are minimised again, with whitening and bandwidth of the population at the
+    # Number of repeated minimisations with whitening and bandwidth of the population at the
     # previous estimate. With zero they are those of the observed data.
     rounds: int = 2
-    few_specimens: int = 10  # below, metrics of one output are minimised again as well
-    step: float = 1e-5  # of differences of log weights
-    wide_step: float = 0.05  # the same if the support of an input moves
-    resimulated_step: float = 1e-3  # of differences of responses that are computed at each theta
+    # number of specimens below which metrics of one output are minimised again as well
+    few_specimens: int = 10
+    step: float = 1e-5  # step of differences of log weights
+    wide_step: float = 0.05  # step of these differences if the support of an input moves
+    # step of differences of responses that are computed at each theta
+    resimulated_step: float = 1e-3
     # Smallest effective number of stored responses at the point of the score. An estimate at an
     # edge is moved inside until it is reached.
     effective_responses: float = 50.0
-    # Distance from the middle of the prior, beyond which an element may be at an edge; and smallest
-    # standard deviation of its likelihood score there, relative to the largest of all elements.
+    # Distance from the middle of the prior beyond which an element may be at an edge, and the
+    # smallest standard deviation of its likelihood score there, relative to the largest of all
+    # elements
     distance: float = 3.0
     smallest_spread: float = 1e-4
 
@@ -79,14 +84,14 @@ class EstimateLikelihood:
     """The likelihood given the estimate."""
 
     evaluator: Evaluator
-    # (M, d): the point of the score, which is the estimate, or a point inside if it is at an edge;
-    # and optima that are as good.
+    # (M, d): point of the score, then optima that are as good. The point is the estimate, or a
+    # point inside if the estimate is at an edge.
     starts: Floats
-    # By set of simulators that share specimens.
+    # scores of each group of simulators that share specimens
     groups: Sequence[StoredScores | ResimulatedScores]
     combinations: Floats  # (d, r): combinations of the scores that vary
     # (d,): unit of `laplace`: a standard deviation of the prior, or a hundred standard errors if
-    # these are less. With a prior far wider than the population, its unit would miss all data.
+    # these are less. The spread of a very wide prior would be a step past all data.
     scale: Floats
     options: SaddlepointOptions
 
@@ -109,12 +114,12 @@ class EstimateLikelihood:
 class StoredScores:
     """Scores of the stored responses of simulators that share specimens."""
 
-    simulator: int  # one of them
-    is_observable: NDArray[np.bool_]  # (M,): stored responses that all simulators can observe
-    values: Floats  # (M', d): scores of these
+    simulator: int  # index of one of the simulators
+    is_observable: Bools  # (M,): stored responses that all simulators can observe
+    values: Floats  # (M', d): scores of the observable responses
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)
-    rows: int  # populations whose weights stay in the cache of the processor
+    rows: int  # number of populations whose weights stay in the cache of the processor
 
     @cached_property
     def scores(self) -> Scores:
@@ -136,8 +141,9 @@ class StoredScores:
 class ResimulatedScores:
     """Scores of responses computed at each theta, of simulators that share specimens."""
 
-    tables: tuple[tuple[int, Floats, Callable[[Floats], Floats]], ...]  # simulator, unit, scores
-    mean: Floats  # (d,): of the observed specimens' scores
+    # index, unit and score function of each simulator
+    tables: tuple[tuple[int, Floats, Callable[[Floats], Floats]], ...]
+    mean: Floats  # (d,): mean of the observed specimens' scores
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)
     rows: int = 1
@@ -170,8 +176,9 @@ def estimate_likelihood(
     optima = optima_of(optimum, evaluator)
     point = move_inside(evaluator, optima[0], options)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
-    # Whitening or bandwidths by few observed specimens would bias the estimate: if they happen to
-    # scatter little, the bandwidth is small and the weight in the sum of simulators large.
+    # Minimise again with whitening and bandwidths of the population. Those of few observed
+    # specimens would bias the estimate: if the specimens scatter little by chance, the bandwidth is
+    # small and the weight in the sum of simulators large.
     nodes = evaluator.nodes
     events = [node.target.event for node in nodes]
     fewest = min(len(node.observed) for node in nodes)
@@ -179,7 +186,7 @@ def estimate_likelihood(
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
     evaluator = coarser_evaluator(evaluator, point)
-    # The combinations of the scores that vary, by the populations at the point.
+    # Find the combinations of the scores that vary in the populations at the point.
     score_groups = [
         _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
@@ -189,7 +196,7 @@ def estimate_likelihood(
     untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
     size = sum(score.size for score in scores)
     combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
-    # A hundred standard errors of each element, or the prior's spread if it is less.
+    # The unit of an element is a hundred standard errors, or the prior's spread if it is less.
     hyperparameters = evaluator.hyperparameters
     is_stored = [node.bound.stored for node in nodes]
     if all(is_stored):
@@ -197,9 +204,7 @@ def estimate_likelihood(
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
         scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
     else:
-        names = optimum.evaluator.hyperparameters.names
-        order = [names.index(name) for name in hyperparameters.names]
-        errors = np.sqrt(np.diag(optimum.covariance))[order]
+        errors = np.sqrt(np.diag(optimum.covariance))[element_order(optimum, evaluator)]
         scale = np.minimum(100 * errors, hyperparameters.prior_sd)
     return EstimateLikelihood(
         evaluator=evaluator,
@@ -214,7 +219,7 @@ def estimate_likelihood(
 def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
-    """Return metrics with whitening and bandwidths of the population, scales and minimiser."""
+    """Return metrics that are prepared on the population, with scales and minimiser."""
     from scipy.optimize import minimize as scipy_minimize
 
     targets = []
@@ -253,38 +258,34 @@ def _group_scores(
     numbers, total = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
-    observed = np.zeros((n, len(point)))
-    populations: list[WeightSlopes | ShiftedResponses] = []
-    functions = []
-    for k, node in zip(members, nodes, strict=True):
-        population = _derivatives(evaluator, k, point, options)
-        score = partial(
-            specimen_scores, node.target, population, options=options.score, total=total
-        )
-        # The gradient of the objective is a sum of these over specimens, in units of the prior.
-        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
-        observed += factor * score(node.observed[np.argsort(numbers[k])])
-        populations.append(population)
-        functions.append((factor, score))
-    mean = observed.mean(axis=0)
+    populations = [_derivatives(evaluator, k, point, options) for k in members]
+    functions = [
+        partial(specimen_scores, node.target, population, options=options.score, total=total)
+        for node, population in zip(nodes, populations, strict=True)
+    ]
+    # The gradient of the objective, in units of the prior, is the sum of these scores over
+    # specimens.
+    factors = [evaluator.hyperparameters.prior_sd / (n * scales[k]) for k in members]
+    parts = zip(members, nodes, factors, functions, strict=True)
+    observed = sum(
+        factor * score(node.observed[np.argsort(numbers[k])]) for k, node, factor, score in parts
+    )
+    mean = np.mean(observed, axis=0)
     identity = np.eye(len(point))
-    is_stored = [node.bound.stored for node in nodes]
-    if not all(is_stored):
+    if not all(node.bound.stored for node in nodes):
         tables = []
-        for k, (factor, _), population in zip(members, functions, populations, strict=True):
+        for k, node, factor, population in zip(members, nodes, factors, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
-            node = evaluator.nodes[k]
             table = tabulated_scores(node.target, population, node.observed, options.score, total)
             tables.append((k, factor, table))
         return ResimulatedScores(tuple(tables), mean, n, identity)
-    is_observable = np.ones(len(populations[0].responses), dtype=bool)
-    for node, population in zip(nodes, populations, strict=True):
-        is_observable &= observable(population.responses, node.target)
-    parts = [
-        factor * score(population.responses[is_observable])
-        for (factor, score), population in zip(functions, populations, strict=True)
-    ]
-    stored = sum(parts) - mean
+    responses = [population.responses for population in populations]
+    targets = [node.target for node in nodes]
+    is_observable = np.all(list(map(observable, responses, targets)), axis=0)
+    stored = -mean + sum(
+        factor * score(values[is_observable])
+        for factor, score, values in zip(factors, functions, responses, strict=True)
+    )
     rows = max(16, IN_CACHE // len(stored))
     return StoredScores(members[0], is_observable, stored, n, identity, rows)
 
@@ -304,8 +305,8 @@ def _derivatives(
         center, upper, lower = np.split(responses, ends)
         return ShiftedResponses(center[0], upper, lower, steps)
     center, up, down = np.split(weights, ends)
-    # Log weights are nearly parabolas, whose differences are right at any step. A weight that
-    # vanishes within the step has none.
+    # Difference the log weights, which are nearly parabolas, so that central differences are
+    # accurate at any step. Difference the weights themselves where one vanishes within the step.
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = center * (np.log(up) - np.log(down))
     differences = np.where(np.isfinite(relative), relative, up - down)
@@ -337,13 +338,13 @@ def _likelihood_spread(
 ) -> Floats:
     """Return changes of the populations over a prior standard deviation, (d,).
 
-    Of log weights, or of responses in units of their standard deviation.
+    The changes are those of log weights, or of responses in units of their standard deviation.
     """
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
         population = _derivatives(evaluator, k, theta, options)
         variance += population.spread**2
-    return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
+    return np.sqrt(variance) * evaluator.hyperparameters.prior_sd
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:
@@ -389,8 +390,8 @@ class Cumulants(NamedTuple):
     hessians: Floats
 
 
-# Tilts (A, r) and the rows (A,) that they belong to -> cumulant functions of these.
-CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
+# function of tilts, (A, r), and the rows that they belong to, (A,), that returns their cumulants
+CumulantFunction = Callable[[Floats, Indices], Cumulants]
 
 
 def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
@@ -406,7 +407,7 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
         largest = exponents.max(axis=1)
         exponents -= largest[:, None]
         weights = np.exp(exponents, out=exponents)
-        # The smaller matrix first: half of the time.
+        # The product with the smaller matrix first takes half of the time.
         sums = (score.powers @ weights.T).T
         totals = sums[:, :1]
         means, products = np.split(sums[:, 1:] / totals, [r], axis=1)
@@ -433,7 +434,7 @@ def saddlepoint_density(
     limit = options.tolerance * size
     converged = np.linalg.norm(state.gradients, axis=1) < limit
     for _ in range(options.iterations):
-        # Without a minimum, values fall and tilts grow without end.
+        # Leave out functions without a minimum, whose values fall without end.
         rows = np.flatnonzero(~converged & (state.values > options.smallest_value))
         if rows.size == 0:
             break
@@ -464,7 +465,7 @@ def log_density(
         return result
     supported = [logs[is_supported] for logs in log_weights]
 
-    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+    def function(tilts: Floats, rows: Indices) -> Cumulants:
         return cumulants([logs[rows] for logs in supported], scores, tilts)
 
     shape = len(supported[0]), scores[0].values.shape[1]
@@ -477,7 +478,8 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     """Return the standardised combinations of scores that vary, (d, r), by their covariance.
 
     A hyperparameter without influence has a score of zero, and two that only act together have
-    proportional scores. Neither enters the density: their posterior is their prior given the rest.
+    proportional scores. Neither enters the density, so that their posterior is their prior given
+    the others.
     """
     tolerance = options.smallest_eigenvalue
     spread = np.sqrt(np.diag(covariance))
@@ -487,4 +489,4 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     scaling = np.diag(1 / np.where(varies, spread, 1.0))[:, varies]
     eigenvalues, vectors = np.linalg.eigh(scaling.T @ covariance @ scaling)
     is_large = eigenvalues > tolerance
-    return np.asarray(scaling @ (vectors[:, is_large] / np.sqrt(eigenvalues[is_large])))
+    return scaling @ (vectors[:, is_large] / np.sqrt(eigenvalues[is_large]))

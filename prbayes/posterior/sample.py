@@ -18,17 +18,13 @@ from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
+from prbayes.numerics.modes import Laplace, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior import smc
-from prbayes.posterior.importance import (
-    ImportanceOptions,
-    Laplace,
-    importance_sample,
-    laplace,
-)
+from prbayes.posterior.importance import ImportanceOptions, importance_sample
 from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
 from prbayes.posterior.target import (
@@ -186,32 +182,19 @@ def modes_of(target: Target) -> list[Laplace] | None:
     starts = target.starts
     try:
         if len(starts) > 1:
-            # Starts on the way to the same mode continue as one.
+            # Continue once from starts that are on the way to the same mode.
             rough = laplace(target.log_posterior, starts, target.scale, steps=6)
-            starts = np.stack([mode.mode for mode in _distinct(rough)])
+            starts = np.stack([mode.mode for mode in distinct_modes(rough)])
         candidates = laplace(target.log_posterior, starts, target.scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
     highest = max(mode.log_mass for mode in candidates)
     modes = [
         mode
-        for i, mode in enumerate(_distinct(candidates))
+        for i, mode in enumerate(distinct_modes(candidates))
         if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
     ]
-    return modes or None  # populations that shrink to a point have no mass
-
-
-def _distinct(modes: list[Laplace]) -> list[Laplace]:
-    """Return the modes, best ones first, that are half a standard deviation from better ones."""
-    distinct: list[Laplace] = []
-    for mode in sorted(modes, key=lambda mode: (not mode.converged, -mode.log_mass)):
-        distances = [
-            np.abs(mode.mode - better.mode) / np.sqrt(np.diag(better.covariance))
-            for better in distinct
-        ]
-        if all(distance.max() > 0.5 for distance in distances):
-            distinct.append(mode)
-    return distinct
+    return modes or None  # None, because populations that shrink to a point have no mass
 
 
 def importance_chains(
@@ -251,7 +234,7 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    # A step that overflows is a divergence.
+    # A step that overflows is a divergence, and not an error.
     with evaluator.model, np.errstate(over="ignore"):
         idata = pm.sample(
             settings.draws,
@@ -267,7 +250,7 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     posterior = idata["posterior"].to_dataset()
     if settings.chains > 1:
         r_hat = import_module("arviz").rhat(posterior).to_array().max()
-        if not r_hat <= 1.1:  # chains in different modes
+        if not r_hat <= 1.1:  # because chains are in different modes
             return None
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])

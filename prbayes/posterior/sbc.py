@@ -32,7 +32,8 @@ from prbayes.posterior.smc import Adjustment, SamplingSettings, require_adjustme
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 
-# Data sets that a worker analyses in seconds; sending the model takes milliseconds.
+# Number of data sets of a job. A worker analyses them in seconds, and sending the model takes
+# milliseconds.
 _CHUNK = 10
 
 
@@ -177,7 +178,7 @@ class Ranks(Tree):
     _parts = ("prior_sbc", "envelope", "truth", "posterior_sd")
 
     def to_dataframe(self) -> Any:
-        """Return a row for each variable: the mean and sd of its ranks, and the envelope's word."""
+        """Return a row for each variable: mean and sd of its ranks, and the envelope's verdict."""
         import pandas as pd
 
         ranks = self["prior_sbc"].to_dataset()
@@ -211,7 +212,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and variables outside of it."""
     from arviz_stats.ecdf_utils import ecdf_pit
 
-    prob = 0.95  # as in ArviZ's own pictures of ranks
+    prob = 0.95  # that of ArviZ's own pictures of ranks
     ecdfs, outside = {}, []
     values = {name: variable[0] for name, variable in ranks.data_vars.items()}
     for name, column in split_elements(values).items():
@@ -233,7 +234,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     return envelope, outside
 
 
-# Ranks, truths and standard deviations by variable; or an error message.
+# ranks, truths and standard deviations by variable, or an error message
 _Result = dict[str, Floats] | str
 
 
@@ -267,7 +268,7 @@ def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dic
     theta = hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
     data = fresh_data(evaluator, theta[0], rng) if evaluator.nodes else {}
     values = hyperparameters.constrained(theta)
-    # With a likelihood by specimen the emulator is the response.
+    # With a log-likelihood by specimen the emulator stands for the response.
     pools = [
         specimen_pool(likelihood, values, rng, size=len(likelihood.readings))
         for likelihood in evaluator.likelihoods
@@ -280,7 +281,7 @@ def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dic
     for name, (truth,) in hyperparameters.constrained(theta).items():
         values = np.asarray(posterior[name])[0]
         below = (values < truth).sum(axis=0)
-        # At random between the two neighbours: ranks are continuous.
+        # A random position between the two neighbouring draws makes ranks continuous.
         rank = (below + rng.random(np.shape(below))) / (settings.draws + 1)
         row[name] = np.stack([rank, truth, values.std(axis=0)])
     return row

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from os import PathLike
 from typing import Any, Literal
 
@@ -34,14 +35,15 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
 from prbayes.model.specimen_preparation import prepared
+from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
-from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.results import (
+    AT_BEST,
     Chains,
     arviz_groups,
     as_multitrace,
@@ -253,6 +255,10 @@ class SamplingSettings:
     progressbar: bool = False
     with_groups: bool = False  # whether the result has the groups of `arviz_groups`
 
+    def is_pseudo(self, evaluator: Evaluator) -> bool:
+        """Return whether draws are those of the pseudo-posterior exp(-discrepancy / epsilon)."""
+        return bool(evaluator.nodes) and self.adjustment is None
+
 
 def require_adjustment(adjustment: object) -> None:
     """Raise unless it is "estimate" or None."""
@@ -278,7 +284,7 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
 
 def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     if settings.epsilon is not None and not is_pseudo:
         raise ValueError(
             f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
@@ -320,7 +326,7 @@ def result_of(
     clock: float,
 ) -> xr.DataTree:
     """Return the DataTree of chains, with discrepancies if these cost no response."""
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     findings: list[Finding] = []
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
@@ -346,7 +352,7 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            # Draws are as wide as few specimens make them, unlike standard errors.
+            # Leave out few-specimens, because draws are as wide as few specimens make them.
             findings += [f for f in optimum.findings if f.code != "few-specimens"]
             if evaluator.nodes and not is_pseudo:
                 findings += prior_conflicts(optimum, evaluator, thetas)
@@ -365,14 +371,14 @@ def result_of(
         return posterior_tree(evaluator, chains, attrs, groups)
 
 
-def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
-    """Return the share without response, (chains, draws, k), at some draws.
+def _lost_of_some(evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the share without response, (chains, draws, k), at 64 draws.
 
-    NaN at others, and of simulators with stored responses.
+    It is NaN at other draws, and for simulators with stored responses.
     """
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
-    rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
+    rows = np.linspace(0, chains * draws - 1, 64).astype(np.intp)
     try:
         for row in np.unique(rows):
             place = np.unravel_index(row, (chains, draws))
@@ -392,13 +398,13 @@ def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
     shares = {}
     findings = []
     for k, node in enumerate(evaluator.nodes):
-        shares[node.name] = chains.at_best.get(node.name, {}).get("lost_mass", 0.0)
+        shares[node.name] = chains.at_best.get(node.name, {}).get("lost_mass_at_best", 0.0)
         if np.isnan(lost[:, :, k]).all():
             continue
         shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
         limit = node.bound.max_lost
         share = share_of_lossy(lost[:, :, k], limit)
-        if share > 0.05:  # a few draws may be far out
+        if share > 0.05:  # because a few draws may be far out
             findings.append(
                 Finding(
                     "lost-mass",
@@ -460,7 +466,8 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
         for k, node in enumerate(evaluator.nodes):
             error = discrepancy_error(node.bound, evaluator.parents(best[None], k))
             masses = missing_mass(evaluator, best, k)
-            at_best[node.name] = {"discrepancy_error": error, **masses}
+            numbers = (error, masses["lost_mass"], masses["failed_mass"])
+            at_best[node.name] = dict(zip(AT_BEST, numbers, strict=True))
     except BudgetError as spent:
         return replace(chains, stopped=chains.stopped or str(spent))
     return replace(chains, at_best=at_best)
@@ -484,7 +491,7 @@ def _chains_on_designs(
             content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
             stored["start"] = hashlib.sha256(content).hexdigest()
         checkpoint = Checkpoint(settings.checkpoint, identity_of(evaluator), stored)
-        # A run without a seed takes that of the run that it continues.
+        # A run without a seed has the seed of the run that it continues.
         entropy = int(checkpoint.settings["entropy"])
     seeds = np.random.SeedSequence(entropy)
     refinements: list[Floats] = []
@@ -547,7 +554,7 @@ def run_chains(
     budget is spent before the first chain is finished.
     """
     saved = [] if checkpoint is None else _saved_states(checkpoint, len(refinements))
-    states: list[State] = []  # of the kernels of finished chains
+    states: list[State] = []  # states of the kernels of finished chains
     stopped = ""
     with shown(settings.progressbar), progress("SMC stages") as advance:
         for chain, seed in enumerate(seeds):
@@ -581,7 +588,7 @@ def run_chains(
     particles, notes = zip(*states, strict=True)
     arrays = {name: np.array([of_chain[name] for of_chain in particles]) for name in particles[0]}
     stats, evidence = _stage_statistics([note["stages"] for note in notes])
-    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    is_pseudo = settings.is_pseudo(evaluator)
     return Chains(
         thetas=arrays["thetas"],
         sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC", **evidence},
@@ -596,8 +603,13 @@ def _saved_states(checkpoint: Checkpoint, round_: int) -> list[State]:
     """Return the states of the kernels that have begun in this round of refinement."""
     if checkpoint.note.get("round") != round_:
         return []
-    notes = checkpoint.note["states"]
-    return [(checkpoint.arrays_of(f"chain{i}_"), note) for i, note in enumerate(notes)]
+    states = []
+    for i, note in enumerate(checkpoint.note["states"]):
+        prefix = f"chain{i}_"
+        arrays = checkpoint.arrays.items()
+        of_chain = {k.removeprefix(prefix): v for k, v in arrays if k.startswith(prefix)}
+        states.append((of_chain, note))
+    return states
 
 
 def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence[Floats]) -> None:
@@ -610,18 +622,16 @@ def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence
 
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
-    """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
-    n_stages = max(len(stages["beta"]) for stages in chains)
+    """Return statistics by chain and stage, NaN after the last stage, and the mean evidence."""
     variables = {}
     for name in chains[0]:
-        table = np.full((len(chains), n_stages), np.nan)
-        for row, stages in zip(table, chains, strict=True):
-            row[: len(stages[name])] = stages[name]
-        variables[name] = (["chain", "stage"], table)
-    coords = {"chain": np.arange(len(chains)), "stage": np.arange(n_stages)}
+        by_stage = zip_longest(*(stages[name] for stages in chains), fillvalue=np.nan)
+        variables[name] = (["stage", "chain"], np.array(list(by_stage), dtype=float))
+    statistics = xr.Dataset(variables).transpose("chain", "stage")
+    coords = {dim: np.arange(size) for dim, size in statistics.sizes.items()}
     logs = np.array([stages["log_marginal_likelihood"][-1] for stages in chains])
     evidence = {
         "log_marginal_likelihood": float(logsumexp(logs) - np.log(logs.size)),
         "log_marginal_likelihood_sd": float(logs.std(ddof=1)) if logs.size > 1 else np.nan,
     }
-    return xr.Dataset(variables, coords=coords), evidence
+    return statistics.assign_coords(coords), evidence

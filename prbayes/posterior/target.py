@@ -18,13 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.special import ndtri
 
 from prbayes._finding import Finding
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
@@ -32,10 +31,11 @@ from prbayes.inference.resampling import groups, observable, observed_set, sets_
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.points import farthest_rows, sobol
+from prbayes.numerics.modes import LogDensity, far_apart, laplace
+from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
-from prbayes.optimize.optimum import Optimum, optima_of
-from prbayes.posterior.importance import LogDensity, importance_sample, laplace
+from prbayes.optimize.optimum import Optimum, element_order, optima_of
+from prbayes.posterior.importance import importance_sample
 from prbayes.posterior.saddlepoint import (
     Cumulants,
     EstimateLikelihood,
@@ -53,7 +53,7 @@ class Target:
     """A posterior density in unconstrained space."""
 
     evaluator: Evaluator
-    log_likelihood: LogDensity  # all terms but the priors
+    log_likelihood: LogDensity  # sum of all terms except the priors
     starts: Floats  # (M, d): points near the modes
     scale: Floats  # (d,): unit of each element for `laplace`
 
@@ -70,14 +70,13 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
     thetas = evaluator.hyperparameters.prior_points(1024, 0)
     order = np.argsort(-target.log_posterior(thetas), kind="stable")
-    candidates = thetas[order[: len(thetas) // 4]] / prior_sd
-    return replace(target, starts=candidates[farthest_rows(candidates, 8)] * prior_sd)
+    return replace(target, starts=far_apart(thetas[order[: len(thetas) // 4]], 8, prior_sd))
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     """Return the posterior given the metrics' own estimate, by scores or refits, or raise.
 
-    The log-density of data sheets is a likelihood itself.
+    For data sheets the log-density of the metric is the likelihood.
     """
     require_density(evaluator)
     if evaluator.nodes[0].metric.exact_likelihood:
@@ -130,17 +129,13 @@ def require_density(evaluator: Evaluator) -> None:
         )
 
 
-def prior_conflicts(
-    optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
-) -> tuple[Finding, ...]:
+def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> tuple[Finding, ...]:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
+    size = 4096
     comparable = [mode["comparable"] for mode in optimum.local_optima]
     if optimum.search.prior or any(comparable):
         return ()
-    order = [
-        optimum.evaluator.hyperparameters.names.index(name)
-        for name in evaluator.hyperparameters.names
-    ]
+    order = element_order(optimum, evaluator)
     covariance = optimum.covariance[np.ix_(order, order)]
     is_identified = np.isfinite(np.diag(covariance))
     if not is_identified.any():
@@ -164,27 +159,29 @@ def prior_conflicts(
 class RefitLikelihoodOptions:
     """Options of the likelihood given an estimate, from refits."""
 
-    n_sets: int = 1024  # synthetic data sets
-    # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
-    # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
+    n_sets: int = 1024  # number of synthetic data sets
+    # Number of rounds that share the data sets. The first round draws in a ball of ``radius``
+    # standard errors around the estimate, later rounds from the previous posterior, ``inflation``
+    # times wider.
     rounds: int = 2
     radius: float = 4.0
     inflation: float = 1.5
-    weakest: float = 10.0  # standard error in prior sd up to which a direction is identified
-    # The same, above which an estimate may be near an edge: there, as at a standard deviation of
-    # zero, estimates of data sets pile up.
+    # largest standard error of an identified direction, in prior standard deviations
+    weakest: float = 10.0
+    # Standard error, in prior standard deviations, above which an estimate may be near an edge.
+    # Estimates of data sets pile up there, as at a standard deviation of zero.
     weak: float = 0.5
     # Squared distance of the observed estimate from its mean, in standard deviations, at which the
     # normal distribution takes over.
     tail: float = 40.0
-    # Number of data sets, for each element of the estimate and one more, that a standard error
-    # counts for in the moments.
+    # Number of data sets, for each element of the estimate and one more, that the standard error
+    # weighs in the moments
     prior_sets: float = 1.0
     reach: float = 10.0  # largest distance of an estimate from the observed one, in standard errors
-    far: float = 0.1  # largest share of estimates beyond
+    far: float = 0.1  # largest share of estimates beyond the reach
     converged: float = 0.9  # smallest share of refits that converge
-    # Times that metrics of several outputs are minimised again, whitened by the population at the
-    # previous estimate.
+    # Number of repeated minimisations of metrics of several outputs, whitened by the population at
+    # the previous estimate
     whitenings: int = 2
     seed: int = 0
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
@@ -195,15 +192,16 @@ class RefitLikelihood:
     """The likelihood given the estimate, for `importance_sample` and `laplace`."""
 
     evaluator: Evaluator
-    # At the estimate and at optima that are as good; in coordinates of the continuation.
+    # sampling distributions at the estimate and at optima that are as good, in coordinates of the
+    # continuation
     centers: tuple[SamplingDistribution, ...]
     continuation: Continuation
     starts: Floats  # (M, d): thetas of the centers, moved within the ends of the prior
     scale: Floats  # (d,): unit of each element for `laplace`
     options: RefitLikelihoodOptions
-    # Synthetic data sets, none if the data identify nothing: specimens at the stored responses, by
-    # group (R, M_j); estimates in coordinates of the first center, (R, r); and log-densities in the
-    # mixture of all populations, (R,).
+    # Synthetic data sets, none if the data identify nothing: numbers of specimens at the stored
+    # responses, (R, M_j) by group; estimates in coordinates of the first center, (R, r); and log-
+    # densities in the mixture of all populations, (R,)
     counts: tuple[csr_array, ...] = ()
     estimates: Floats = field(default_factory=lambda: np.empty((0, 0)))
     log_mixture: Floats = field(default_factory=lambda: np.empty(0))
@@ -220,7 +218,7 @@ class RefitLikelihood:
         rows = max(16, IN_CACHE // max(largest, len(self.estimates)))
         for first in range(0, len(x), rows):
             block = x[first : first + rows]
-            # Log weights of the data sets, up to a constant of each row.
+            # logs: log weights of the data sets, up to a constant of each row
             logs = _log_likelihoods(sampling, self.counts, block) - self.log_mixture
             is_supported = np.isfinite(logs).any(axis=1)
             values = np.full(len(block), -np.inf)
@@ -233,9 +231,7 @@ class RefitLikelihood:
         return result
 
 
-def nearest(
-    centers: Sequence[SamplingDistribution], thetas: Floats
-) -> tuple[NDArray[np.intp], Floats]:
+def nearest(centers: Sequence[SamplingDistribution], thetas: Floats) -> tuple[Indices, Floats]:
     """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
     x = np.stack([center.coordinates(thetas) for center in centers])
     index = np.linalg.norm(x, axis=2).argmin(axis=0)
@@ -250,17 +246,17 @@ def extended_log_density(
     The weights are known up to a factor.
 
     The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
-    distribution with their moments. A few data sets with one standard error join the moments, which
-    matters if few of the synthetic ones have weights. ``shifts``, (S, r), are the populations
-    relative to the observed estimate.
+    distribution with their moments. A few data sets with a scatter of one standard error are added
+    to the moments, in case few of the synthetic ones have weights. ``shifts``, (S, r), are the
+    populations relative to the observed estimate.
     """
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
     untilted = cumulants([log_weights], scores, np.zeros_like(shifts))
-    log_weights = log_weights - untilted.values[:, None]  # they sum to one
+    log_weights = log_weights - untilted.values[:, None]  # so that the weights sum to one
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
     part = effective / (effective + options.prior_sets * (r + 1))
-    # Beyond all data sets the mean is as far away as the population.
+    # Scale the mean to the distance of the population where that is beyond all data sets.
     lengths = np.linalg.norm(untilted.gradients, axis=1)
     ratios = np.linalg.norm(shifts, axis=1) / np.maximum(lengths, 1e-300)
     factors = np.maximum(ratios, 1) ** (1 - part)
@@ -271,7 +267,7 @@ def extended_log_density(
     distance = (mean * standardised).sum(axis=1)
     share = part * np.exp(-distance / options.tail)
 
-    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+    def function(tilts: Floats, rows: Indices) -> Cumulants:
         empirical = cumulants([log_weights[rows]], scores, tilts)
         center, within = mean[rows], covariance[rows]
         linear = np.einsum("skl,sl->sk", within, tilts)
@@ -318,13 +314,15 @@ def refit_likelihood(
         sampling, rest = inside, []
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
-    # Identified directions are known from all stored responses; an eighth is enough for the rest.
+    # All stored responses have shown which directions are identified. An eighth of them suffices
+    # for the rest.
     theta = continuation.within(thetas[:1])[0]
     evaluator = coarser_evaluator(evaluator, theta)
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
-    # Prior standard deviations, or a hundred standard errors if these are less.
+    # The unit of an element is a prior standard deviation, or a hundred standard errors if these
+    # are less.
     errors = np.sqrt(((sampling.axes * sampling.stderr) ** 2).sum(axis=1))
     is_known = ~continuation.is_continued & (errors > 0)
     units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
@@ -339,7 +337,7 @@ def refit_likelihood(
     r = sampling.stderr.size
     if not r:
         return likelihood
-    # Data sets in balls around the centers, then around the posterior given these.
+    # Draw data sets in balls around the centers first, then around the posterior given these.
     number = options.n_sets // options.rounds
     balls = [
         sampling.coordinates(center.thetas(_points_of_ball(number // len(centers), r, options, i)))
@@ -410,7 +408,8 @@ def _draw(
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
     data, counts = sets_along(evaluator, thetas, rng)
-    # Populations at another optimum have their estimates near the first one.
+    # With several centers start from the first one, because populations at another optimum have
+    # their estimates near it.
     starts = x if len(centers) == 1 else np.zeros_like(x)
     if is_linear:
         estimates = sampling.linear_estimates(data)
@@ -486,7 +485,7 @@ def _moved_inside(
     """Return the distribution at a point inside if the estimate is near an edge, else None.
 
     Near an edge, as where a standard deviation is about zero, estimates pile up and have no
-    density. One linear step from a point inside has: in the variance such a step has no edge.
+    density. One linear step from a point inside has a density, because it may pass the edge.
     """
     evaluator, scales, theta = sampling.evaluator, sampling.scales, sampling.theta
     if needs_refits(evaluator):

@@ -29,6 +29,7 @@ from scipy.linalg import qr
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
+from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.threads import one_thread
 from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
@@ -352,12 +353,6 @@ def fit_normal(z: Floats, log_a: Floats, start: Any = None) -> Normal:
         if max(np.abs(change).max(), np.abs(shift).max()) < 1e-9:
             break
     return mean, np.linalg.cholesky(covariance)
-
-
-def normalised_weights(log_w: Floats) -> Floats:
-    """Return weights with sum 1 along the last axis."""
-    weights = np.exp(log_w - log_w.max(axis=-1, keepdims=True))
-    return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:

@@ -34,7 +34,7 @@ def test_a_normal_population_has_its_mean_spread_and_tail() -> None:
         (prb.decision.StandardDeviation(doubled, x), 2 * sigma),
         (prb.decision.Quantile(doubled, x, probability=0.8), 2 * (mu + 0.8416 * sigma)),
     ):
-        np.testing.assert_allclose(sample.evaluate(quantity, found.thetas), expected, atol=0.02)
+        np.testing.assert_allclose(sample.evaluate(quantity.of, found.thetas), expected, atol=0.02)
     # Known responses are reused.
     assert sample.responses.count == sample.design.n_runs
     again = found.sample(sample.responses.function, (x,), None)
@@ -87,7 +87,7 @@ def test_quantities_have_the_error_of_their_computation() -> None:
             for p, z in ((1e-6, -4.7534), (0.01, -2.3263), (0.99, 2.3263), (1 - 1e-6, 4.7534))
         ),
     ):
-        (value,) = sample.evaluate(quantity, found.center[None])
+        (value,) = sample.evaluate(quantity.of, found.center[None])
         _, error = sample.checked_quantity(quantity)
         assert abs(value - expected) < 3 * error < 1.5
 

@@ -13,7 +13,8 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
-from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.numerics.modes import laplace
+from prbayes.posterior.importance import importance_sample
 from prbayes.posterior.target import Target
 
 LogPrior = Callable[[Floats, Floats], Floats]  # of mu and sigma

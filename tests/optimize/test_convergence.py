@@ -24,7 +24,7 @@ from prbayes.optimize.convergence import (
     overlapping_populations,
     settle,
 )
-from prbayes.optimize.objective import Method, Objective
+from prbayes.optimize.objective import Minimisation, Objective
 
 # -- budgets, tolerances, trace --------------------------------------------------------------------
 
@@ -179,7 +179,9 @@ def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -
             options: Any = {"gradient": gradient, "max_evaluations": most - spent}
             return Objective(alone, center, self.prior_sd, size, **options)
 
-    search = OfFunction(Evaluator.of(model()), np.ones(2), Method(), False, 1e-5, most)
+    search = OfFunction(
+        Evaluator.of(model()), np.ones(2), Minimisation(tolerance=1e-5, max_evaluations=most)
+    )
     end = np.array(at)
     value = float(function(end)[0])
     trace = Trace((end,), (value,), (count,), count)
@@ -258,12 +260,12 @@ def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
 @pytest.mark.parametrize("propagation", [prb.Reweighted(256), prb.Resimulated(256)], ids=["stored", "computed"])  # fmt: skip
 def test_a_start_with_overlap_is_kept(propagation: Any) -> None:
     evaluator = Evaluator.of(normal_model(propagation))
-    search = Search(evaluator, np.ones(2), Method(), False, 1e-6, 100)
+    search = Search(evaluator, np.ones(2), Minimisation(max_evaluations=100))
     theta = np.array([0.3, 0.0])
-    near, trace = approach(search, theta, np.ones(1), 0, Trace())
+    near, trace = approach(search, theta, np.ones(1), Trace())
     assert near is theta
     assert trace.count == 0
-    far, trace = approach(search, np.array([9.0, -1.0]), np.ones(1), 0, Trace())
+    far, trace = approach(search, np.array([9.0, -1.0]), np.ones(1), Trace())
     assert overlapping_populations(evaluator, far[None])[1].min() > 0.5
     assert trace.count > 0
 

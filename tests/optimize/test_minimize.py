@@ -26,7 +26,7 @@ from prbayes.optimize import minimize as minimization
 from prbayes.optimize.convergence import Fit, Result, Search
 from prbayes.optimize.design_refinement import Restart
 from prbayes.optimize.minimize import optimum_findings
-from prbayes.optimize.objective import Method, Ridge, initial_scales
+from prbayes.optimize.objective import Minimisation, Ridge, initial_scales
 from prbayes.propagation.importance import SIZES
 from prbayes.response.compile import PLAIN
 
@@ -619,7 +619,7 @@ def test_a_gradient_that_is_nan_is_differenced() -> None:
     value, gradient = evaluator.objective(prior=False, gradient=True)(theta, scales)
     assert np.isfinite(value)
     assert np.isnan(gradient).any()
-    search = Search(evaluator, prior_sd, Method(), False, 1e-6, 100)
+    search = Search(evaluator, prior_sd, Minimisation(max_evaluations=100))
     objective = search.objective(theta, scales, 1.0, 0, gradient=True)
     differenced, slope = objective(np.zeros(3))
     assert differenced == pytest.approx(value)

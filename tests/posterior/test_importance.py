@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
 from prbayes._validate import Floats
-from prbayes.posterior.importance import ImportanceOptions, importance_sample, laplace
+from prbayes.numerics.modes import laplace
+from prbayes.posterior.importance import ImportanceOptions, importance_sample
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -26,25 +26,6 @@ def two_modes(thetas: Floats) -> Floats:
     low = multivariate_normal([-4.0, 0.0], [1.0, 0.2]).logpdf(thetas)
     high = multivariate_normal([4.0, 1.0], [0.5, 1.0]).logpdf(thetas)
     return np.asarray(np.logaddexp(np.log(0.3) + low, np.log(0.7) + high))
-
-
-def test_laplace_is_exact_for_a_normal_density() -> None:
-    (mode,) = laplace(normal, MEAN[None] + [2.0, 1.0, -1.0], SCALE)
-    np.testing.assert_allclose(mode.mode, MEAN, atol=1e-3)
-    np.testing.assert_allclose(mode.covariance, COVARIANCE, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(mode.log_mass, 7.0, atol=1e-3)
-
-
-def test_a_direction_without_curvature_has_ten_times_the_scale() -> None:
-    (mode,) = laplace(lambda t: -0.5 * t[:, 0] ** 2, np.zeros((1, 2)), np.array([1.0, 2.0]))
-    np.testing.assert_allclose(np.sqrt(np.diag(mode.covariance)), [1.0, 20.0], rtol=1e-3)
-
-
-def test_laplace_refuses_the_end_of_a_support() -> None:
-    with pytest.raises(ValueError, match="not finite"):
-        laplace(
-            lambda t: np.where(t[:, 0] > 0, -t[:, 0], -np.inf), np.full((1, 1), 1e-3), np.ones(1)
-        )
 
 
 def test_moments_and_evidence_of_a_normal_density() -> None:

@@ -6,11 +6,10 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
@@ -23,17 +22,15 @@ from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import cross
 from prbayes.response.discrepancy import has_discrepancy
 
-IntArray = NDArray[np.intp]
-
 
 def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
-    """Name directions that the data identify less than the prior."""
+    """Name directions about which the data are less informative than the prior."""
     hidden = local.unidentified
     indirect = only_through_prior(evaluator)
     if indirect.any():
-        # One, or zero up to rounding for elements on which nothing depends.
+        # Singular values are one, or zero up to rounding of directions that only the prior informs.
         axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
-        hidden = np.asarray(axes[:, strength > 0.5])
+        hidden = axes[:, strength > 0.5]
     return unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
 
 
@@ -44,9 +41,9 @@ def unidentified_findings(
     *,
     has_bounds: bool = True,
 ) -> list[Finding]:
-    """Report directions that the data identify less than the prior, without excluded names.
+    """Report directions about which the data are less informative than the prior.
 
-    ``has_bounds``: bounds from one side were searched.
+    ``excluded`` names are left out. ``has_bounds`` is whether one-sided bounds were searched.
     """
     directions = [name for name in unidentified_names(evaluator, local) if name not in excluded]
     if not directions:
@@ -89,15 +86,13 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
     return findings
 
 
-def mixed_directions(
-    local: Local, coefficients: IntArray, inputs: IntArray, names: list[str]
-) -> str:
+def mixed_directions(local: Local, coefficients: Indices, inputs: Indices, names: list[str]) -> str:
     """Name unidentified directions of both blocks of elements; empty if there are none."""
     _, _, axes = np.linalg.svd(local.unidentified[coefficients])
     directions = [
         named_direction(direction, names)
         for direction in (local.unidentified @ axes.T).T
-        # A thousandth of the square is a thirtieth of a spread of the prior.
+        # A squared share of .001 is a thirtieth of a prior standard deviation.
         if min(float((direction[block] ** 2).sum()) for block in (coefficients, inputs)) > 0.001
     ]
     verb = "is" if len(directions) == 1 else "are"
@@ -105,14 +100,14 @@ def mixed_directions(
 
 
 def correlated_estimates(
-    local: Local, coefficients: IntArray, inputs: IntArray, names: list[str]
+    local: Local, coefficients: Indices, inputs: Indices, names: list[str]
 ) -> str:
     """Name the combinations with the largest correlation; empty if that is below .95.
 
     The variance of either is then ten times its variance with the other known.
     """
     by_data = local.identified @ np.linalg.pinv(local.covariance) @ local.identified.T
-    precision = np.asarray(by_data + np.eye(local.prior_sd.size))
+    precision = by_data + np.eye(local.prior_sd.size)
     correlation, *loadings = canonical_correlation(np.linalg.inv(precision), coefficients, inputs)
     if correlation < 0.95:
         return ""
@@ -124,7 +119,7 @@ def correlated_estimates(
 
 
 def canonical_correlation(
-    covariance: Floats, rows: IntArray, columns: IntArray
+    covariance: Floats, rows: Indices, columns: Indices
 ) -> tuple[float, Floats, Floats]:
     """Return the largest canonical correlation of two blocks, and the loadings in each."""
     first, second = (
@@ -133,7 +128,7 @@ def canonical_correlation(
     )
     between = first @ covariance[np.ix_(rows, columns)] @ second.T
     u, correlations, vt = np.linalg.svd(between)
-    # Loadings are the covariances of theta with the best combinations.
+    # The loadings are covariances of theta with the most correlated combinations.
     return (
         float(correlations[0]),
         np.linalg.solve(first, u[:, 0]),
@@ -141,21 +136,19 @@ def canonical_correlation(
     )
 
 
-def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[IntArray, IntArray]:
-    """Return the elements of theta above the coefficients only, and above other inputs only."""
+def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indices]:
+    """Return the elements that enter the discrepancy's coefficients only, and other inputs only."""
     if not has_discrepancy(node.bound.responses.function):
         return np.arange(0), np.arange(0)
     inputs, model = node.bound.inputs, evaluator.model
     *arguments, coefficients = range(len(inputs.arguments))
+    shapes = evaluator.hyperparameters.shapes.values()
+    sizes = [int(np.prod(shape, dtype=int)) for shape in shapes]
     above = []
     for numbers in ([coefficients], arguments):
         names = {rv.name for rv in inputs.parents_above(numbers)}
-        is_above: list[bool] = []
-        shapes = evaluator.hyperparameters.shapes.values()
-        for value, shape in zip(model.value_vars, shapes, strict=True):
-            size = int(np.prod(shape, dtype=int))
-            is_above += [model.values_to_rvs[value].name in names] * size
-        above.append(np.flatnonzero(is_above))
+        is_above = [model.values_to_rvs[value].name in names for value in model.value_vars]
+        above.append(np.flatnonzero(np.repeat(is_above, sizes)))
     return np.setdiff1d(above[0], above[1]), np.setdiff1d(above[1], above[0])
 
 
@@ -180,7 +173,7 @@ def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> li
 
 
 def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> list[Finding]:
-    """Report standard errors that are NaN, with the obstacle; by default the end of a support."""
+    """Report standard errors that are NaN. The default reason is the end of a support."""
     names = [name for name, errors in stderr.items() if np.isnan(errors).any()]
     if not names:
         return []
@@ -194,13 +187,14 @@ def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> l
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
     """Return whether no discrepancy changes around theta, as where populations miss the data."""
-    # In spreads of the prior: small enough to stay on a plateau, and large against rounding.
+    # A hundredth of the prior's spread is small enough to stay on a plateau, and large against
+    # rounding.
     step = 0.01 * evaluator.hyperparameters.prior_sd
     values = evaluator(cross(theta, step)).discrepancies
     with np.errstate(invalid="ignore"):
-        # 1e4 times the rounding of a sum in double precision.
+        # The limit is 1e4 times the rounding error of a sum in double precision.
         is_small = np.abs(values - values[0]) <= 1e-12 * np.abs(values[0])
-    # Infinite values are equal, although their difference is not zero.
+    # Compare for equality as well, because the difference of infinite values is NaN.
     return bool(((values == values[0]) | is_small).all())
 
 
@@ -216,7 +210,7 @@ def elements_at_edge(
     """
     hyperparameters = evaluator.hyperparameters
     shift = theta - np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
-    # Collapsed populations end 2.9 to 24 spreads of the prior out.
+    # In the studies collapsed populations were 2.9 to 24 prior standard deviations out.
     far = np.flatnonzero(np.abs(shift) > 2.0 * hyperparameters.prior_sd)
     if not far.size or no_information(evaluator, theta):
         return ()
@@ -225,13 +219,14 @@ def elements_at_edge(
     center, *values = evaluator.total(np.vstack([theta, further, back]), scales)
     with np.errstate(invalid="ignore"):
         changes_further, changes_back = np.abs(np.array(values) - center).reshape(2, -1)
-    # Of collapsed populations a spread further changes 2e-7 of the size at most, and the way back
-    # 7e-4 at least: any value in [1e-6, 1e-4] gives the same verdicts.
+    # For collapsed populations a prior standard deviation further changes the objective by at most
+    # 2e-7 of its size, and the way back by at least 7e-4: any limit in [1e-6, 1e-4] gives the same
+    # verdicts.
     unchanged = max(1e-5, tolerance) * size
     at_edge = []
     for i in np.flatnonzero((changes_further < unchanged) & (changes_back > unchanged)):
-        # Far out the population is one number, to the last digit. The comparison uses the last
-        # point from theta to there whose discrepancy is unchanged.
+        # Far beyond the data the population collapses numerically. Compare at the last point on the
+        # way back at which the discrepancy has not changed.
         way = theta + np.linspace(0, 1, 101)[:, None] * (back[i] - theta)
         is_same = np.abs(evaluator.total(way, scales) - center) < unchanged
         last = way[np.logical_and.accumulate(is_same)][-1]
@@ -243,8 +238,8 @@ def elements_at_edge(
 def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
     """Return whether distribution functions at two thetas differ by more than .02.
 
-    Half of the mass whose spread shrinks by a factor of 1.3 makes .035; a constant population has a
-    difference of one point's mass.
+    If the spread of half of the mass shrinks by a factor of 1.3, they differ by .035. Constant
+    populations differ by the mass of one point.
     """
     largest = 0.0
     for k, node in enumerate(evaluator.nodes):

@@ -13,6 +13,7 @@ from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local, single_output_parts
+from prbayes.inference.checks.sample_size import elements_above
 from prbayes.inference.goodness_of_fit import FittedSets
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Discrepancy, Minimum, Part
@@ -34,8 +35,8 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         values, weights = evaluator.populations(theta[None], k)
         parts = single_output_parts(node.target)
         index = min(_tail_index(part.of(values[0]), weights[0]) for part in parts)
-        # At 1024 quantiles of a half-Cauchy population 1.0, of Student's t with 1.5 degrees of
-        # freedom 1.5, of a lognormal one with a spread of 2.5 1.1.
+        # The index at 1024 quantiles is 1.0 for a half-Cauchy population, 1.5 for Student's t with
+        # 1.5 degrees of freedom, and 1.1 for a lognormal population with a log-scale of 2.5.
         if index < 1.1:
             text = (
                 f"{node.name}: the simulated responses have so heavy a tail (tail index "
@@ -79,8 +80,8 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
                 continue
             observed = part.target.observed
             observed = observed[np.isfinite(observed)]
-            # The sum of kernels at a spacing of 2.5 widths is the density to 9 %, by Poisson's
-            # summation 2 exp(-2 (pi / 2.5)^2).
+            # A sum of kernels that are 2.5 widths apart approximates the density to 9 %, by
+            # Poisson's summation 2 exp(-2 (pi / 2.5)^2).
             responses = part.of(values[0])
             finite = np.sort(responses[np.isfinite(responses)])
             ends = np.concatenate([[-np.inf], finite, [np.inf]])
@@ -100,33 +101,27 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     return findings
 
 
-def small_simulators(evaluator: Evaluator, *, enough: int = 30) -> list[Finding]:
-    """Report simulators of so few specimens that the spread in common is estimated too small.
+def small_simulators(evaluator: Evaluator) -> list[Finding]:
+    """Report simulators of so few specimens that their common spread is underestimated.
 
-    Bandwidths of few data let simulators that happen to scatter little weigh most, unless they have
-    the same response and so one bandwidth. The probability residual and the area are right.
+    With bandwidths of few data, simulators that scatter little by chance have the largest weight,
+    unless all have one response and so one bandwidth. The probability residual and the area have no
+    such bias.
     """
-    nodes = evaluator.nodes
+    enough, nodes = 30, evaluator.nodes
     widths = set()
     for node in nodes:
         parts = [part.target for part in node.target.parts if part.target.metric.likelihood]
         if len(parts) > 1:
-            widths.add(node.name)  # in white coordinates of the simulator's data
+            # because bandwidths are in white coordinates of the simulator's own data
+            widths.add(node.name)
         elif parts:
             cells = getattr(parts[0], "cells", None)
             widths.add(getattr(cells, "bandwidth", node.name))
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or len(widths) < 2 or dependent(nodes):
         return []
-    # Elements of theta that enter the populations of two simulators.
-    hyperparameters = evaluator.hyperparameters
-    prior_sd = hyperparameters.prior_sd
-    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
-    count = np.zeros(hyperparameters.size)
-    for k in range(len(nodes)):
-        flat = [parent.reshape(len(thetas), -1) for parent in evaluator.parents(thetas, k)]
-        count += np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
-    if not (count > 1).any():
+    if not (elements_above(evaluator)[: len(nodes)].sum(axis=0) > 1).any():
         return []
     return [
         Finding(
@@ -197,7 +192,7 @@ def refit_bias(fitted: FittedSets) -> list[Finding]:
     spread = np.where(spread > 0, spread, np.inf)
     shift = (thetas.mean(axis=0) - center) / spread
     worst = int(np.abs(shift).argmax())
-    # The mean of 200 refits is known to .07 standard deviations.
+    # The standard error of the mean of 200 refits is .07 standard deviations.
     if abs(shift[worst]) < 0.5:
         return []
     name = fitted.sampling.evaluator.hyperparameters.readable_names[worst]
@@ -216,8 +211,8 @@ def smoothing_bias(
 ) -> list[Finding]:
     """Report log-likelihoods whose smoothing moves the optimum by more than half a standard error.
 
-    By a Newton step to the optimum under kernels of half the width; of stored responses only. It
-    needs the sampling distribution ``local``.
+    The shift is a Newton step to the optimum under kernels of half the width. It needs stored
+    responses and the sampling distribution ``local``.
     """
     smoothed = [
         k
@@ -227,13 +222,14 @@ def smoothing_bias(
     ]
     if local is None or not smoothed or not local.covariance.size:
         return []
-    # Principal axes in theta, (d, r), of one standard error each.
+    # axes, (d, r): principal axes in theta, each one standard error long
     variances, vectors = np.linalg.eigh(local.covariance)
     positive = variances > 0
     along = vectors[:, positive] * np.sqrt(variances[positive])
-    axes = np.asarray(local.prior_sd[:, None] * (local.identified @ along))
+    axes = local.prior_sd[:, None] * (local.identified @ along)
     r = axes.shape[1]
-    # The second order in .3 standard errors is some per cent, the points' noise small beside it.
+    # Over .3 standard errors the second-order term is some per cent of the objective, and larger
+    # than the noise of the points.
     size = 0.3
     thetas = theta + size * stencil(r) @ axes.T
     step = np.full(r, size)
@@ -241,16 +237,17 @@ def smoothing_bias(
     findings = []
     for k in smoothed:
         gain = _gain_of_half_width(evaluator, thetas, k) / scales[k]
-        # On the way to the other optimum the curvature is the mean of both.
+        # The mean of both curvatures applies on the way to the other optimum.
         curvature = (hessian + hessian_of(gain, r) / 2) / size**2
         if not (np.isfinite(curvature).all() and np.linalg.eigvalsh(curvature)[0] > 0):
             continue
         gradient = slopes(gain[: 1 + 2 * r], step)
         shift = axes @ np.linalg.solve(curvature, -gradient)
         stderr = np.sqrt((axes**2).sum(axis=1))
-        # The bias goes with the kernel's variance: half the width removes three quarters.
+        # The bias is proportional to the kernel's variance, so that half the width removes three
+        # quarters of it.
         bias = np.abs(shift) / np.where(stderr > 0, stderr, np.inf) / (3 / 4)
-        # 89 % intervals cover 85 % at a bias of half a standard error.
+        # With a bias of half a standard error 89 % intervals cover 85 %.
         if bias.max() > 0.5:
             findings.append(_smoothing_finding(evaluator, k, bias))
     return findings
@@ -274,10 +271,11 @@ def _smoothing_finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     kernel = ""
     parts = single_output_parts(node.target)
     if len(parts) == 1:
-        # A bias of a tenth, as that of the default kernel for a normal population.
+        # Recommend a width with a bias of a tenth, as the default kernel has for a normal
+        # population.
         width = kernel_width(parts[0].target) * np.sqrt(0.1 / bias[worst])
         kernel = f"prb.LogLikelihood(density=prb.GaussianKDE({width:.2g})), or "
-    # Beyond 1.5 standard errors one step gives no reliable number.
+    # Beyond 1.5 standard errors a single Newton step is not accurate.
     amount = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > 1.5:
         amount = "more than a standard error"

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
+from prbayes.inference.checks.prior import PriorEnd, prior_end_findings
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored, needs_refits
 from prbayes.inference.resampling import observed_set
@@ -29,14 +29,14 @@ class OneSidedBound:
     """A hyperparameter that the data bound from one side."""
 
     name: str
-    value: float  # of the optimum, in the users' own units
-    limit: float  # one-sided, 95%
+    value: float  # value at the optimum, in the users' own units
+    limit: float  # one-sided limit with a confidence of 95 %
     is_upper: bool
-    end: float  # of the prior on the other side; NaN without one
+    end: float  # end of the prior on the other side; NaN without an end
 
 
 def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
-    """Report values and limits, those of one side in one finding."""
+    """Report values and limits, in one finding for upper and one for lower limits."""
     findings = []
     words = ("below", "least", "up", "larger"), ("above", "most", "down", "smaller")
     for is_upper in (True, False):
@@ -61,10 +61,22 @@ def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
     return findings
 
 
+def end_and_bound_findings(
+    ends: list[PriorEnd],
+    bounds: Sequence[OneSidedBound],
+    page: str = "likelihood.md#end-of-a-prior",
+) -> tuple[list[Finding], set[str]]:
+    """Report ends of priors, and bounds of the other hyperparameters; return the names as well."""
+    names = {end.name for end in ends}
+    bounds = [bound for bound in bounds if bound.name not in names]
+    findings = [*prior_end_findings(ends, page), *bound_findings(bounds)]
+    return findings, names | {bound.name for bound in bounds}
+
+
 def one_sided_bounds(
     evaluator: Evaluator,
     theta: Floats,
-    flat: NDArray[np.bool_],
+    flat: Bools,
     statistic: Callable[[Floats, int], float],
 ) -> list[OneSidedBound]:
     """Return the ``flat`` elements, (d,), that exceed a limit on one side of theta, but not both.
@@ -99,8 +111,9 @@ def one_sided_bounds(
 def _limit(
     theta: Floats, i: int, statistic: Callable[[Floats, int], float], unit: float, most: float
 ) -> float:
-    """Return the i-th element at the limit, at most so many units away, NaN without a limit."""
-    place, below = theta.copy(), (0.0, 0.0)  # distance and statistic
+    """Return the i-th element at the limit, or NaN if none is within ``most`` units."""
+    # distance and statistic of the last point below the limit
+    place, below = theta.copy(), (0.0, 0.0)
     highest = float(ndtri(0.95))
 
     def at(distance: float) -> float:
@@ -118,30 +131,28 @@ def _limit(
     else:
         return np.nan
     above = distance, value
+
+    def crossing() -> float:
+        """Return the distance at which the line through both points reaches the limit."""
+        return float(np.interp(highest, [below[1], above[1]], [below[0], above[0]]))
+
     for _ in range(2):  # regula falsi
-        middle = float(np.interp(highest, [below[1], above[1]], [below[0], above[0]]))
+        middle = crossing()
         value = at(middle)
         if value >= highest:
             above = middle, value
         elif np.isfinite(value):
             below = middle, value
-    middle = np.interp(highest, [below[1], above[1]], [below[0], above[0]])
-    return float(theta[i] + middle * unit)
+    return float(theta[i] + crossing() * unit)
 
 
 def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
-    """Return whether distances, ``lowest`` in all, are three times those of data from there.
+    """Return whether the distance, ``lowest``, is over three times that of data drawn there.
 
     Such a fit may be a local optimum.
     """
     is_distance = all(node.metric.distance for node in sampling.evaluator.nodes)
-    return is_distance and lowest > 3 * _noise(sampling)
-
-
-def _noise(sampling: SamplingDistribution) -> float:
-    """Return the objective's sampling noise."""
-    pairs = zip(sampling.information, sampling.scales, strict=True)
-    return float(sum(item.noise_floor / scale for item, scale in pairs))
+    return is_distance and lowest > 3 * sampling.noise
 
 
 def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | None:
@@ -151,28 +162,29 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     optimum is no poor fit: elsewhere there may then be a better one.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
-    is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
+    is_alone = sampling.local.hidden_share > 0.9
     if not is_alone.any():
         return []
     start = time.perf_counter()
     (lowest,) = evaluator.total(sampling.theta[None], scales)
     seconds = time.perf_counter() - start
-    # Some ten places, with the derivatives of the population at each.
+    # The search evaluates about ten points for each element, with the derivatives of the population
+    # at each.
     n_populations = 20 * sampling.theta.size**2
     is_long = seconds * n_populations > 30 or budget().is_limited
     if needs_refits(evaluator):
         return None
     if not is_stored(evaluator) and (is_long or is_far_from_data(sampling, lowest)):
         return None
-    noise = _noise(sampling)
+    noise = sampling.noise
 
     def statistic(theta: Floats, i: int) -> float:
         (total,) = evaluator.total(theta[None], scales)
         if not total > lowest + 0.1 * noise:
-            return np.nan  # flat: saves the standard error
+            return np.nan  # because the objective is flat, and the standard error costs more
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
         if not all(np.nansum(weights) > 0 for _, weights in populations):
-            return np.nan  # without any response
+            return np.nan  # because no point has a response there
         sampled = SamplingDistribution.of(evaluator, theta, scales)
         error = np.sqrt(sampled.local.in_theta[i, i])
         if not np.isfinite(error):

@@ -38,47 +38,45 @@ def normal_scores(u: Floats) -> Floats:
     return scores
 
 
-def zhang_statistic(z: Floats, weights: Floats, draws: int = 8, seed: int = 0) -> Floats:
+def zhang_statistic(z: Floats, weights: Floats) -> Floats:
     """Return the mean Z_A of drawn inputs, (d,), of scores (N, K, d) and weights (N, K).
 
     A drawn input has the population's distribution, however many roots a specimen has; posterior
-    means do not. The mean over a few draws removes most of the noise of drawing.
+    means do not. The mean over eight draws removes most of the noise of drawing.
     """
     n, points, _ = z.shape
     cumulative = np.cumsum(weights, axis=1)
-    uniform = np.random.default_rng(seed).random((draws if points > 1 else 1, n, 1))
+    uniform = np.random.default_rng(0).random((8 if points > 1 else 1, n, 1))
     drawn = (cumulative < uniform * cumulative[:, -1:]).sum(axis=-1)
-    u = np.sort(ndtr(np.clip(z[np.arange(n), drawn], -6, 6)), axis=1)  # (draws, N, d)
+    # (draws, N, d): distribution functions of the drawn inputs
+    u = np.sort(ndtr(np.clip(z[np.arange(n), drawn], -6, 6)), axis=1)
     rank = np.arange(1, n + 1)[:, None]
     terms = np.log(u) / (n - rank + 0.5) + np.log1p(-u) / (rank - 0.5)
     statistic: Floats = -terms.sum(axis=1).mean(axis=0)
     return statistic
 
 
-def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 100) -> Floats:
+def mixture_ratio(z: Floats, weights: Floats) -> Floats:
     """Return log-likelihood ratios of a mixture to the fitted population, (d,).
 
     The mixture replaces the population of one input at a time; its mixing weights follow from EM.
     The width of its normals bounds the likelihood.
     """
-    centers = np.linspace(-3.5, 3.5, 25)
+    centers, width = np.linspace(-3.5, 3.5, 25), 0.5
     ratios = []
     for score in np.moveaxis(np.clip(z, -6, 6), -1, 0):
         log_ratio = score[..., None] ** 2 / 2 - ((score[..., None] - centers) / width) ** 2 / 2
         ratio = np.einsum("nk,nkc->nc", weights, np.exp(log_ratio) / width)
         mixing = np.full(len(centers), 1 / len(centers))
-        for _ in range(steps):
+        for _ in range(100):
             mixing *= (1 / (ratio @ mixing)) @ ratio / len(ratio)
         ratios.append(np.log(ratio @ mixing).sum())
     return np.array(ratios)
 
 
-def population_statistics(z: Floats, weights: Floats, seed: int = 0) -> Floats:
-    """Return Z_A of all inputs, then the mixture's ratio of all inputs, (2 d,); large ones reject.
-
-    Observed and bootstrap samples need the same seed of the drawn inputs.
-    """
-    return np.concatenate([zhang_statistic(z, weights, seed=seed), mixture_ratio(z, weights)])
+def population_statistics(z: Floats, weights: Floats) -> Floats:
+    """Return Z_A of all inputs, then the ratios of their mixtures, (2 d,); large ones reject."""
+    return np.concatenate([zhang_statistic(z, weights), mixture_ratio(z, weights)])
 
 
 @dataclass(frozen=True)
@@ -88,19 +86,17 @@ class PopulationTest:
     p_value: float
     zhang: Floats  # (d,): p-values of Z_A by input, not adjusted for the number of statistics
     mixture: Floats  # (d,): p-values of the mixture's likelihood ratio by input
-    n: int  # specimens
+    n: int  # number of specimens
 
 
-def population_test(
-    z: Floats, weights: Floats, null: Sequence[Floats] | Floats, seed: int = 0
-) -> PopulationTest:
+def population_test(z: Floats, weights: Floats, null: Sequence[Floats] | Floats) -> PopulationTest:
     """Test whether the family of the population fits the inputs; for the power see `power_text`.
 
     ``null`` has the `population_statistics` of bootstrap samples of the fitted population, each
     with N specimens and refitted; 199 suffice. The size is .03 to .06 at p <= .05. Power with 20
     and 50 specimens against t (4), by a warp-speed bootstrap: .19 to .28, and .32 to .45.
     """
-    observed = population_statistics(z, weights, seed)
+    observed = population_statistics(z, weights)
     null = np.asarray(null)
     zhang, mixture = upper_p_values(observed[None], null)[0].reshape(2, -1)
     p_value = float(adjusted_p_values(observed, null).min())
@@ -152,17 +148,15 @@ def population_findings(
     return (Finding("population-misfit", text, "likelihood.md#population-misfit"),)
 
 
-def failing_region_findings(
-    evaluator: Evaluator, theta: Floats, specimens: int = 4096, lost: float = 0.25
-) -> tuple[Finding, ...]:
-    """Report populations with at least ``lost`` expected specimens without response; no run.
+def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
+    """Report populations in which at least .25 specimens are expected to have no response; no run.
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
     truncated to the other inputs (`prbayes.specimens.response_share`). Where it is +inf specimens
     fail: as none is among the data, a population moves away from there.
     """
-    findings = []
-    for simulator, share in _failing_shares(evaluator, theta, specimens):
+    lost, findings = 0.25, []
+    for simulator, share in _failing_shares(evaluator, theta):
         likelihood = simulator.likelihood
         n = len(simulator.rows)
         if share * n < lost:
@@ -185,14 +179,12 @@ def failing_region_findings(
     return tuple(findings)
 
 
-def replaced_findings(
-    evaluator: Evaluator, theta: Floats, specimens: int = 4096, smallest: float = 5e-4
-) -> tuple[Finding, ...]:
+def replaced_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
     """Report populations that rest on finite numbers in place of responses that failed.
 
-    Of stored responses the share is that of the runs' weights; of the log-likelihood by specimen
-    that of specimens whose nearest run has the number. Responses that are simulated again are
-    computed once more.
+    The share is the weight of stored responses that were replaced. For the log-likelihood by
+    specimen it is the share of specimens whose nearest run was replaced. Responses that are
+    simulated again are computed once more.
     """
     shares = {}
     for k, node in enumerate(evaluator.nodes):
@@ -205,9 +197,9 @@ def replaced_findings(
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         if _replaces(simulator.responses):
             emulation = prepared(simulator.likelihood).emulation
-            z = _population_coordinates(evaluator, theta, k, simulator.likelihood, specimens)
+            z = _population_coordinates(evaluator, theta, k, simulator.likelihood)
             _, nearest = cKDTree(emulation.z).query(z)
-            values, weights = emulation.y[nearest], np.full(specimens, 1 / specimens)
+            values, weights = emulation.y[nearest], np.full(len(z), 1 / len(z))
             shares[simulator.name] = _replaced_share(simulator.responses, values, weights)
     responses = {s.name: s.responses for s in evaluator.simulators}
     return tuple(
@@ -221,27 +213,27 @@ def replaced_findings(
             "distributed.md#when-a-response-fails",
         )
         for name, share in shares.items()
-        if share >= smallest
+        if share >= 5e-4  # a smaller one is displayed as 0.0%
     )
 
 
 def _replaces(responses: Responses) -> bool:
-    """Return whether numbers are in place of some responses."""
+    """Return whether finite numbers have replaced some responses."""
     return responses.failures > 0 and bool(np.isfinite(responses.replacement))
 
 
 def _replaced_share(responses: Responses, values: Floats, weights: Floats) -> float:
-    """Return the weight of the responses, (n, ...), that are the number."""
+    """Return the weight of the responses, (n, ...), that were replaced."""
     is_replaced = (values == responses.replacement).reshape(len(values), -1).all(axis=1)
     return float(weights @ is_replaced)
 
 
 def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr: Floats) -> Floats:
-    """Return the shift of an optimum, in standard errors (d,), if lost specimens counted.
+    """Return how far an optimum would move if lost specimens counted, in standard errors, (d,).
 
-    The optimum is that of the specimens with a response. Counted, points without one keep their
-    weight and are farther from the data than all responses. No response is computed where they are
-    stored; the minimum is searched by Nelder-Mead.
+    The optimum is that of the specimens with a response. If they counted, points without a response
+    would keep their weight and be farther from the data than all responses. No response is computed
+    where they are stored; the minimum is searched by Nelder-Mead.
     """
     from scipy.optimize import minimize as scipy_minimize
 
@@ -262,25 +254,25 @@ def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr:
     return np.asarray(minimum.x)
 
 
-def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 4096) -> None:
+def refuse_lost_specimens(evaluator: Evaluator, theta: Floats) -> None:
     """Raise if too much of a population has no response (NaN): it is not known from the rest."""
-    for simulator, share in _failing_shares(evaluator, theta, specimens):
+    for simulator, share in _failing_shares(evaluator, theta):
         if prepared(simulator.likelihood).share is not None:
             remedy = simulator.responses.remedy
             refuse_lost_share(simulator.name, share, simulator.max_lost, remedy)
 
 
-def failing_share(evaluator: Evaluator, theta: Floats, specimens: int = 4096) -> dict[str, float]:
+def failing_share(evaluator: Evaluator, theta: Floats) -> dict[str, float]:
     """Return the share of a population, at theta (d,), without a finite response; no run.
 
-    By simulator, of the log-likelihood by specimen alone.
+    The shares are by simulator, of those with a log-likelihood by specimen.
     """
     shares = dict.fromkeys((simulator.name for simulator in evaluator.emulated), 0.0)
-    return shares | {s.name: share for s, share in _failing_shares(evaluator, theta, specimens)}
+    return shares | {s.name: share for s, share in _failing_shares(evaluator, theta)}
 
 
 def _failing_shares(
-    evaluator: Evaluator, theta: Floats, specimens: int
+    evaluator: Evaluator, theta: Floats
 ) -> Iterator[tuple[EmulatedSimulator, float]]:
     """Yield the emulated simulators with failing runs and the failing share of the population."""
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
@@ -288,16 +280,16 @@ def _failing_shares(
         emulation = prepared(likelihood).emulation
         if np.isfinite(emulation.y).all():
             continue
-        z = _population_coordinates(evaluator, theta, k, likelihood, specimens)
+        z = _population_coordinates(evaluator, theta, k, likelihood)
         fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
         yield simulator, float(fails.mean())
 
 
 def _population_coordinates(
-    evaluator: Evaluator, theta: Floats, k: int, likelihood: SpecimenLikelihood, specimens: int
+    evaluator: Evaluator, theta: Floats, k: int, likelihood: SpecimenLikelihood
 ) -> Floats:
-    """Return the coordinates, (n, d), of specimens drawn from a population."""
+    """Return the coordinates, (4096, d), of specimens drawn from a population."""
     sampler = PopulationSampler(likelihood.inputs)
     rng = np.random.default_rng(23)
-    drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
-    return np.asarray(likelihood.coordinates.of([x[0] for x in drawn], 1))
+    drawn, _ = sampler(evaluator.parents(theta[None], k), 4096, rng)
+    return likelihood.coordinates.of([x[0] for x in drawn], 1)

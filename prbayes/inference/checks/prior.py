@@ -14,10 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.model.evaluator import Evaluator, only_through_prior
@@ -29,7 +28,7 @@ class PriorEnd:
     """A hyperparameter at an end of its prior."""
 
     name: str
-    value: float  # of the optimum, in the users' own units
+    value: float  # value at the optimum, in the users' own units
     bound: float  # the end of the prior
 
     def __str__(self) -> str:
@@ -39,7 +38,7 @@ class PriorEnd:
 def elements_at_prior_ends(
     evaluator: Evaluator,
     theta: Floats,
-    flat: NDArray[np.bool_],
+    flat: Bools,
     objective: Callable[[Floats], float],
     rise: float,
 ) -> list[PriorEnd]:
@@ -70,7 +69,7 @@ def elements_at_prior_ends(
         def along(x: Floats, start: Floats = start, i: int = i) -> float:
             return objective(start + np.insert(x, i, 0.0) * hyperparameters.prior_sd)
 
-        # A coarse search suffices.
+        # A coarse search suffices, because only its minimum is compared with the limit.
         origin = np.zeros(theta.size - 1)
         options = {
             "maxfev": 100 * theta.size,
@@ -81,9 +80,9 @@ def elements_at_prior_ends(
         at_end = theta.copy()
         at_end[i] += np.copysign(10 * hyperparameters.prior_sd[i], below[i] - 0.5)
         if objective(at_end) > objective(theta) + 1e-3 * rise:
-            continue  # a minimum before the end
+            continue  # because the minimum lies before the end
         limit, lowest = objective(theta) + rise, along(origin)
-        # Infinite where no design reaches.
+        # The objective is infinite where no design has points.
         if origin.size and limit < lowest < np.inf:
             lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
         if lowest > limit:
@@ -95,8 +94,9 @@ def elements_at_prior_ends(
 def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
     """Return the elements that are pushed to an end of their prior; computes no response."""
     evaluator, scales = sampling.evaluator, sampling.scales
-    # Two elements that only replace each other have a squared loading of a half each.
-    is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
+    # The limit excludes elements that only replace each other, whose squared loadings are a half
+    # each.
+    is_alone = sampling.local.hidden_share > 0.9
     is_alone &= ~only_through_prior(evaluator)
     if not is_alone.any() or not is_stored(evaluator):
         return []
@@ -104,9 +104,7 @@ def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
     def total(theta: Floats) -> float:
         return float(evaluator.total(theta[None], scales)[0])
 
-    noise = np.array([information.noise_floor for information in sampling.information])
-    rise = float((noise / scales).sum())
-    return elements_at_prior_ends(evaluator, sampling.theta, is_alone, total, rise)
+    return elements_at_prior_ends(evaluator, sampling.theta, is_alone, total, sampling.noise)
 
 
 def prior_end_findings(
@@ -122,37 +120,25 @@ def prior_end_findings(
     return [Finding("prior-end", text, page)]
 
 
-@dataclass(frozen=True)
-class PriorConflict:
-    """Conflict of prior and data, by hyperparameter, (d,) each."""
+def prior_conflict(estimate: Floats, predictive: Floats) -> tuple[Floats, Floats]:
+    """Return p-values of estimates in their prior predictive distributions, plain and adjusted.
 
-    p_values: Floats  # two-sided, of the estimates in their prior predictive distributions
-    adjusted: Floats  # for the number of hyperparameters (Holm 1979)
-    pulls: Floats  # shifts of the posterior means from the estimates, in standard errors
-
-
-def prior_conflict(
-    estimate: Floats, standard_error: Floats, posterior_mean: Floats, predictive: Floats
-) -> PriorConflict:
-    """Return p-values and pulls of all hyperparameters.
-
-    ``predictive``, (S, d), are estimates from synthetic data sets at draws of the prior; 1000
-    suffice. Those that are not finite are left out. Size of one p-value at .05: .04 to .06. Power
-    with 10, 20 and 50 specimens (linear problem, sharp prior, 1000 data sets): a mean four prior
-    standard deviations off .86, .98, 1.00; a logarithm of the standard deviation three off .36 to
-    .55, .70 to .76, .94 to .96.
+    P-values, (d,), are two-sided; they are adjusted for the number of hyperparameters by Holm's
+    step-down method (1979). ``predictive``, (S, d), are estimates from synthetic data sets at draws
+    of the prior; 1000 suffice. Those that are not finite are left out. Size of one p-value at .05:
+    .04 to .06. Power with 10, 20 and 50 specimens (linear problem, sharp prior, 1000 data sets): a
+    mean four prior standard deviations off .86, .98, 1.00; a logarithm of the standard deviation
+    three off .36 to .55, .70 to .76, .94 to .96.
     """
     finite = np.isfinite(predictive)
     below = (finite & (predictive <= estimate)).sum(axis=0)
     above = (finite & (predictive >= estimate)).sum(axis=0)
     p_values = np.minimum(1.0, 2 * (np.minimum(below, above) + 1) / (finite.sum(axis=0) + 1))
-    # Holm's step-down method.
     order = np.argsort(p_values)
     factors = np.arange(len(p_values), 0, -1)
     adjusted = np.empty_like(p_values)
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
-    pulls = np.abs(posterior_mean - estimate) / standard_error
-    return PriorConflict(p_values, adjusted, pulls)
+    return p_values, adjusted
 
 
 def conflict_findings(
@@ -162,9 +148,6 @@ def conflict_findings(
     standard_error: Floats,
     posterior_mean: Floats,
     predictive: Floats,
-    *,
-    threshold: float = 0.05,
-    pull: float = 0.5,
 ) -> tuple[Finding, ...]:
     """Return a finding ``prior-conflict`` of each hyperparameter in conflict.
 
@@ -184,15 +167,17 @@ def conflict_findings(
     >>> finding.text.split("; ")[0]
     'mu: got prior 9.99 +- 0.29, data 11.2 +- 0.2 (p = 0.004)'
     """
-    conflict = prior_conflict(estimate, standard_error, posterior_mean, predictive)
-    findings = []
-    matters = (conflict.adjusted <= threshold) & (conflict.pulls > pull)
+    _, p_values = prior_conflict(estimate, predictive)
+    # shifts of the posterior means from the estimates, in standard errors
+    pulls = np.abs(posterior_mean - estimate) / standard_error
+    findings, pull = [], 0.5
+    matters = (p_values <= 0.05) & (pulls > pull)
     for j in np.flatnonzero(matters).tolist():
         center, sd = prior[:, j].mean(), prior[:, j].std(ddof=1)
         text = (
             f"{labels[j]}: got prior {center:.3g} +- {sd:.2g}, data {estimate[j]:.3g} +- "
-            f"{standard_error[j]:.2g} (p = {conflict.adjusted[j]:.1g}); the prior pulls the "
-            f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard errors "
+            f"{standard_error[j]:.2g} (p = {p_values[j]:.1g}); the prior pulls the "
+            f"posterior mean to {posterior_mean[j]:.3g}, {pulls[j]:.1f} standard errors "
             f"from the data, expected at most {pull:g}; check the units and the prior, or widen it."
         )
         findings.append(Finding("prior-conflict", text, "likelihood.md#prior-conflict"))

@@ -6,13 +6,12 @@ import contextlib
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
@@ -20,7 +19,7 @@ from prbayes.response.inputs import Inputs
 _PAGE = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
 
 
-def elements_above(evaluator: Evaluator) -> NDArray[np.bool_]:
+def elements_above(evaluator: Evaluator) -> Bools:
     """Return which elements of theta enter the population of each simulator, (K, d)."""
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
@@ -31,9 +30,10 @@ def elements_above(evaluator: Evaluator) -> NDArray[np.bool_]:
         flat = [parent.reshape(len(thetas), -1) for parent in parents]
         values = np.concatenate(flat, axis=1)
         if values.shape[1] > len(parents):
-            # Of a vector a population may depend on one element alone.
+            # Draw specimens, because a population may depend on a single element of a vector
+            # parent.
             inputs = evaluator.simulators[k].inputs
-            with contextlib.suppress(TypeError):  # not all inputs can be drawn
+            with contextlib.suppress(TypeError):  # raised by inputs that cannot be drawn
                 values = _specimens(inputs, parents)
         row |= (values[1:] != values[0]).any(axis=1)
     return enters
@@ -69,17 +69,18 @@ def interval_ratios(n: float) -> tuple[float, float]:
     """
     upper = (1 + INTERVAL) / 2
     z = float(ndtri(upper))
-    # The maximum of the likelihood divides the squares by n.
+    # The factor n / (n - 1) is that of the maximum of the likelihood, which divides squares by n.
     mean = np.sqrt(n / (n - 1)) * stdtrit(n - 1, upper) / z
     longest, shortest = (np.sqrt(n / (2 * gammaincinv((n - 1) / 2, p))) for p in (1 - upper, upper))
     return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
 
 
-def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
-    """Report hyperparameters that follow from so few specimens that standard errors are too small.
+def few_specimens(evaluator: Evaluator) -> list[Finding]:
+    """Report too few specimens for standard errors.
 
-    Simulators with an element of theta in common count together.
+    Specimens of simulators with a common element of theta are added.
     """
+    enough = 8
     enters = elements_above(evaluator)
     enters = enters[:, enters.any(axis=0)]
     _, groups = connected_components(enters @ enters.T)
@@ -88,9 +89,10 @@ def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
         members = [evaluator.simulators[k] for k in np.flatnonzero(groups == group)]
         labels = [member.specimens for member in members if member.specimens is not None]
         count = sum(member.n_specimens for member in members)
-        if len(labels) == len(members):  # specimens in common count once
+        if len(labels) == len(members):  # because specimens in common count once
             count = float(np.unique(np.concatenate(labels)).size)
-        counts.append(round(count, 6))  # a sum of weights may be slightly below a whole number
+        # because a sum of weights may be slightly below a whole number
+        counts.append(round(count, 6))
     n = min(counts, default=enough)
     if not n < enough:
         return _spread_in_common(evaluator, enters, groups, counts)
@@ -112,14 +114,15 @@ def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
 
 def _spread_in_common(
     evaluator: Evaluator,
-    enters: NDArray[np.bool_],
-    groups: NDArray[np.intp],
+    enters: Bools,
+    groups: Indices,
     counts: Sequence[float],
 ) -> list[Finding]:
     """Report a spread that populations with means of their own underestimate (Neyman and Scott).
 
     With G means the maximum of the likelihood is sqrt(1 - G / N) of a common standard deviation,
-    about G / sqrt(2 N) standard errors below it. The metrics are tested by refits.
+    about G / sqrt(2 N) standard errors below it. Metrics of distributions are tested by refits
+    instead.
     """
     if evaluator.nodes:
         return []

@@ -1,0 +1,54 @@
+"""Laplace approximations of known densities, and starts that are far apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from prbayes._validate import Floats
+from prbayes.numerics.modes import Laplace, distinct_modes, far_apart, laplace
+
+MEAN = np.array([1.0, -2.0, 0.5])
+COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
+SCALE = np.array([3.0, 5.0, 2.0])
+NORMAL = multivariate_normal(MEAN, COVARIANCE)
+
+
+def normal(thetas: Floats) -> Floats:
+    return np.asarray(7.0 + NORMAL.logpdf(thetas))
+
+
+def test_laplace_is_exact_for_a_normal_density() -> None:
+    (mode,) = laplace(normal, MEAN[None] + [2.0, 1.0, -1.0], SCALE)
+    np.testing.assert_allclose(mode.mode, MEAN, atol=1e-3)
+    np.testing.assert_allclose(mode.covariance, COVARIANCE, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(mode.log_mass, 7.0, atol=1e-3)
+
+
+def test_a_direction_without_curvature_has_ten_times_the_scale() -> None:
+    (mode,) = laplace(lambda t: -0.5 * t[:, 0] ** 2, np.zeros((1, 2)), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(np.sqrt(np.diag(mode.covariance)), [1.0, 20.0], rtol=1e-3)
+
+
+def test_laplace_refuses_the_end_of_a_support() -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        laplace(
+            lambda t: np.where(t[:, 0] > 0, -t[:, 0], -np.inf), np.full((1, 1), 1e-3), np.ones(1)
+        )
+
+
+def test_starts_are_far_apart_in_their_unit() -> None:
+    candidates = np.array([[0.0, 0.0], [0.0, 9.0], [1.0, 0.0], [2.0, 0.0]])
+    starts = far_apart(candidates, 2, np.array([1.0, 10.0]))
+    assert starts.tolist() == [[0.0, 0.0], [2.0, 0.0]]
+    assert len(far_apart(candidates, 9, np.ones(2))) == 4
+
+
+def test_modes_half_a_standard_deviation_apart_are_distinct() -> None:
+    """The one with the larger mass remains; one that has not converged is the last."""
+    modes = [
+        Laplace(np.array([place]), np.eye(1), log_mass, converged)
+        for place, log_mass, converged in [(0.0, 1.0, True), (0.4, 2.0, True), (3.0, 3.0, False)]
+    ]
+    assert [mode.log_mass for mode in distinct_modes(modes)] == [2.0, 3.0]
