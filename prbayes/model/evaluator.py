@@ -142,7 +142,12 @@ class Evaluator:
         if self.likelihoods:
             values = variables_at(self.hyperparameters, thetas)
             for likelihood in self.likelihoods:
-                total += log_likelihoods(likelihood, values).sum(axis=1)
+                # Populations in blocks, so that memory stays constant with many specimens.
+                step = max(1, 4 * AT_ONCE // len(likelihood.readings))
+                for first in range(0, len(thetas), step):
+                    rows = slice(first, first + step)
+                    at_rows = {name: value[rows] for name, value in values.items()}
+                    total[rows] += log_likelihoods(likelihood, at_rows).sum(axis=1)
         observed = self.model.observed_RVs
         variables = [rv for rv in observed if not isinstance(rv.owner.op, ObservedRV)]
         if variables or self.model.potentials:

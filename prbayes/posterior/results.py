@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, called, flag
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, called, flag
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
     arviz_attributes,
@@ -70,7 +70,9 @@ def posterior_tree(
         "posterior": posterior_group(evaluator, chains.thetas, attrs),
         **groups,
         "sample_stats": chains.sample_stats,
-        "calibration": _calibration(evaluator, chains).assign_attrs(attrs),
+        "calibration": _calibration(evaluator, chains, groups.get("log_likelihood")).assign_attrs(
+            attrs
+        ),
         "observed_data": observed_dataset(evaluator),
     }
     failures = failures_dataset(evaluator)
@@ -105,8 +107,12 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 # -- calibration -----------------------------------------------------------------------------------
 
 
-def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
+def _calibration(
+    evaluator: Evaluator, chains: Chains, by_specimen: xr.Dataset | None
+) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
+
+    ``by_specimen`` has the log-likelihoods of specimens, if these have been computed.
 
     Log-likelihoods by specimen are the last; their discrepancies are minus log-likelihoods.
     """
@@ -137,10 +143,12 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
             records[k]["required_ess"] = node.reweighted.required_ess
     if evaluator.measurements:
         failing = failing_share(evaluator, rows.mean(axis=0))
-        log_likelihoods = specimen_log_likelihoods(evaluator, rows)
+        if by_specimen is None:
+            by_specimen = _log_likelihood_by_specimen(evaluator, chains)
     for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
         name = measurement.name
-        discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=1).reshape(n_chains, n_draws)
+        # Of simulators that share specimens the last one has their log-likelihood.
+        discrepancies[:, :, k] = -by_specimen[name].sum(axis=-1) if name in by_specimen else 0.0
         records[k] |= unknown | {
             "epsilon": 1.0,
             "failing_share": failing.get(name, np.nan),
@@ -258,14 +266,21 @@ def _emulated_responses(
 ) -> xr.Dataset:
     """Return emulated responses of new specimens at thetas, (chains, draws, d)."""
     chains, draws, d = thetas.shape
+    thinned = _thinned(draws, chains * sum(m.observed.size for m in evaluator.measurements))
+    leading = (chains, len(thinned))
     responses = {}
-    values = variables_at(evaluator.hyperparameters, thetas.reshape(-1, d))
+    values = variables_at(evaluator.hyperparameters, thetas[:, thinned].reshape(-1, d))
     for likelihood in evaluator.likelihoods:
         for measurement in likelihood.measurements:
             n = len(measurement.observed)
             readings = draw_readings(likelihood, rng, values, n, measurement)
-            responses[measurement.name] = readings.reshape(chains, draws, *readings.shape[1:])
-    return labelled_responses(evaluator, responses, (chains, draws))
+            responses[measurement.name] = readings.reshape(*leading, *readings.shape[1:])
+    return labelled_responses(evaluator, responses, leading).assign_coords(draw=thinned)
+
+
+def _thinned(draws: int, size: int) -> Indices:
+    """Return the draws for which ``size`` numbers each fit into memory."""
+    return np.arange(draws)[:: max(1, math.ceil(draws * size / AT_ONCE))]
 
 
 def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> xr.Dataset:
@@ -273,8 +288,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
     chains, draws, d = thetas.shape
     stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
     sizes = [evaluator.nodes[k].target.observed.size for k in stored]
-    size = chains * draws * sum(sizes)
-    thinned = np.arange(draws)[:: max(1, math.ceil(size / AT_ONCE))]
+    thinned = _thinned(draws, chains * sum(sizes))
     leading = (chains, len(thinned))
     rows = thetas[:, thinned].reshape(-1, d)
     responses = {}
