@@ -177,14 +177,13 @@ def emulate(
                 earlier = plausible
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-            if is_good:
-                is_open = plausible.proposals.is_open(plausible.scale)
-                if (
-                    is_rough(data, emulation)
-                    and not is_open
-                    and most_corrections(*data.known.shape)
-                ):
+            is_open = plausible.proposals.is_open(plausible.scale)
+            can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
+            if is_good and is_rough(data, emulation):
+                if can_correct:
                     emulation = corrected(run, data, emulation, population)
+                is_good = bool(can_correct) or len(emulation.z) >= most
+            if is_good:
                 plausible = plausible.of_emulation(data, emulation)
                 return emulation, *plausible.agreeing(data), plausible.draws
             likely = Likely.of(data, emulation, population, batches)
