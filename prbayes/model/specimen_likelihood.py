@@ -45,10 +45,10 @@ from prbayes.model.random_variable import (
 from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.model.unknown_error import ReadingDensity
 from prbayes.numerics.threads import one_thread
-from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
 from prbayes.specimens.response_share import ResponseShare
+from prbayes.specimens.weighted_points import WeightedPoints
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
@@ -77,8 +77,8 @@ def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     if last[0] is not log_a:
         x = [variable.get_value(borrow=True) for variable in shared]
         groups = [rows for _, rows in likelihood.by_group]
-        inputs = likelihood.inputs
-        points = [WeightedPoints.of(inputs, [v[rows] for v in x], log_a[rows]) for rows in groups]
+        density = likelihood.density
+        points = [WeightedPoints.of(density, [v[rows] for v in x], log_a[rows]) for rows in groups]
         last = likelihood.cache["points by group"] = (log_a, points)
     return last[1]
 
@@ -95,7 +95,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     for (group, rows), points in groups:
         parents = likelihood.parents(values, group, rows)
         if likelihood.error_is_known:
-            result[:, rows] = likelihood.density.log_likelihoods(parents, points)
+            result[:, rows] = points.log_likelihoods(parents)
         else:
             result[:, rows] = _with_unknown_error(likelihood, errors, parents, points, rows)
     if share is not None:
@@ -138,9 +138,9 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
         logs = []
         for part in (slice(half), slice(half, None)):
             of_half = [v[rows, part] for v in x]
-            points = WeightedPoints.of(likelihood.inputs, of_half, log_a[rows, part])
+            points = WeightedPoints.of(likelihood.density, of_half, log_a[rows, part])
             if likelihood.error_is_known:
-                of_points = likelihood.density.log_likelihoods(parents, points)
+                of_points = points.log_likelihoods(parents)
             else:
                 of_points = _with_unknown_error(likelihood, errors, parents, points, rows, part)
             logs.append(_with_gross_errors(likelihood, values, of_points, rows))
@@ -186,7 +186,7 @@ def _with_unknown_error(
     result = np.empty((len(errors), len(rows)))
     order = np.lexsort(errors.T)
     of_readings = _reading_density(likelihood).at_errors(errors[order])
-    of_points = likelihood.density.at_points([p[order] for p in parents], points)
+    of_points = points.log_densities([p[order] for p in parents])
     for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):
         result[k] = log_sum_exp(log_p + points.log_a + of_error[rows, columns])
     return result

@@ -36,7 +36,6 @@ from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
@@ -51,6 +50,7 @@ from prbayes.specimens.points import (
 )
 from prbayes.specimens.proposals import Proposals
 from prbayes.specimens.response_share import ResponseShare, response_share
+from prbayes.specimens.weighted_points import WeightedPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,8 +362,8 @@ class Populations:
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
             if smoothing is None:
-                points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
-                result[:, rows] = likelihood.density.log_likelihoods(parents, points)
+                points = WeightedPoints.of(likelihood.density, [v[rows] for v in x], weights[rows])
+                result[:, rows] = points.log_likelihoods(parents)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):

@@ -14,13 +14,10 @@ from scipy.special import logsumexp
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
-from prbayes.propagation.population_density import (
-    ExponentialForm,
-    PopulationDensity,
-    WeightedPoints,
-)
+from prbayes.propagation.population_density import ExponentialForm, PopulationDensity
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.specimens.weighted_points import WeightedPoints
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(0.1, 0.9, (7, 5))  # within the support of all families
@@ -64,8 +61,7 @@ def by_name(inputs: Inputs, values: dict[str, Any]) -> list[Any]:
 
 def log_likelihoods(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any) -> Any:
     """Return the log-likelihoods by the module under test."""
-    points = WeightedPoints.of(inputs, x, log_a)
-    return PopulationDensity(inputs).log_likelihoods(roots, points)
+    return WeightedPoints.of(PopulationDensity(inputs), x, log_a).log_likelihoods(roots)
 
 
 def by_graph(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any) -> Any:
@@ -155,31 +151,3 @@ def test_an_evaluator_has_the_log_likelihood_of_pymc() -> None:
     expected = graphs(thetas)[0]
     assert np.allclose(specimen_log_likelihoods(evaluator, thetas)["y"], expected, rtol=1e-11)
     assert np.allclose(evaluator.log_other(thetas), expected.sum(axis=1), rtol=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("dist", "points"),
-    [
-        (pm.StudentT.dist(nu=3, mu=0, sigma=1), np.linspace(0.1, 0.9, 50)),
-        (pm.Uniform.dist(0, 1), np.linspace(0.1, 0.9, 50)),
-        (pm.TruncatedNormal.dist(0, 1, lower=pm.Normal.dist()), np.linspace(0.1, 0.9, 50)),
-        (pm.Poisson.dist(3), np.arange(50.0)),
-        (pm.Normal.dist(0, 1), np.repeat([0.0, 1.0], 20)),  # points that coincide
-        (pm.InverseGamma.dist(3, 1), -np.ones(40)),  # all outside of the support
-        (pm.InverseGamma.dist(3, 1), np.full(40, np.nan)),
-    ],
-)
-def test_distributions_and_points_without_a_matrix_form(dist: Any, points: Any) -> None:
-    assert ExponentialForm.of([dist], [points]) is None
-
-
-def test_points_outside_of_a_support_take_no_part() -> None:
-    """Those below zero, or above the end of a truncated distribution."""
-    points = np.linspace(0.1, 2.0, 40)
-    for dist in (pm.HalfNormal.dist(1), pm.Gamma.dist(2, 1), pm.Exponential.dist(1)):
-        beside = ExponentialForm.of([dist], [np.concatenate([points, [-1.0, np.nan]])])
-        alone = ExponentialForm.of([dist], [points])
-        assert beside.is_inside.tolist() == [True] * 40 + [False] * 2
-        np.testing.assert_array_equal(beside.statistics[:, :40], alone.statistics)
-    truncated = ExponentialForm.of([pm.TruncatedNormal.dist(0, 1, upper=1)], [points])
-    assert truncated.is_inside.tolist() == (points <= 1).tolist()
