@@ -375,7 +375,7 @@ def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estima
     by_draw = sample.evaluate(quantity, sample.populations.thetas)
     error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
     error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
-    kind = "stored" if sample.emulator is None else "emulated"
+    kind = "stored" if sample.design.has_runs else "emulated"
     source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
     count, n_runs = sample.responses.count, sample.n_runs
     return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)

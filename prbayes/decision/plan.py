@@ -459,7 +459,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     parents = evaluator.parents(thetas, sample.k)
     _, weights = sample.design.populations(parents)
     outputs = sample.outputs
-    if sample.emulator is None:
+    if sample.design.has_runs:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
     else:
         is_observable = np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)

@@ -382,7 +382,7 @@ def _responses_at(
     if computed:
         return [sample.select(transform.responses(sample.responses, z))]
     x = transform(z)
-    if not (sample.design.has_runs and sample.design.design.on_line):
+    if not sample.design.on_line:
         return sample.emulated(x)
     # One input: linear between the runs, and not finite where the nearest run is not.
     (runs,) = sample.points

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,22 +45,25 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
         # parts of equal mass, count as exact.
         if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
-        if [bound for bound in designs.values() if bound.design.is_emulated]:
-            emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
+        left_out = [
+            node.reweighted.design.without_each_block() if node.reweighted else [] for node in nodes
+        ]
+        if any(left_out):
+            error = _error_of_emulators(sampling, left_out)
+            emulators = float(np.sqrt(2) * error.max(initial=0.0))
     return DesignErrors(points, emulators)
 
 
-def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
+def _error_of_emulators(
+    sampling: SamplingDistribution, left_out: Sequence[Sequence[Floats]]
+) -> Floats:
     """Return the error of the optimum by emulators, (r,).
 
     From minima of emulators that lack a block of the runs, less the minimum of the whole by the
-    same descent, which may differ from the optimum for other reasons.
+    same descent, which may differ from the optimum for other reasons. ``left_out`` are the
+    responses by these emulators, by simulator; none of a simulator without emulated points.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
-    left_out = [
-        node.reweighted.design.without_each_block() if node.reweighted else []
-        for node in evaluator.nodes
-    ]
     observed = observed_set(evaluator)
     whole = BatchObjective.of(evaluator, scales, observed)
     descent = descent_of(sampling, whole, is_rough=True)
@@ -94,7 +98,7 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
-    if all(bound.design.is_emulated for bound in evaluator.reweighted.values()):
+    if evaluator.has_emulated_points:
         # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
         # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
         rate += 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)

@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.emulator import fit_emulator
-from prbayes.metrics.base import Metric
+from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
@@ -29,7 +29,7 @@ from prbayes.model.measurement import (
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError, responding_weights
 from prbayes.propagation.importance import new_specimens
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
@@ -263,6 +263,16 @@ class EmulatedSimulator:
         values = self._emulated(flat).reshape(size, n, *self.measurement.event)
         return values, np.full((size, n), 1 / n)
 
+    def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
+        """Return the discrepancies of populations from a prepared metric, (k,)."""
+        values, weights = self.populations(parents)
+        weights = responding_weights(values, weights)
+        return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(values))])
+
+    def weighted_sample(self, parents: Sequence[Floats]) -> EmulatedSample:
+        """Return specimens whose weights make populations near those at parents."""
+        return EmulatedSample.of(self, parents)
+
 
 type PopulationSimulator = Node | EmulatedSimulator
 
@@ -298,9 +308,12 @@ class EmulatedSample:
     blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
     inputs: Inputs  # of the specimens
     n_points: int  # number of specimens
+    _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
     has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
+    on_line: ClassVar[bool] = False  # whether the points are a quadrature rule
+    is_continued: ClassVar[bool] = True  # whether responses are taken as constant beyond the runs
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
@@ -323,6 +336,30 @@ class EmulatedSample:
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
         return values_of(self.points, self.inputs, inputs)
+
+    def values_of(self, responses: Responses) -> Floats:
+        """Return a response of the specimens, (n,) or (n, m)."""
+        return self._emulator(responses)(self.points_of(responses.inputs))
+
+    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+        """Return a response at any points, (n,) or (n, m), and with two errors of it.
+
+        The errors are that at left-out runs, and that beyond the range of the runs.
+        """
+        emulator = self._emulator(responses)
+        inputs = values_of(points, self.inputs, responses.inputs)
+        values = emulator(inputs)
+        return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
+
+    def n_runs_of(self, responses: Responses) -> int:
+        """Return the number of runs behind a response."""
+        return len(self._emulator(responses).z)
+
+    def _emulator(self, responses: Responses) -> EmulatedResponse:
+        """Return the emulator of a response, which the first call for the response fits."""
+        if responses not in self._emulators:
+            self._emulators[responses] = self.simulator.emulator(responses)
+        return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""

@@ -38,7 +38,7 @@ from prbayes.model.specimen_likelihood import (
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.propagation.base import Bound, responding_weights
+from prbayes.propagation.base import responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
@@ -128,6 +128,11 @@ class Evaluator:
         return np.array([node.epsilon_value for node in self.nodes])
 
     @property
+    def has_emulated_points(self) -> bool:
+        """Whether all designs have points with emulated responses."""
+        return all(bound.design.has_emulated_points for bound in self.reweighted.values())
+
+    @property
     def n_responses(self) -> int:
         """Number of scalar responses that were computed; shared responses count once."""
         counts: dict[int, int] = {}  # by runs
@@ -139,10 +144,9 @@ class Evaluator:
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
-        if self.likelihoods:
+        for likelihood in self.likelihoods:
             values = variables_at(self.hyperparameters, thetas)
-            for likelihood in self.likelihoods:
-                total += log_likelihoods(likelihood, values).sum(axis=1)
+            total += log_likelihoods(likelihood, values).sum(axis=1)
         observed = self.model.observed_RVs
         variables = [rv for rv in observed if not isinstance(rv.owner.op, ObservedRV)]
         if variables or self.model.potentials:
@@ -157,7 +161,7 @@ class Evaluator:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
         budget().check()
         node = self.nodes[k]
-        return node.bound.discrepancies(self.parents(thetas, k), target or node.target)
+        return node.discrepancies(self.parents(thetas, k), target or node.target)
 
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); an invalid theta does not affect the rest."""
@@ -465,18 +469,15 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
 
     The same one if no design is large, or if the smaller designs do not support theta, (d,).
     """
-    bounds: list[Bound] = []
+    coarse_nodes = []
     for node in evaluator.nodes:
         bound = node.reweighted
         if bound is not None and bound.n_points >= _LARGE:
-            bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
-        else:
-            bounds.append(node.bound)
-    if bounds == [node.bound for node in evaluator.nodes]:
+            node = replace(node, bound=bound.copied(bound.design.rows(bound.blocks == 0)))
+        coarse_nodes.append(node)
+    coarse = replace(evaluator, nodes=tuple(coarse_nodes), has_graph=False)
+    if coarse.nodes == evaluator.nodes:
         return evaluator
-    pairs = zip(evaluator.nodes, bounds, strict=True)
-    coarse_nodes = tuple(replace(node, bound=bound) for node, bound in pairs)
-    coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
     for name, values in coarse.support(theta[None]).items():
         if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
             return evaluator

@@ -105,6 +105,15 @@ class Node:
         """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
         return self.bound.populations(list(parents))
 
+    def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
+        """Return the discrepancies of populations from a prepared metric, (k,)."""
+        return self.bound.discrepancies(parents, target)
+
+    def weighted_sample(self, parents: Sequence[Floats]) -> ReweightedBound:
+        """Return specimens whose weights make populations: those of the design."""
+        assert self.reweighted is not None
+        return self.reweighted
+
     @property
     def epsilon_value(self) -> float:
         """The value of epsilon, NaN while it is not set."""

@@ -111,11 +111,10 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     hyperparameters = evaluator.hyperparameters
     prior_sd = hyperparameters.prior_sd
     local = None if fit.sampling is None else fit.sampling.local
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if fit.ridge is not None and local is not None:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-    elif fit.pilot is None or (is_emulated and local is not None):
+    elif fit.pilot is None or (evaluator.has_emulated_points and local is not None):
         # As wide as the prior along elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
@@ -227,8 +226,7 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    if not is_emulated or errors.emulators > _SHARE * AGREE:
+    if not evaluator.has_emulated_points or errors.emulators > _SHARE * AGREE:
         # The error of a design of several inputs is taken to fall with the power .65 of its size.
         # At most twice as many runs at a time: the estimate of the error is itself uncertain.
         factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))
@@ -253,7 +251,7 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
             continue
         previous = bound.n_runs
         batch = bound.config.n
-        if bound.design.is_emulated:
+        if bound.design.has_emulated_points:
             batch = max(batch // 4, bound.responses.workers)
         batches = max(1, round((factor - 1) * previous / batch))
         size = min(batches * batch, bound.config.most - previous)
@@ -304,7 +302,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         has_room = {
             name
             for name in names
-            if not bounds[name].design.is_emulated
+            if not bounds[name].design.has_emulated_points
             and len(bounds[name].design.batch_sizes) <= MAX_ROUNDS
         }
         _add_runs(evaluator, best, has_room)
@@ -343,7 +341,7 @@ def draw_samples(
     is_drawn = False
     for k, node in enumerate(evaluator.nodes):
         bound = node.reweighted
-        if bound is None or not bound.design.is_emulated or node.name not in names:
+        if bound is None or not bound.design.has_emulated_points or node.name not in names:
             continue
         if not larger or bound.design.emulated_size < SIZES.largest:
             parents = valid_parents(bound, _components(evaluator, thetas, k))

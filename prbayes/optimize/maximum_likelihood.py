@@ -548,7 +548,7 @@ def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> fl
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why a model of log-likelihoods by specimen cannot be fitted to other data, or None."""
     others = len(evaluator.model.observed_RVs) > len(evaluator.measurements)
-    if evaluator.nodes or others or evaluator.model.potentials:
+    if others or evaluator.model.potentials:
         return (
             "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
         )

@@ -47,7 +47,8 @@ class Chains:
     thetas: Floats  # (chains, draws, d)
     sampler: Mapping[str, Any]  # attributes: the name of the sampler, and diagnostics
     sample_stats: xr.Dataset
-    log_likelihood: Floats | None = None  # (chains, draws), up to a constant; None by specimen
+    # (chains, draws): up to a constant; None of draws by NUTS or SMC of specimens alone
+    log_likelihood: Floats | None = None
     discrepancies: Floats | None = None  # (chains, draws, k); NaN if they would cost responses
     lost: Floats | None = None  # (chains, draws, k): share without response; NaN if stored
     # By simulator, at the best draw: error of the discrepancy, and lost and failed shares of the

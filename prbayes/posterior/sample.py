@@ -19,9 +19,7 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.minimize import find_optimum, require_finished
-from prbayes.optimize.objective import Minimisation
-from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.optimize.optimum import Optimum
 from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
@@ -31,12 +29,7 @@ from prbayes.posterior.importance import (
 )
 from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
-from prbayes.posterior.target import (
-    Target,
-    estimate_target,
-    require_density,
-    specimen_target,
-)
+from prbayes.posterior.target import Target, posterior_target
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -148,20 +141,12 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed."""
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    optimum = settings.optimum
-    if evaluator.nodes:
-        require_density(evaluator)
-        if optimum is None:
-            optimum = require_finished(find_optimum(evaluator, Minimisation()))
-        settings = replace(settings, optimum=require_sampling(optimum, "sample"))
+    optimum = smc.required_optimum(evaluator, settings, "sample")
+    settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
         chains = None
         for _ in range(MAX_ROUNDS + 1):
-            if evaluator.nodes:
-                assert optimum is not None
-                target = estimate_target(evaluator, optimum)
-            else:
-                target = specimen_target(evaluator, optimum)
+            target = posterior_target(evaluator, optimum)
             modes = modes_of(target)
             if modes is None:
                 break
@@ -227,10 +212,7 @@ def importance_chains(
     sample = importance_sample(target.log_posterior, modes, size, seed, options, prior)
     if not sample.is_reliable:
         return None
-    log_likelihood = None
-    if target.evaluator.nodes:
-        log_prior = hyperparameters.log_prior(sample.draws)
-        log_likelihood = (sample.log_density - log_prior).reshape(shape)
+    log_prior = hyperparameters.log_prior(sample.draws)
     coords = {"chain": np.arange(settings.chains), "draw": np.arange(settings.draws)}
     lp = ["chain", "draw"], sample.log_density.reshape(shape)
     return Chains(
@@ -242,7 +224,7 @@ def importance_chains(
             "log_marginal_likelihood": sample.log_evidence,
         },
         sample_stats=xr.Dataset({"lp": lp}, coords=coords),
-        log_likelihood=log_likelihood,
+        log_likelihood=(sample.log_density - log_prior).reshape(shape),
     )
 
 

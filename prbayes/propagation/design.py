@@ -57,8 +57,8 @@ class Design:
     on_line: bool = False
 
     @property
-    def is_emulated(self) -> bool:
-        """Whether responses between the runs are emulated."""
+    def has_emulated_points(self) -> bool:
+        """Whether there are points between the runs, whose responses are emulated."""
         return self.emulated is not None
 
     def rows(self, mask: NDArray[np.bool_]) -> Design:

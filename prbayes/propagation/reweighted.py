@@ -233,6 +233,7 @@ class ReweightedBound(Bound):
 
     stored: ClassVar[bool] = True
     has_runs: ClassVar[Literal[True]] = True  # as points, unlike emulated specimens
+    is_continued: ClassVar[bool] = False  # whether responses are taken as constant beyond the runs
 
     def __init__(
         self,
@@ -263,7 +264,7 @@ class ReweightedBound(Bound):
         runs = self._design.runs
         self.first_points, self.first_responses = runs.points, runs.values
         refuse_all_nan(name, runs.values)
-        if not self._design.is_emulated:
+        if not self._design.has_emulated_points:
             _report_low_ess(self, components)
 
     @property
@@ -360,6 +361,15 @@ class ReweightedBound(Bound):
         values = self._emulator_of(at_runs).at(emulated)
         has_runs = len(values) < self.n_points
         return np.concatenate([values, at_runs]) if has_runs else values
+
+    def n_runs_of(self, responses: Responses) -> int:
+        """Return the number of runs behind a response."""
+        return self.n_runs
+
+    @property
+    def on_line(self) -> bool:
+        """Whether the points are a quadrature rule of one continuous number."""
+        return self._design.on_line
 
     def refuse_change(self, responses: Responses) -> None:
         """Raise if the design's own response gives other values now than at the runs."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -96,26 +96,15 @@ def cross_validate(
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    by_specimen = is_specimen_optimum(optimum)
-    if by_specimen:
-        refits = specimen_refits(optimum, "cross_validate")
-        require_minimiser(optimum, "cross_validate")
-    else:
-        require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
+    engine = _specimen_engine if is_specimen_optimum(optimum) else _metric_engine
+    refitted, losses = engine(optimum)
     evaluator = optimum.evaluator
     folds = most_folds(optimum, 5) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
     held_out, training, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
-        if by_specimen:
-            thetas, converged = refits.reweighted(training)
-        else:
-            observed = [node.target.observed for node in evaluator.nodes]
-            sampling = optimum.sampling()
-            x, converged = refit(sampling, DataSets(observed, training))
-            thetas = sampling.thetas(x)
-    losses = _mean_log_losses if by_specimen else _discrepancies
+        thetas, converged = refitted(training)
     scores, weights = _scores(evaluator, thetas, held_out)
     dims = ["fold", "simulator"]
     return CrossValidationTable(
@@ -134,6 +123,32 @@ def cross_validate(
         },
         attrs={"random_seed": str(seed), **versions()},
     )
+
+
+# Estimates of weighted data sets, weights (S, n_k) -> (S, d), with which of them converged; and
+# losses of estimates, (S, simulators).
+type _Refit = Callable[[list[Floats]], tuple[Floats, NDArray[np.bool_]]]
+type _Loss = Callable[[Evaluator, Floats, list[Floats]], Floats]
+
+
+def _specimen_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
+    """Return how log-likelihoods by specimen are refitted and judged, or raise if they cannot."""
+    refits = specimen_refits(optimum, "cross_validate")
+    require_minimiser(optimum, "cross_validate")
+    return refits.reweighted, _mean_log_losses
+
+
+def _metric_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
+    """Return how metrics of distributions are refitted and judged, or raise if they cannot."""
+    require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
+
+    def refitted(weights: list[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+        observed = [node.target.observed for node in optimum.evaluator.nodes]
+        sampling = optimum.sampling()
+        x, converged = refit(sampling, DataSets(observed, weights))
+        return sampling.thetas(x), converged
+
+    return refitted, _discrepancies
 
 
 class CrossValidationTable(Table):
