@@ -559,12 +559,12 @@ def refuse_unused_inputs(
     surface = fit_emulator(z, outputs)
     jacobian = surface(z)[1][:, :, list(inputs)]
     spread = outputs.std(axis=0)
-    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
+    values, directions = _singular_vectors(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, list(inputs.values()))
 
 
-def _singular(jacobian: Floats) -> tuple[Floats, Floats]:
+def _singular_vectors(jacobian: Floats) -> tuple[Floats, Floats]:
     """Return singular values, (k, d), and right singular vectors, (k, d, d)."""
     finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     if finite.shape[1] < finite.shape[2]:

@@ -40,7 +40,7 @@ from prbayes.specimens.emulation import Surface
 
 
 @dataclass(frozen=True)
-class EmulatedSizes:
+class EmulatedPopulationSizes:
     """Sizes of emulated samples."""
 
     # Specimens of a population in plots and scores: the error of a quantile is far below the width
@@ -53,7 +53,7 @@ class EmulatedSizes:
     blocks: int = 8  # parts of the sample whose differences give its error
 
 
-_SIZES = EmulatedSizes()
+_SIZES = EmulatedPopulationSizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     preparation = prepared(likelihood)
     run_z = preparation.emulation.z
     runs = likelihood.coordinates.inputs(run_z)
-    points = values_of(runs, likelihood.inputs, responses.inputs)
+    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
     values = responses(points, [])
     coordinates = Coordinates.of_prior(responses.inputs)
     z = coordinates.of(points, 1)
@@ -154,7 +154,7 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 
-def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
+def values_of_inputs(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
     """Return the values of a subset of the inputs, from those of all inputs of a response."""
     places = [
         next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
@@ -244,7 +244,7 @@ class EmulatedSimulator:
         if responses.same_as(self.responses):
             emulated = self._emulated
             runs = self.likelihood.coordinates.inputs(emulated.z)
-            points = values_of(runs, self.likelihood.inputs, responses.inputs)
+            points = values_of_inputs(runs, self.likelihood.inputs, responses.inputs)
             values = emulated.y.reshape(len(emulated.z), *emulated.event)
             responses.refuse_change(points, values, self.responses)
             return emulated
@@ -328,14 +328,14 @@ class EmulatedSample:
         )
         specimens = at_conditions(simulator.inputs, specimens, simulator.conditions)
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
-        log_p = _log_density(simulator.inputs, parents, flat)
+        log_p = _population_log_densities(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
         return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
-        return values_of(self.points, self.inputs, inputs)
+        return values_of_inputs(self.points, self.inputs, inputs)
 
     def values_of(self, responses: Responses) -> Floats:
         """Return a response of the specimens, (n,) or (n, m)."""
@@ -347,7 +347,7 @@ class EmulatedSample:
         The errors are that at left-out runs, and that beyond the range of the runs.
         """
         emulator = self._emulator(responses)
-        inputs = values_of(points, self.inputs, responses.inputs)
+        inputs = values_of_inputs(points, self.inputs, responses.inputs)
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
 
@@ -363,7 +363,7 @@ class EmulatedSample:
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
-        log_p = _log_density(self.inputs, parents, self.points) - self.log_mixture
+        log_p = _population_log_densities(self.inputs, parents, self.points) - self.log_mixture
         largest = log_p.max(axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
             weights = np.exp(log_p - largest)
@@ -382,7 +382,9 @@ class EmulatedSample:
             )
 
 
-def _log_density(inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]) -> Floats:
+def _population_log_densities(
+    inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
+) -> Floats:
     """Return log-densities of specimens in populations, (k, n)."""
     function = compiled_log_density(inputs)
     step = max(1, AT_ONCE // len(points[0]))

@@ -135,17 +135,21 @@ class StackedReadings:
             for k, variable in enumerate(variables):
                 of_rows = [np.asarray(m.conditions)[:, k] for m in measurements]
                 kind = f"values of {variable.name}"
-                conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)
+                conditions[:, k] = _value_by_specimen(kind, measurements, of_rows, numbers, size)
                 coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
         readings, scales, repeats = zip(*parts, strict=True)
         groups = None
         if first.groups is not None:
             of_rows = [np.asarray(m.groups) for m in measurements]
-            groups = _by_specimen("groups", measurements, of_rows, numbers, size).astype(np.intp)
+            groups = _value_by_specimen("groups", measurements, of_rows, numbers, size).astype(
+                np.intp
+            )
         covariates = np.empty((len(first.covariates), size))
         for covariate, name in zip(covariates, first.covariates, strict=True):
             of_rows = [m.covariates[name] for m in measurements]
-            covariate[:] = _by_specimen(f"values of {name}", measurements, of_rows, numbers, size)
+            covariate[:] = _value_by_specimen(
+                f"values of {name}", measurements, of_rows, numbers, size
+            )
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
             width = 2 * np.ptp(measurement.range, axis=0)
@@ -208,7 +212,7 @@ def _averaged(
     return averaged(readings, measurement.scale, numbers, count)
 
 
-def _by_specimen(
+def _value_by_specimen(
     kind: str,
     measurements: Sequence[Measurement],
     values: Sequence[NDArray[Any]],

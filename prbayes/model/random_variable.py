@@ -487,7 +487,7 @@ def building(terms: str) -> Iterator[None]:
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
-def _log_density(
+def _metric_log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
     """Return the log-density of the observed data: a graph of the parents and of epsilon.

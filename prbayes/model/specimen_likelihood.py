@@ -394,13 +394,15 @@ def draw_readings(
             break
         outputs[is_missing] = draw_outputs()[is_missing]
     if measurement is None:
-        return _with_errors(rng, outputs, likelihood.readings, likelihood.measurements, values)
+        return _with_reading_errors(
+            rng, outputs, likelihood.readings, likelihood.measurements, values
+        )
     outputs = outputs[..., output_columns(likelihood, measurement)]
-    readings = _with_errors(rng, outputs, measurement.readings, [measurement], values)
+    readings = _with_reading_errors(rng, outputs, measurement.readings, [measurement], values)
     return readings.reshape(size, n, *measurement.event)
 
 
-def _with_errors(
+def _with_reading_errors(
     rng: np.random.Generator,
     outputs: Floats,
     readings: Readings,

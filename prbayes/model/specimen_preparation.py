@@ -18,7 +18,7 @@ from scipy.special import chdtri, ndtri
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.emulators.runs import Runs as TableRuns
+from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
     data_findings,
@@ -129,17 +129,19 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     for response in responses if not likelihood.has_table else []:
         response.on_start = partial(log_first_runs, cost, f"Reweighted(n={n})", response)
-    runs = Runs(likelihood)
+    runs = CheckedRuns(likelihood)
     try:
         data = specimen_data(likelihood)
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
         refined, share = response_share(
             # A call of a table's surface is no run.
-            OfTables.of(likelihood, TableRuns.__call__) if likelihood.has_table else runs,
+            OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
             data,
             first.emulation,
-            lambda share: Populations(likelihood).posterior(points.z, points.log_a, share=share),
+            lambda share: SpecimenPopulations(likelihood).posterior(
+                points.z, points.log_a, share=share
+            ),
         )
         if share is not None and likelihood.inputs.conditions:
             raise DesignError(
@@ -170,7 +172,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
 
 
 @dataclass(eq=False)
-class Runs:
+class CheckedRuns:
     """Outputs of runs at coordinates; checks the first ones for range and influence."""
 
     likelihood: SpecimenLikelihood
@@ -228,7 +230,7 @@ def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[f
 
 def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     """Return the specimens, what is known of them, and the populations of the model."""
-    populations = Populations(likelihood)
+    populations = SpecimenPopulations(likelihood)
     coordinates, conditions = likelihood.coordinates, likelihood.stacked.coordinates
     known = np.full((len(likelihood.readings), coordinates.size), np.nan)
     if conditions is not None:
@@ -247,7 +249,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     )
 
 
-def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Preparation:
+def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Return the emulator, the points and findings of both."""
     likelihood = runs.likelihood
     if likelihood.has_table:
@@ -261,11 +263,11 @@ def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Pre
         points, proposals, draws = specimen_points(data, emulation, population)
     else:
         emulation, points, proposals, draws = emulate(runs, data, emulation)
-    findings = tuple(_findings(likelihood, emulation, points, proposals))
+    findings = tuple(_preparation_findings(likelihood, emulation, points, proposals))
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
 
-def _findings(
+def _preparation_findings(
     likelihood: SpecimenLikelihood,
     emulation: Emulation,
     points: SpecimenPoints,
@@ -333,7 +335,7 @@ def log_shares(
 
 
 @dataclass(frozen=True, eq=False)
-class Populations:
+class SpecimenPopulations:
     """Populations of a model's hyperparameters, evaluated at points of its specimens."""
 
     likelihood: SpecimenLikelihood
@@ -494,7 +496,7 @@ def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
 class PopulationDraws:
     """Draws of the hyperparameters, (S, d)."""
 
-    populations: Populations
+    populations: SpecimenPopulations
     thetas: Floats
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:

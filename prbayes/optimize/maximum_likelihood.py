@@ -42,7 +42,7 @@ from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
-    Populations,
+    SpecimenPopulations,
     prepared,
     specimen_data,
 )
@@ -636,7 +636,7 @@ def specimen_pool(
         replace(preparation.emulation, offsets=None),
         preparation.proposals.residuals.population,
     )
-    draws = _Copies(PopulationDraws(Populations(likelihood), preparation.thetas), n)
+    draws = _Copies(PopulationDraws(SpecimenPopulations(likelihood), preparation.thetas), n)
     points, _ = agreeing_points(data, proposals, data.options.points, draws)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)

@@ -40,7 +40,7 @@ from prbayes.model.fingerprint import (
     Identity,
     Level,
     as_attributes,
-    from_attributes,
+    identity_from_attributes,
     identity_of,
     require_same,
 )
@@ -557,11 +557,11 @@ def identity_in(result: Any) -> Identity | None:
     if isinstance(result, Optimum):
         return result.search.identity
     if isinstance(result, xr.Dataset):
-        return from_attributes(result.attrs)
+        return identity_from_attributes(result.attrs)
     if not isinstance(result, xr.DataTree):
         return None
     group = "posterior" if "posterior" in result.children else "optimum"
-    return from_attributes(result[group].attrs) if group in result.children else None
+    return identity_from_attributes(result[group].attrs) if group in result.children else None
 
 
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:

@@ -152,7 +152,7 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     if not evaluator.likelihoods:
         return by_metric
     return xr.concat(
-        [by_metric, _by_specimen(evaluator, chains.thetas, by_metric)],
+        [by_metric, _likelihood_variables(evaluator, chains.thetas, by_metric)],
         "simulator",
         data_vars="minimal",
         coords="minimal",
@@ -161,7 +161,9 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     )
 
 
-def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) -> xr.Dataset:
+def _likelihood_variables(
+    evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset
+) -> xr.Dataset:
     """Return the same variables of log-likelihoods by specimen, as minus discrepancies."""
     chains, draws, d = thetas.shape
     measurements = evaluator.measurements

@@ -21,7 +21,7 @@ from prbayes.propagation.importance import (
     Mixture,
     MixtureSampler,
     Sample,
-    fit_emulator,
+    fit_design_emulator,
     mixture_of,
     spread_over,
 )
@@ -178,7 +178,7 @@ class DesignSampler:
         # 32 populations determine the mixing weight of the emulator.
         weights = self.weights(runs, spread_over(components, 32))
         if emulator is None:
-            emulator = fit_emulator(self.emulator, runs, weights)
+            emulator = fit_design_emulator(self.emulator, runs, weights)
         else:
             emulator = emulator.for_populations(weights)
         if emulator is None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator
-from prbayes.emulators.selection import Runs, weight_of_runs
+from prbayes.emulators.selection import TrainingRuns, weight_of_runs
 from prbayes.emulators.surfaces import as_surface
 from prbayes.numerics.points import base_points, inside
 from prbayes.numerics.threads import one_thread
@@ -242,7 +242,7 @@ class Sample:
 class DesignEmulator:
     """An emulator of one response, fitted to the runs of a design."""
 
-    runs: Runs
+    runs: TrainingRuns
     emulator: Emulator
     left_out: Floats  # (n, m): predictions of runs that were left out
     event: tuple[int, ...]  # shape of one response: () or (m,)
@@ -314,7 +314,7 @@ class DesignEmulator:
 
 
 @one_thread()
-def fit_emulator(emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator | None:
+def fit_design_emulator(emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator | None:
     """Fit an emulator to runs; None where the runs alone are as good.
 
     ``emulator`` is a surface or a regressor, or a text for the best of several. ``weights``,
@@ -322,7 +322,7 @@ def fit_emulator(emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator
     """
     x = columns(runs.points)
     y = runs.values.reshape(len(runs), -1)
-    fitted = Runs(x, y, weights.mean(axis=0), runs.blocks)
+    fitted = TrainingRuns(x, y, weights.mean(axis=0), runs.blocks)
     try:
         best = fitted.fit(ROUGH_CANDIDATES if isinstance(emulator, str) else [as_surface(emulator)])
         left_out = fitted.left_out_predictions(best)

@@ -49,7 +49,9 @@ _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
 }
 
 
-def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, bool]] | None:
+def _family_coordinates(
+    dist: pt.TensorVariable, values: Floats
+) -> list[tuple[Floats, bool]] | None:
     """Return coordinates (c, n) of each element, and if they are quadratic; None without a form."""
     if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
@@ -110,7 +112,7 @@ class ExponentialForm:
         """Return the form of independent inputs at points, (n, *event); None if they have none."""
         coordinates: list[tuple[Floats, bool]] = []
         for dist, values in zip(dists, points, strict=True):
-            of_input = _coordinates(dist, values)
+            of_input = _family_coordinates(dist, values)
             if of_input is None:
                 return None
             coordinates += of_input

@@ -39,7 +39,7 @@ from prbayes.propagation.importance import (
     DesignEmulator,
     MixtureSampler,
     Sample,
-    fit_emulator,
+    fit_design_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
 from prbayes.propagation.population_density import PopulationDensity, normalise
@@ -421,7 +421,7 @@ class ReweightedBound(Bound):
         design = self._design
         assert design.emulator is not None
         runs = replace(design.runs, values=at_runs)
-        emulator = fit_emulator(self.config.emulator, runs, design.emulator.weights)
+        emulator = fit_design_emulator(self.config.emulator, runs, design.emulator.weights)
         # With half of the population, the bias of the emulator is as large as the scatter of runs.
         # The runs have the share that the design's own response gave them.
         most = 0.5

@@ -105,7 +105,7 @@ def cross_validate(
     held_out, training, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
         thetas, converged = refitted(training)
-    scores, weights = _scores(evaluator, thetas, held_out)
+    scores, weights = _specimen_scores(evaluator, thetas, held_out)
     dims = ["fold", "simulator"]
     return CrossValidationTable(
         {
@@ -115,7 +115,7 @@ def cross_validate(
             "converged": ("fold", converged),
             "score": ("specimen", scores),
             "weight": ("specimen", weights),
-            "data": ("simulator", [_digest(simulator) for simulator in evaluator.simulators]),
+            "data": ("simulator", [_data_digest(simulator) for simulator in evaluator.simulators]),
         },
         coords={
             "fold": np.arange(folds),
@@ -148,7 +148,7 @@ def _metric_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
         x, converged = refit(sampling, DataSets(observed, weights))
         return sampling.thetas(x), converged
 
-    return refitted, _discrepancies
+    return refitted, _mean_discrepancies
 
 
 class CrossValidationTable(Table):
@@ -238,7 +238,7 @@ def _folds(
     return held_out, [w / w.sum(axis=1, keepdims=True) for w in training], np.array(sizes).T
 
 
-def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
+def _mean_discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
     """Return discrepancies (folds, simulators) for weights of the data; NaN without any weight."""
     columns = []
     for k, (node, by_fold) in enumerate(zip(evaluator.nodes, data, strict=True)):
@@ -274,7 +274,9 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     return np.array(columns).T
 
 
-def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tuple[Floats, Floats]:
+def _specimen_scores(
+    evaluator: Evaluator, thetas: Floats, held_out: list[Floats]
+) -> tuple[Floats, Floats]:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = specimens(evaluator.simulators)
     scores, counts = np.zeros(total), np.zeros(total)
@@ -301,7 +303,7 @@ def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tup
     return scores, counts
 
 
-def _digest(simulator: PopulationSimulator) -> str:
+def _data_digest(simulator: PopulationSimulator) -> str:
     """Return a digest of observed values, weights and labels, in order."""
     labels = [] if simulator.specimens is None else simulator.specimens.tolist()
     content = simulator.observed.tobytes() + simulator.weights.tobytes() + repr(labels).encode()

@@ -437,7 +437,7 @@ class JointNull(Null):
         """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
         evaluator, theta = self.optimum.evaluator, self.optimum.theta
         rng_of_ties = case.rng(1)
-        numbers, n_new = _validated_counts(evaluator.nodes, tested)
+        numbers, n_new = _numbers_in_calibration(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
         for t in tested:
             responses, weights = populations[t.simulator]
@@ -554,7 +554,7 @@ def _require_population(condition: Condition, values: Floats, weights: Floats) -
         )
 
 
-def _validated_counts(
+def _numbers_in_calibration(
     nodes: Sequence[Node], tested: list[_Tested]
 ) -> tuple[list[NDArray[np.intp]], int]:
     """Return the numbers of each condition's specimens in the calibration, and how many are new."""
