@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from prbayes._display import without_constructor
 from prbayes._validate import Floats
-from prbayes.emulators.emulator import Emulator, fit_emulator
+from prbayes.emulators.emulator import Emulator, fit_emulator, with_failures
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
 
@@ -145,14 +145,7 @@ class TrainingRuns:
         lowest, highest = y.min(axis=0), y.max(axis=0)
         reach = highest - lowest
         values = np.clip(emulator.values(points), lowest - reach, highest + reach)
-        if not self.good[mask].all():
-            from scipy.spatial import cKDTree
-
-            places = np.flatnonzero(mask)
-            nearest = places[cKDTree(self.scaled(self.x[places])).query(points)[1]]
-            failed = ~self.good[nearest]
-            values[failed] = self.y[nearest[failed]]
-        return values
+        return with_failures(values, points, self.scaled(self.x[mask]), self.y[mask])
 
     def predict_without_blocks(self, emulator: Emulator, at: Floats) -> Iterator[Floats]:
         """Yield the predictions, (k, m), of emulators without each block of the runs."""

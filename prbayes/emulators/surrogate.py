@@ -26,7 +26,7 @@ from prbayes._validate import (
     seed_number,
     share,
 )
-from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator, fit_emulator
+from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator, fit_emulator, with_failures
 from prbayes.emulators.following import Follower, fit_follower
 from prbayes.emulators.io import read_surrogate, write_surrogate
 from prbayes.emulators.radial_basis import RadialBasis
@@ -127,15 +127,11 @@ class DesignSurface:
         return self(self.domain.at(sobol(64, self.domain.dimensions, 0)))
 
     @cached_property
-    def _trees(self) -> tuple[Any, Any]:
-        """Search trees of all runs and of the usable ones."""
+    def _tree(self) -> Any:
+        """The search tree of the usable runs."""
         from scipy.spatial import cKDTree
 
-        return cKDTree(self.unit), cKDTree(self.unit[self.usable])
-
-    def nearest(self, columns: Floats) -> NDArray[np.intp]:
-        """Return the run that is nearest to each row, (n,)."""
-        return np.asarray(self._trees[0].query(self.domain.scaled(columns))[1])
+        return cKDTree(self.unit[self.usable])
 
     def nearby(self, residuals: Floats, columns: Floats) -> Floats:
         """Return the residuals of the nearest usable runs, (n, k, ...)."""
@@ -143,7 +139,7 @@ class DesignSurface:
         # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
         k = min(len(usable), 4 * (unit.shape[1] + 1))
         # Points that are not finite are outside: any neighbours will do.
-        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        _, nearest = self._tree.query(np.where(np.isfinite(unit), unit, 0.5), k=k)
         return np.asarray(usable[nearest])
 
 
@@ -629,11 +625,8 @@ class Surrogate(Shown):
             place = (number % np.uint64(k)).astype(np.intp)
             signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
             values = values + residuals[np.arange(n), place] * signs
-        if not self._surface.usable.all():
-            nearest = self._surface.nearest(columns)
-            is_failed = ~self._surface.usable[nearest]
-            values[is_failed] = self.responses[nearest[is_failed]]
-        return values
+        unit = self.domain.scaled(columns)
+        return with_failures(values, unit, self._surface.unit, self.responses)
 
 
 def with_output_labels(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:

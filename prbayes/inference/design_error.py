@@ -16,6 +16,7 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import observed_set
+from prbayes.model.evaluator import have_emulated_points
 from prbayes.model.random_variable import Node
 from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
@@ -98,7 +99,7 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
-    if evaluator.has_emulated_points:
+    if have_emulated_points(evaluator):
         # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
         # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
         rate += 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)

@@ -32,6 +32,7 @@ from prbayes.model.random_variable import (
     nodes,
     simulators,
 )
+from prbayes.model.simulator_with_data import SimulatorWithData
 from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     measurements_of,
@@ -74,12 +75,13 @@ class Evaluator:
     model: pm.Model
     hyperparameters: Hyperparameters  # names, transforms and prior of theta
     nodes: tuple[Node, ...]  # simulators with a metric of distributions
-    likelihoods: tuple[SpecimenLikelihood, ...]  # one for simulators with common specimens
-    measurements: tuple[Measurement, ...]  # simulators with a log-likelihood by specimen
-    emulated: tuple[EmulatedSimulator, ...]  # the populations of these, by group
+    # Simulators with a log-likelihood by specimen, by group, whose populations are emulated.
+    emulated: tuple[EmulatedSimulator, ...]
     # Whether the nodes have the data and designs of the model, whose graph is the objective then.
     has_graph: bool = True
     functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
+    likelihoods: tuple[SpecimenLikelihood, ...] = field(init=False)  # one for common specimens
+    measurements: tuple[Measurement, ...] = field(init=False)  # simulators with all of their groups
     # The nodes, then simulators whose responses are emulated, by group.
     simulators: list[PopulationSimulator] = field(init=False, repr=False)
     reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
@@ -90,6 +92,8 @@ class Evaluator:
     def __post_init__(self) -> None:
         """Set the attributes of all simulators, and of the other terms."""
         vars(self).update(
+            likelihoods=tuple(dict.fromkeys(e.likelihood for e in self.emulated)),
+            measurements=tuple(dict.fromkeys(e.measurement for e in self.emulated)),
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
             responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
@@ -103,17 +107,10 @@ class Evaluator:
         refuse_replaced_expressions(model)
         hyperparameters = Hyperparameters.of(model)  # refuses a model before its first runs
         computed = tuple(nodes(model).values())
-        likelihoods = tuple(dict.fromkeys(specimen_likelihoods(model).values()))
-        for likelihood in likelihoods:
+        evaluator = cls(model, hyperparameters, computed, tuple(emulated_simulators(model)))
+        for likelihood in evaluator.likelihoods:
             likelihood.cache["hyperparameters"] = weakref.ref(hyperparameters)
-        return cls(
-            model,
-            hyperparameters,
-            computed,
-            likelihoods,
-            tuple(measurements_of(model).values()),
-            tuple(emulated_simulators(model)),
-        )
+        return evaluator
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the model by cloudpickle: models of PyMC have no plain pickle."""
@@ -126,11 +123,6 @@ class Evaluator:
     def epsilon(self) -> Floats:
         """The simulators' epsilons, shape (k,), NaN where unset."""
         return np.array([node.epsilon_value for node in self.nodes])
-
-    @property
-    def has_emulated_points(self) -> bool:
-        """Whether all designs have points with emulated responses."""
-        return all(bound.design.has_emulated_points for bound in self.reweighted.values())
 
     @property
     def n_responses(self) -> int:
@@ -437,6 +429,16 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
 # Runs and designs.
 
 
+def with_data(evaluator: Evaluator) -> list[SimulatorWithData]:
+    """Return all simulators, each with the specimens of all of its groups."""
+    return [*evaluator.nodes, *evaluator.measurements]
+
+
+def have_emulated_points(evaluator: Evaluator) -> bool:
+    """Return whether all designs have points with emulated responses."""
+    return all(bound.design.has_emulated_points for bound in evaluator.reweighted.values())
+
+
 def is_current(evaluator: Evaluator) -> bool:
     """Return whether the model still has the evaluator's data; `pymc.set_data` changes them."""
     model = evaluator.model
@@ -469,15 +471,15 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
 
     The same one if no design is large, or if the smaller designs do not support theta, (d,).
     """
-    coarse_nodes = []
-    for node in evaluator.nodes:
-        bound = node.reweighted
-        if bound is not None and bound.n_points >= _LARGE:
-            node = replace(node, bound=bound.copied(bound.design.rows(bound.blocks == 0)))
-        coarse_nodes.append(node)
-    coarse = replace(evaluator, nodes=tuple(coarse_nodes), has_graph=False)
-    if coarse.nodes == evaluator.nodes:
+    smaller = {
+        name: bound.copied(bound.design.rows(bound.blocks == 0))
+        for name, bound in evaluator.reweighted.items()
+        if bound.n_points >= _LARGE
+    }
+    if not smaller:
         return evaluator
+    coarse_nodes = [replace(n, bound=smaller.get(n.name, n.bound)) for n in evaluator.nodes]
+    coarse = replace(evaluator, nodes=tuple(coarse_nodes), has_graph=False)
     for name, values in coarse.support(theta[None]).items():
         if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
             return evaluator

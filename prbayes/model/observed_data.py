@@ -28,14 +28,14 @@ from prbayes.response.outputs import Outputs, in_order_of, read_observed, refuse
 class ObservedData:
     """Observed responses of N specimens, with what is known of each specimen."""
 
-    name: str  # of the simulator
+    name: str  # name of the simulator, for messages
     original: Any  # observed values as the user has them: numbers or `pymc.Data`
-    values: Floats  # (N,) or (N, m)
+    values: Floats  # (N,) or (N, m): measured responses
     outputs: Outputs
     groups: NDArray[np.intp] | None  # (N,): index of the group; None without groups
     weights: Any  # (N,): relative weights; None for equal ones
-    labels: NDArray[Any] | None  # (N,); None without labels
-    # (N,): observed row of each specimen where weights are frequencies, else None
+    labels: NDArray[Any] | None  # (N,): labels of the specimens; None without labels
+    # (N,): observed row of each specimen if the weights are frequencies, else None
     rows: NDArray[np.intp] | None
     n_rows: int  # number of observed rows
     dims: tuple[str, ...] | None  # names of the observed dimensions

@@ -71,7 +71,7 @@ from prbayes.response.inputs import (
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
-# Settings of a propagation for calls of the response.
+# Options of a propagation that concern the calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
 
 
@@ -238,7 +238,7 @@ class _Arguments:
 
 def _new_name(name: str, model: pm.Model) -> str:
     """Return the name of a variable that the model does not have yet."""
-    # A model within another one puts its own name before those of its variables.
+    # A nested model puts its name before the names of its variables.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     if model.name_for(name) in model.named_vars:
         raise ValueError(
@@ -305,7 +305,8 @@ def _with_units(
     names = [*set_units(inputs, response, units), name, *outputs.names]
     unknown = [key for key in units if key not in names]
     if unknown:
-        refuse_misfit(name, response, inputs.sizes, outputs)  # names other arguments than these
+        # A response with arguments of other names is the likelier mistake.
+        refuse_misfit(name, response, inputs.sizes, outputs)
         raise KeyError(
             f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
         )
@@ -624,7 +625,7 @@ def _add_specification(
     simulator = replace(specification, same_inputs=tuple(same_inputs))
     operation = SimulatorRV(signature=signature, reference=weakref.ref(simulator))
     rv = SimulatorDistribution(name, *params, operation=operation, observed=observed, dims=dims)
-    rv.owner.op.owner = weakref.ref(rv.owner)  # before a clone of the model claims it
+    rv.owner.op.owner = weakref.ref(rv.owner)  # at once, since a clone of the model may claim it
     return rv
 
 

@@ -25,6 +25,7 @@ from prbayes.model.data_checks import (
     emulator_findings,
     misfit_findings,
     outlier_findings,
+    output_labels,
     refuse_unreachable,
     refuse_unused_inputs,
     repeat_findings,
@@ -312,7 +313,7 @@ def _data_findings(
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
             values,
-            labels=[f"{m.name}[{label}]" for label in m.outputs.names] or [m.name],
+            labels=output_labels(m.name, m.outputs.names),
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
         )

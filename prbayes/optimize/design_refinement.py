@@ -16,7 +16,13 @@ from prbayes.inference.checks.identification import unidentified_names
 from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
-from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
+from prbayes.model.evaluator import (
+    Evaluator,
+    Shortcoming,
+    have_emulated_points,
+    n_design_runs,
+    shortcomings,
+)
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import (
     OVERLAP,
@@ -114,7 +120,7 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     if fit.ridge is not None and local is not None:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-    elif fit.pilot is None or (evaluator.has_emulated_points and local is not None):
+    elif fit.pilot is None or (have_emulated_points(evaluator) and local is not None):
         # As wide as the prior along elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
@@ -226,7 +232,7 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    if not evaluator.has_emulated_points or errors.emulators > _SHARE * AGREE:
+    if not have_emulated_points(evaluator) or errors.emulators > _SHARE * AGREE:
         # The error of a design of several inputs is taken to fall with the power .65 of its size.
         # At most twice as many runs at a time: the estimate of the error is itself uncertain.
         factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))

@@ -35,6 +35,7 @@ from prbayes.model.evaluator import (
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
+    with_data,
 )
 from prbayes.model.fingerprint import (
     Identity,
@@ -437,9 +438,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
 
 def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
-    responses = [node.bound.responses for node in evaluator.nodes]
-    responses += [measurement.responses for measurement in evaluator.measurements]
-    return sum(r.computed for r in responses)
+    return sum(simulator.responses.computed for simulator in with_data(evaluator))
 
 
 def point_text(evaluator: Evaluator, theta: Floats) -> str:
@@ -581,18 +580,17 @@ def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     evaluator = optimum.evaluator
     nodes, measurements = evaluator.nodes, evaluator.measurements
-    names = [node.name for node in nodes] + [m.name for m in measurements]
+    names = [simulator.name for simulator in with_data(evaluator)]
     likelihoods = specimen_log_likelihoods(evaluator, optimum.theta[None])
     discrepancies = {name: -float(v.sum()) for name, v in likelihoods.items()}
     discrepancies |= optimum.discrepancies
     n_runs = [node.bound.n_runs for node in nodes]
     n_runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
-    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
     by_simulator: dict[str, list[Any]] = {
         "discrepancy": [discrepancies[name] for name in names],
         "scale": [optimum.scales.get(name, 1.0) for name in names],
-        "metric": [without_addresses(metric) for metric in metrics],
+        "metric": [without_addresses(simulator.metric) for simulator in with_data(evaluator)],
         "compared": compared,
         "is_likelihood": [0] * len(nodes) + [1] * len(measurements),
         "n_runs": n_runs,

@@ -19,7 +19,9 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.minimize import find_optimum, require_finished
+from prbayes.optimize.objective import Minimisation
+from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
@@ -29,7 +31,7 @@ from prbayes.posterior.importance import (
 )
 from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
-from prbayes.posterior.target import Target, posterior_target
+from prbayes.posterior.target import Target, posterior_target, require_density
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -141,8 +143,12 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed."""
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    optimum = smc.required_optimum(evaluator, settings, "sample")
-    settings = replace(settings, optimum=optimum)
+    optimum = settings.optimum
+    if evaluator.nodes:
+        require_density(evaluator)
+        if optimum is None:
+            optimum = require_finished(find_optimum(evaluator, Minimisation()))
+        settings = replace(settings, optimum=require_sampling(optimum, "sample"))
     with designs_as_before(evaluator):
         chains = None
         for _ in range(MAX_ROUNDS + 1):

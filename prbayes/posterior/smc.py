@@ -289,10 +289,15 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     epsilons = evaluator.epsilon
     try:
         with designs_as_before(evaluator) as restore_designs:
+            optimum = settings.optimum
             if is_pseudo:
                 optimum = _set_epsilons(evaluator, settings)
-            else:
-                optimum = required_optimum(evaluator, settings, "sample_smc")
+            elif evaluator.nodes:
+                require_density(evaluator)
+                if optimum is None:
+                    search = Minimisation(refine=settings.refine)
+                    optimum = require_finished(find_optimum(evaluator, search))
+                require_sampling(optimum, "sample_smc")
             chains = _chains_on_designs(evaluator, settings, optimum)
             if is_pseudo:
                 chains = _with_errors(evaluator, chains)
@@ -303,20 +308,6 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     finally:
         for node, value in zip(evaluator.nodes, epsilons, strict=True):
             node.epsilon.set_value(np.asarray(value))
-
-
-def required_optimum(
-    evaluator: Evaluator, settings: SamplingSettings, caller: str
-) -> Optimum | None:
-    """Return the optimum, which is searched where metrics need one, or raise if it is unsuited."""
-    optimum = settings.optimum
-    if not evaluator.nodes:
-        return optimum
-    require_density(evaluator)
-    if optimum is None:
-        search = Minimisation(refine=settings.refine)
-        optimum = require_finished(find_optimum(evaluator, search))
-    return require_sampling(optimum, caller)
 
 
 def result_of(

@@ -34,9 +34,9 @@ def _non_negative(x: Floats) -> Floats:
     return np.where(x >= 0, x, np.nan)
 
 
-# Coordinates of an element, (n,) -> (n,), not finite outside of the support, and whether their
-# monomials of degree two are sufficient statistics as well. The supports do not depend on
-# parameters; that of the truncated normal is in the graph.
+# Functions of an element, (n,) -> (n,), that are its sufficient statistics, and whether their
+# products are sufficient statistics as well. A function is not finite outside of the support, which
+# does not depend on the parameters. The support of the truncated normal is in the graph.
 _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
     type(pm.Normal.rv_op): ((np.positive,), True),
     type(pm.HalfNormal.rv_op): ((_non_negative,), True),
@@ -98,10 +98,10 @@ def _standardised(values: Floats) -> Floats:
 class ExponentialForm:
     """Log-densities at n fixed points as a matrix product."""
 
-    # (q + 1, n): sufficient statistics of all inputs, then the constant; zero outside the support
+    # (q + 1, n): sufficient statistics of all inputs, then ones; zero outside of the support
     statistics: Floats
-    is_inside: NDArray[np.bool_]  # (n,): points of the support
-    # (q + 1, *event): points at which the log-density determines the natural parameters
+    is_inside: NDArray[np.bool_]  # (n,): whether a point is in the support
+    # (q + 1, *event): points whose log-densities determine the natural parameters
     anchors: tuple[Floats, ...]
     inverse: Floats  # (q + 1, q + 1): inverse of the statistics at the anchors
 
@@ -126,8 +126,8 @@ class ExponentialForm:
         size = len(at_inside)
         if inside.size < 2 * size:
             return None
-        # Anchors far from dependent, by pivoted QR. Among the half of the points near the middle:
-        # far away log-densities have larger roundings.
+        # Pivoted QR selects anchors that are nearly orthogonal. It selects among the half of the
+        # points near the middle, since log-densities far away have larger roundings.
         distance = (at_inside**2).sum(axis=0)
         near = np.argsort(distance, kind="stable")[: inside.size // 2]
         _, _, order = qr(at_inside[:, near], mode="economic", pivoting=True)
@@ -157,7 +157,7 @@ class PopulationDensity:
     """Populations of some inputs, compiled once: log-densities and draws."""
 
     inputs: Inputs
-    # The last points with the form of their log-density.
+    # Points of the last call, and the form of their log-density, if there is one.
     _form: tuple[Any, ExponentialForm | None] = (None, None)
 
     @cached_property
@@ -175,8 +175,8 @@ class PopulationDensity:
         previous, form = self._form
         if previous is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
-            # At an end of a support PyMC's density may be finite, or infinite.
-            # Points of specimens with covariates have several populations.
+            # The form is not used at the end of a support, where PyMC's density may be finite or
+            # infinite, nor with covariates, which give each point a population of its own.
             if form is not None and (self.inputs.covariates or not form.is_inside.all()):
                 form = None
             self._form = points[0], form
@@ -189,7 +189,7 @@ class PopulationDensity:
             if form is None:
                 (logs,) = self.log_density(*params, *[x[rows] for x in points])
                 return np.array(logs)
-            # In one thread: the points of a design do not depend on the number of threads.
+            # One thread, so that the points of a design do not depend on the number of threads.
             with one_thread():
                 logs = natural @ form.statistics[:, rows]
             if is_rounded.any():

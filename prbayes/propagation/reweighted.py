@@ -39,7 +39,6 @@ from prbayes.propagation.importance import (
     DesignEmulator,
     MixtureSampler,
     Sample,
-    fit_design_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
 from prbayes.propagation.population_density import PopulationDensity, normalise
@@ -233,7 +232,7 @@ class ReweightedBound(Bound):
 
     stored: ClassVar[bool] = True
     has_runs: ClassVar[Literal[True]] = True  # as points, unlike emulated specimens
-    is_continued: ClassVar[bool] = False  # whether responses are taken as constant beyond the runs
+    is_continued: ClassVar[bool] = False  # whether responses are constant beyond the runs
 
     def __init__(
         self,
@@ -421,7 +420,7 @@ class ReweightedBound(Bound):
         design = self._design
         assert design.emulator is not None
         runs = replace(design.runs, values=at_runs)
-        emulator = fit_design_emulator(self.config.emulator, runs, design.emulator.weights)
+        emulator = DesignEmulator.fit(self.config.emulator, runs, design.emulator.weights)
         # With half of the population, the bias of the emulator is as large as the scatter of runs.
         # The runs have the share that the design's own response gave them.
         most = 0.5

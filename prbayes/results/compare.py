@@ -275,7 +275,7 @@ def _scores(
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
             default: Sequence[Metric] = _METRICS
-            if simulator.is_emulated:  # its log-likelihood replaces the kernel form
+            if simulator.metric.by_specimen:  # its log-likelihood replaces the kernel form
                 default = _METRICS[:-1]
             if simulator.observed.ndim > 1:
                 default = [Joint(metric) for metric in default]  # the same in all directions

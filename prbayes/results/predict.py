@@ -484,7 +484,7 @@ def _predicted(
     results: list[_Predicted] = []
     emulated: EmulatedResponse | None = None
     for group_points in by_group:
-        if simulator is not None and not simulator.is_emulated:
+        if isinstance(simulator, Node):
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
             continue
         parents = [group_points[str(rv.name)] for rv in inputs.parents]

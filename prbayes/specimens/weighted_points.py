@@ -27,9 +27,9 @@ class WeightedPoints:
     """Points of N specimens, with the density of populations there."""
 
     density: PopulationDensity
-    x: Sequence[Floats]  # (N, K, *event): by aleatory input
-    log_a: Floats  # (N, K)
-    # at the points in the order of (K, N): reductions are then sums of long rows
+    x: Sequence[Floats]  # (N, K, *event): values of each aleatory input
+    log_a: Floats  # (N, K): the numbers A
+    # Form for points in the order of (K, N), so that reductions are sums of long rows.
     form: ExponentialForm | None
 
     @classmethod
@@ -62,7 +62,8 @@ class WeightedPoints:
         with np.errstate(all="ignore"):
             (at_anchors,) = self.density.log_density(*at_each, *form.anchors)
         natural, is_rounded = form.natural_parameters(at_anchors)
-        # A is a statistic whose parameter is one; -inf in a product may become NaN.
+        # A is a statistic whose parameter is one. A large number replaces -inf, as a product of
+        # infinity and zero is NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
         terms = np.vstack([form.statistics, np.maximum(base, -1e300)]).T
         parameters = np.vstack([natural.T, np.ones(len(natural))])
@@ -137,7 +138,7 @@ def _log_sum_exp_first(exponents: Floats) -> Floats:
     return np.where(largest < -1e299, -np.inf, total)
 
 
-type Normal = tuple[Floats, Floats]  # mean (d,) and lower Cholesky factor of the covariance (d, d)
+type Normal = tuple[Floats, Floats]  # mean (d,) and lower Cholesky factor (d, d)
 
 
 def fit_normal(z: Floats, log_a: Floats, start: Any = None) -> Normal:

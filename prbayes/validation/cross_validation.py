@@ -16,7 +16,7 @@ from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
 from prbayes.inference.refits import refit
-from prbayes.inference.resampling import DataSets, specimens
+from prbayes.inference.resampling import DataSets
 from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
 from prbayes.metrics.likelihood import LogLikelihood
@@ -26,6 +26,7 @@ from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
 from prbayes.response.condition import is_condition
@@ -203,7 +204,7 @@ class Ranking(Table):
 
 def most_folds(optimum: Optimum, limit: int) -> int:
     """Return the largest number of folds of two specimens or more, at most a limit."""
-    _, total = specimens(optimum.evaluator.simulators)
+    _, total = number_specimens(optimum.evaluator.simulators)
     return max(2, min(limit, total // 2))
 
 
@@ -215,7 +216,7 @@ def _folds(
     Return weights of held-out observations and of the other ones, which sum to one, (folds, n_k) by
     simulator; and numbers of held-out observations, (folds, simulators).
     """
-    numbers, total = specimens(simulators)
+    numbers, total = number_specimens(simulators)
     if total < 2 * folds:
         raise ValueError(f"folds: got {folds} for {total} specimens, expected at most {total // 2}")
     # The 3 makes random numbers differ from others with the same seed.
@@ -278,7 +279,7 @@ def _specimen_scores(
     evaluator: Evaluator, thetas: Floats, held_out: list[Floats]
 ) -> tuple[Floats, Floats]:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
-    numbers, total = specimens(evaluator.simulators)
+    numbers, total = number_specimens(evaluator.simulators)
     scores, counts = np.zeros(total), np.zeros(total)
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
