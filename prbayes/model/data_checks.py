@@ -443,16 +443,20 @@ def data_findings(
     if rounded_outputs:
         findings.insert(0, _rounding_finding(rounded_outputs, largest_step))
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
-        groups = identical_specimens(exact)
-        listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
-        more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
-        text = (
-            f"Got specimens {listed}{more} (counted from 0) with identical values of all outputs, "
-            "expected different ones; leave out copies, pass specimens= and error= for repeated "
-            "readings, or rounded= for coarse ones."
-        )
-        findings.append(Finding("identical-specimens", text, "likelihood.md#identical-specimens"))
+        findings.append(_repeats_finding(identical_specimens(exact)))
     return tuple(findings)
+
+
+def _repeats_finding(groups: Sequence[Sequence[int]]) -> Finding:
+    """Return the finding of groups of identical specimens."""
+    listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
+    more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
+    text = (
+        f"Got specimens {listed}{more} (counted from 0) with identical values of all outputs, "
+        "expected different ones; leave out copies, pass specimens= and error= for repeated "
+        "readings, or rounded= for coarse ones."
+    )
+    return Finding("identical-specimens", text, "likelihood.md#identical-specimens")
 
 
 def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: float) -> Finding:

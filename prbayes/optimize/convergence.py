@@ -118,6 +118,7 @@ class Search:
     ridge: Ridge | None = None  # added to the objective
     uses_gradient: bool = field(init=False)  # whether the method receives gradients
     has_kinks: bool = field(init=False)  # gradients jump: line searches end in ever smaller steps
+    is_random: bool = field(init=False)  # whether evaluations draw specimens
 
     def __post_init__(self) -> None:
         nodes = self.evaluator.nodes
@@ -132,6 +133,7 @@ class Search:
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
         object.__setattr__(self, "uses_gradient", self.method.gradient and not random)
         object.__setattr__(self, "has_kinks", has_kinks)
+        object.__setattr__(self, "is_random", bool(random))
 
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; for a user's metric its value at theta."""
@@ -395,7 +397,7 @@ def approach(
     response. Returns theta itself where there is overlap.
     """
     evaluator = search.evaluator
-    if [node for node in evaluator.nodes if node.bound.random]:
+    if search.is_random:
         return theta, trace
     # A weight effective sample size below two: the design does not reach the population at all.
     ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]
