@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,25 +45,23 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
         # parts of equal mass, count as exact.
         if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
-        left_out = [
-            node.reweighted.design.without_each_block() if node.reweighted else [] for node in nodes
-        ]
-        if any(left_out):
-            error = _error_of_emulators(sampling, left_out)
-            emulators = float(np.sqrt(2) * error.max(initial=0.0))
+        emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
     return DesignErrors(points, emulators)
 
 
-def _error_of_emulators(
-    sampling: SamplingDistribution, left_out: Sequence[Sequence[Floats]]
-) -> Floats:
-    """Return the error of the optimum by emulators, (r,).
+def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
+    """Return the error of the optimum by emulators, (r,); NaN if no design has an emulator.
 
     From minima of emulators that lack a block of the runs, less the minimum of the whole by the
-    same descent, which may differ from the optimum for other reasons. ``left_out`` are the
-    responses by these emulators, by simulator; none of a simulator without emulated points.
+    same descent, which may differ from the optimum for other reasons.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
+    left_out = [
+        node.reweighted.design.without_each_block() if node.reweighted else []
+        for node in evaluator.nodes
+    ]
+    if not any(left_out):
+        return np.full(sampling.stderr.size, np.nan)
     observed = observed_set(evaluator)
     whole = BatchObjective.of(evaluator, scales, observed)
     descent = descent_of(sampling, whole, is_rough=True)
