@@ -24,7 +24,7 @@ from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import arrays
-from prbayes.model.specimen_preparation import Populations, prepared
+from prbayes.model.specimen_preparation import SpecimenPopulations, prepared
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.results.likelihood_checks import check_conflict, check_draws, check_population
 
@@ -82,7 +82,7 @@ def before_the_fit(
         return {"before the fit": ["refused"], "error": str(error)}
 
 
-def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
+def of_draws(evaluator: Evaluator, populations: SpecimenPopulations) -> dict[str, Any]:
     """Return the codes of the findings of posterior draws, and the tests that were not run."""
     (likelihood,) = evaluator.likelihoods
     points = prepared(likelihood).points
@@ -116,13 +116,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 @cache
-def prepared_case(name: str) -> tuple[Evaluator, SpecimenLikelihood, Populations]:
+def prepared_case(name: str) -> tuple[Evaluator, SpecimenLikelihood, SpecimenPopulations]:
     """Return an evaluator to be given data, a likelihood with the first runs, and populations."""
     _base_model, base = likelihood_of(CASES[name])
     model, _ = likelihood_of(CASES[name])
     evaluator = Evaluator.of(model)
     (likelihood,) = evaluator.likelihoods
-    return evaluator, base, Populations(likelihood)
+    return evaluator, base, SpecimenPopulations(likelihood)
 
 
 def row(name: str, number: int) -> dict[str, Any]:

@@ -23,9 +23,9 @@ from benchmarks.responses import RESPONSES
 from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_preparation import (
+    CheckedRuns,
     PopulationDraws,
-    Populations,
-    Runs,
+    SpecimenPopulations,
     prepared,
     specimen_data,
 )
@@ -60,12 +60,12 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
     thetas = evaluator.hyperparameters.thetas_of(
         [idata.posterior[rv.name].values.reshape(-1) for rv in model.free_RVs]
     )
-    populations = Populations(likelihood)
+    populations = SpecimenPopulations(likelihood)
     reference = normal_of(PopulationDraws(populations, thetas[::8]).specimens(), 1.2)
     data = specimen_data(likelihood)
     exact = replace(
         prepared(likelihood).emulation,
-        surface=DifferencedResponse(Runs(likelihood)),
+        surface=DifferencedResponse(CheckedRuns(likelihood)),
         y=np.zeros_like(prepared(likelihood).emulation.y),
         error=data.options.floor * data.readings.spread(),
     )

@@ -189,7 +189,7 @@ def _opened(path: Path) -> xr.DataTree:
 
 
 def _validity_test(path: Path, dataset: xr.Dataset) -> ValidityTest:
-    from prbayes.model.fingerprint import from_attributes
+    from prbayes.model.fingerprint import identity_from_attributes
     from prbayes.validation.area_test import ValidityTest
 
     numbers = ("statistic", "critical_value", "p_value", "alpha")
@@ -202,7 +202,7 @@ def _validity_test(path: Path, dataset: xr.Dataset) -> ValidityTest:
             envelope=dataset[["lower", "upper"]].to_array().values,
             conditions=dataset["condition"].values.astype(str),
             specimens=dataset["specimen"].values.astype(str),
-            identity=from_attributes(dataset.attrs),
+            identity=identity_from_attributes(dataset.attrs),
         )
     except KeyError as error:
         raise UserError(

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import likelihood_coverage, likelihood_guards, many_inputs, readings_coverage
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_preparation import Populations
+from prbayes.model.specimen_preparation import SpecimenPopulations
 
 pytestmark = pytest.mark.long
 
@@ -39,7 +39,7 @@ def test_guards() -> None:
     (likelihood,) = evaluator.likelihoods
     y = likelihood_guards.readings(problem, 0)
     assert likelihood_guards.before_the_fit(likelihood, base, y) == {"before the fit": []}
-    found = likelihood_guards.of_draws(evaluator, Populations(likelihood))
+    found = likelihood_guards.of_draws(evaluator, SpecimenPopulations(likelihood))
     assert found == {"codes": [], "untested": []}
 
 

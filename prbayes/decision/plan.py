@@ -463,7 +463,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     thetas = cross(sample.populations.center, step)
     weights = sample.masses(thetas)
     outputs = sample.outputs
-    if sample.emulator is None:
+    if sample.design.has_runs:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
     else:
         is_observable = np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)

@@ -17,7 +17,7 @@ from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
 from prbayes.model.evaluator import read_inputs_of_copy
-from prbayes.model.fingerprint import from_attributes, require_together
+from prbayes.model.fingerprint import identity_from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
 from prbayes.model.parameters import element_name, variable_of, variables_at
 from prbayes.optimize.optimum import identity_in
@@ -163,7 +163,7 @@ class PopulationReader:
                 "prb.decision.Condition(response, *inputs)"
             )
         identities = {"result": identity_in(self.populations.result)}
-        require_together(identities | {name: from_attributes(predicted.attrs)}, caller)
+        require_together(identities | {name: identity_from_attributes(predicted.attrs)}, caller)
         nodes = self.populations.evaluator.simulators
         groups = next((n.inputs.groups for n in nodes if n.inputs.groups is not None), None)
         groups = groups if groups is not None and groups.dim in predicted.dims else None

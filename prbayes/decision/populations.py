@@ -28,7 +28,7 @@ from prbayes.decision.quantities import (
 )
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
-from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
+from prbayes.model.emulated import EmulatedSample
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
@@ -125,7 +125,7 @@ class Populations:
         )
 
     @cached_property
-    def _emulated_samples(self) -> dict[int, EmulatedSample]:
+    def _designs(self) -> dict[int, ReweightedBound | EmulatedSample]:
         return {}
 
     def sample(
@@ -154,18 +154,11 @@ class Populations:
                 "other .dist() objects with n_points=1000, prb.predict also model variables"
             )
         k = simulators.index(simulator)
-        if simulator.is_emulated:
-            if k not in self._emulated_samples:
-                parents = self.evaluator.parents(self.thetas, k)
-                self._emulated_samples[k] = EmulatedSample.of(simulator, parents)
-            design = self._emulated_samples[k]
-            emulator = simulator.emulator(responses)
-            values = emulator(design.points_of(responses.inputs))
-            sample = ResponseSample(self, k, design, responses, values, None, emulator)
-        else:
-            bound = simulator.reweighted
-            assert bound is not None
-            sample = ResponseSample(self, k, bound, responses, bound.values_of(responses), None)
+        if k not in self._designs:
+            parents = self.evaluator.parents(self.thetas, k)
+            self._designs[k] = simulator.weighted_sample(parents)
+        design = self._designs[k]
+        sample = ResponseSample(self, k, design, responses, design.values_of(responses), None)
         sample.refuse_unsupported()
         return sample
 
@@ -180,7 +173,6 @@ class ResponseSample:
     responses: Responses
     outputs: Floats  # (n,) or (n, m): outputs at the design's points
     column: int | None  # column of the output; None for a response with one number
-    emulator: EmulatedResponse | None = None  # emulator of the response, where it is not stored
 
     def select(self, outputs: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""
@@ -198,16 +190,7 @@ class ResponseSample:
         or add the error of left-out runs, or the error beyond the runs' range. The list is empty if
         responses are stored and not emulated.
         """
-        if self.emulator is None:
-            assert self.design.has_runs
-            return [self.select(v) for v in self.design.emulated(self.responses, list(points))]
-        inputs = values_of(points, self.design.inputs, self.responses.inputs)
-        values = self.emulator(inputs)
-        error = self.emulator.error.reshape(self.emulator.event)
-        return [
-            self.select(outputs)
-            for outputs in (values, values + error, self.emulator.steepened(inputs))
-        ]
+        return [self.select(v) for v in self.design.emulated(self.responses, list(points))]
 
     @cached_property
     def _order(self) -> Indices:
@@ -224,10 +207,7 @@ class ResponseSample:
     @property
     def n_runs(self) -> int:
         """Number of runs behind the responses."""
-        if self.emulator is not None:
-            return len(self.emulator.z)
-        assert self.design.has_runs
-        return self.design.n_runs
+        return self.design.n_runs_of(self.responses)
 
     @cached_property
     def blocks(self) -> Indices:
@@ -355,15 +335,14 @@ class ResponseSample:
         findings += _beyond_runs(self, quantity)
         (weights,) = self.weights(center)
         is_beyond = quantity.of_specimen(self.values, at)
-        on_line = self.design.has_runs and self.design.design.on_line
-        if not on_line:  # because the jackknife of few points in a tail is itself rough
+        if not self.design.on_line:  # because the jackknife of few points in a tail is itself rough
             rare = weights * (is_beyond if is_upper else 1 - is_beyond)
             error = max(error, float(np.linalg.norm(rare)))
         tails = probability_bounds(share, error, float(ndtr(-1)))
         tails *= min(quantity.probability, 1 - quantity.probability) / share
         ends = ascending_quantile(self.values, weights, 1 - tails if is_upper else tails)
         error = float(np.abs(ends - value).max())
-        if self.emulator is not None:
+        if self.design.is_continued:
             error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
         return findings, error
 
@@ -385,7 +364,7 @@ def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
 
 def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
     """Return a finding if the constant response beyond the runs limits a quantity."""
-    if sample.emulator is None:
+    if not sample.design.is_continued:
         return ()
     thetas = sample.populations.thinned()
     change = standard_deviation(_range_effect(sample, quantity, thetas)) / 2

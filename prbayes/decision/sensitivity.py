@@ -385,7 +385,7 @@ def _responses_at(
     if computed:
         return [sample.select(transform.responses(sample.responses, z))]
     x = transform(z)
-    if not (sample.design.has_runs and sample.design.design.on_line):
+    if not sample.design.on_line:
         return sample.emulated(x)
     # With one input interpolate between the runs, and return the response of the nearest run where
     # that is not finite.

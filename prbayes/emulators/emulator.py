@@ -159,3 +159,19 @@ def fit_emulator(
     if components is not None:
         left_out += rest
     return Emulator(z, unit * left_out, center, unit, components, tuple(surfaces))
+
+
+def with_failures(values: Floats, points: Floats, runs: Floats, outputs: Floats) -> Floats:
+    """Return values at points, (k, ...), or the outputs of the nearest run where that run failed.
+
+    Points (k, d) and runs (n, d) have common units. Outputs (n, ...) of runs that failed are not
+    finite. The values are overwritten.
+    """
+    has_failed = ~np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+    if has_failed.any():
+        from scipy.spatial import cKDTree
+
+        _, nearest = cKDTree(runs).query(points)
+        is_beside = has_failed[nearest]
+        values[is_beside] = outputs[nearest[is_beside]]
+    return values

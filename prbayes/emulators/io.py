@@ -35,7 +35,7 @@ class SavedSurrogate:
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
-def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
+def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
@@ -71,8 +71,8 @@ def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
     replace_files({Path(path): bytes(data.to_netcdf(engine="h5netcdf"))}, "Surrogate.save: path")
 
 
-def read(path: str | PathLike[str]) -> SavedSurrogate:
-    """Read a file of `write`, or raise a StoreError if it cannot be read, or is no surrogate."""
+def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
+    """Read a file of `write_surrogate`; raise a StoreError if it cannot be read, or is none."""
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:
             data.load()

@@ -171,7 +171,9 @@ def read_ranges(
     if random:
         samples = predictive_inputs(name, list(random.values()), random_seed)
         draws = dict(zip(random, samples, strict=True))
-    ranges = Ranges(tuple(_range(name, k, x, draws.get(k), coverage) for k, x in entries.items()))
+    ranges = Ranges(
+        tuple(_range_of(name, k, x, draws.get(k), coverage) for k, x in entries.items())
+    )
     if not ranges.dimensions:
         raise ValueError(
             f"{name}: inputs: got constants only, expected at least one range or distribution"
@@ -188,7 +190,9 @@ def read_ranges(
     return ranges, rows[~ranges.outside(rows).any(axis=1)]
 
 
-def _range(name: str, key: str | int, entry: Any, draws: Floats | None, coverage: float) -> Range:
+def _range_of(
+    name: str, key: str | int, entry: Any, draws: Floats | None, coverage: float
+) -> Range:
     """Return the range of an input: given, or of the central share of draws; or a constant."""
     label = key if isinstance(key, str) else str(getattr(entry, "name", None) or f"input {key}")
     if draws is not None:  # (populations, specimens, *event)

@@ -14,7 +14,7 @@ from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surrogate import Surrogate, labelled
+from prbayes.emulators.surrogate import Surrogate, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
@@ -229,7 +229,7 @@ def continued(runs: Runs, *inputs: ArrayLike) -> Any:
     _, jacobian = surrogate._surface.emulator(inner[rows])
     change = np.einsum("kmd,kd->km", jacobian, unit[rows] - inner[rows])
     values[rows] += change.reshape(values[rows].shape)
-    return labelled(surrogate, values, batch)
+    return with_output_labels(surrogate, values, batch)
 
 
 def left_out_nearby(runs: Runs, *inputs: ArrayLike) -> Any:
@@ -237,4 +237,4 @@ def left_out_nearby(runs: Runs, *inputs: ArrayLike) -> Any:
     surrogate = runs.surrogate
     columns, batch = surrogate.domain.columns(inputs)
     residuals = surrogate._surface.nearby(surrogate.error.residuals, columns)[:, 0]
-    return labelled(surrogate, residuals, batch)
+    return with_output_labels(surrogate, residuals, batch)

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from prbayes._display import without_constructor
 from prbayes._validate import Floats
-from prbayes.emulators.emulator import Emulator, fit_emulator
+from prbayes.emulators.emulator import Emulator, fit_emulator, with_failures
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
 
@@ -45,12 +45,12 @@ class CrossValidation:
     @property
     def rms(self) -> Any:
         """Root mean square, in units of the response; (m,) of several outputs."""
-        return _number(np.sqrt(np.nanmean(self.residuals**2, axis=0)))
+        return _scalar_or_array(np.sqrt(np.nanmean(self.residuals**2, axis=0)))
 
     @property
     def largest(self) -> Any:
         """Largest magnitude, in units of the response; (m,) of several outputs."""
-        return _number(np.nanmax(np.abs(self.residuals), axis=0))
+        return _scalar_or_array(np.nanmax(np.abs(self.residuals), axis=0))
 
     @property
     def relative(self) -> Any:
@@ -62,7 +62,7 @@ class CrossValidation:
         is_constant = sd == 0
         of_constant = np.where(np.asarray(self.rms) > 0, np.inf, 0.0)
         ratio = self.rms / np.where(is_constant, 1.0, sd)
-        return _number(np.where(is_constant, of_constant, ratio))
+        return _scalar_or_array(np.where(is_constant, of_constant, ratio))
 
     def __str__(self) -> str:
         numbers = zip(*map(np.atleast_1d, (self.rms, self.relative, self.largest)), strict=True)
@@ -72,7 +72,7 @@ class CrossValidation:
         )
 
 
-def _number(values: Any) -> Any:
+def _scalar_or_array(values: Any) -> Any:
     """Return an array of several outputs, or the number of one."""
     return float(values) if np.ndim(values) == 0 else values
 
@@ -87,7 +87,7 @@ def points_needed(model: Any, dimensions: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class TrainingRuns:
     """Runs that an emulator is fitted on."""
 
     x: Floats  # (n, d): inputs
@@ -145,14 +145,7 @@ class Runs:
         lowest, highest = y.min(axis=0), y.max(axis=0)
         reach = highest - lowest
         values = np.clip(emulator.values(points), lowest - reach, highest + reach)
-        if not self.good[mask].all():
-            from scipy.spatial import cKDTree
-
-            places = np.flatnonzero(mask)
-            nearest = places[cKDTree(self.scaled(self.x[places])).query(points)[1]]
-            failed = ~self.good[nearest]
-            values[failed] = self.y[nearest[failed]]
-        return values
+        return with_failures(values, points, self.scaled(self.x[mask]), self.y[mask])
 
     def predict_without_blocks(self, emulator: Emulator, at: Floats) -> Iterator[Floats]:
         """Yield the predictions, (k, m), of emulators without each block of the runs."""

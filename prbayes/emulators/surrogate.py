@@ -26,14 +26,14 @@ from prbayes._validate import (
     seed_number,
     share,
 )
-from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator, fit_emulator
+from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator, fit_emulator, with_failures
 from prbayes.emulators.following import Follower, fit_follower
-from prbayes.emulators.io import read, write
+from prbayes.emulators.io import read_surrogate, write_surrogate
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.selection import CrossValidation, points_needed
 from prbayes.emulators.surfaces import Surface, as_surface
-from prbayes.emulators.table import Table, read_table
+from prbayes.emulators.table import RunTable, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
@@ -50,7 +50,7 @@ _log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True, eq=False)
-class FittedSurface:
+class DesignSurface:
     """A surface through the usable runs of a design, or one for each output."""
 
     domain: Ranges
@@ -72,7 +72,7 @@ class FittedSurface:
         coarse: Callable[..., Any] | None = None,
         coarse_values: Floats | None = None,
         seed: int = 0,
-    ) -> FittedSurface:
+    ) -> DesignSurface:
         """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller."""
         unit, usable = domain.scaled(points), _usable(responses)
         x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
@@ -127,15 +127,11 @@ class FittedSurface:
         return self(self.domain.at(sobol(64, self.domain.dimensions, 0)))
 
     @cached_property
-    def _trees(self) -> tuple[Any, Any]:
-        """Search trees of all runs and of the usable ones."""
+    def _tree(self) -> Any:
+        """The search tree of the usable runs."""
         from scipy.spatial import cKDTree
 
-        return cKDTree(self.unit), cKDTree(self.unit[self.usable])
-
-    def nearest(self, columns: Floats) -> NDArray[np.intp]:
-        """Return the run that is nearest to each row, (n,)."""
-        return np.asarray(self._trees[0].query(self.domain.scaled(columns))[1])
+        return cKDTree(self.unit[self.usable])
 
     def nearby(self, residuals: Floats, columns: Floats) -> Floats:
         """Return the residuals of the nearest usable runs, (n, k, ...)."""
@@ -143,7 +139,7 @@ class FittedSurface:
         # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
         k = min(len(usable), 4 * (unit.shape[1] + 1))
         # Points that are not finite are outside: any neighbours will do.
-        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        _, nearest = self._tree.query(np.where(np.isfinite(unit), unit, 0.5), k=k)
         return np.asarray(usable[nearest])
 
 
@@ -209,7 +205,7 @@ class Surrogate(Shown):
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
     _named: Outputs | None = field(repr=False, default=None)
-    _surface: FittedSurface = field(repr=False, kw_only=True)
+    _surface: DesignSurface = field(repr=False, kw_only=True)
 
     @classmethod
     def fit(
@@ -334,7 +330,7 @@ class Surrogate(Shown):
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
         # Fit the surface, and estimate its error.
-        surface = FittedSurface.of(model, domain, design, responses, coarse, coarse_values, seed)
+        surface = DesignSurface.of(model, domain, design, responses, coarse, coarse_values, seed)
         if coarse is not None and surface.coarse is None:
             _log.info("%s: the coarse response does not improve the fit, and is not used", name)
         residuals = surface.left_out
@@ -398,7 +394,7 @@ class Surrogate(Shown):
     def of_table(
         cls,
         name: str,
-        table: Table,
+        table: RunTable,
         model: Any = None,
         outside: OnFailure | None = None,
         random_seed: Seed = 0,
@@ -415,7 +411,7 @@ class Surrogate(Shown):
         _refuse_unfit(name, values, min(needed))
         n_usable = _usable(values).sum()
         models = tuple(m for m, n in zip(models, needed, strict=True) if n <= n_usable)
-        surfaces = [FittedSurface.of(m, domain, design, values, seed=seed) for m in models]
+        surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
         spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
         # The largest residuals are those of the most extreme runs.
@@ -499,7 +495,7 @@ class Surrogate(Shown):
             once = f"{text}; they give {replacement}; this warning appears once."
             report(Finding("outside-ranges", once), level=level)
             self._warned[:] = [True]
-        return labelled(self, values, batch)
+        return with_output_labels(self, values, batch)
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
         """Return the root mean square of the cross-validation residuals nearby.
@@ -553,7 +549,7 @@ class Surrogate(Shown):
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._surface.probes())
+        write_surrogate(path, self, self._surface.probes())
 
     @classmethod
     def load(
@@ -584,7 +580,7 @@ class Surrogate(Shown):
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """
-        saved = read(file_path(path, "path"))
+        saved = read_surrogate(file_path(path, "path"))
         model = saved.model if model is None else model
         if model is None:
             raise TypeError(
@@ -602,7 +598,7 @@ class Surrogate(Shown):
         coarse_values = None
         if coarse is not None:
             coarse_values = _coarse_at("Surrogate.load", coarse, domain, points)
-        surface = FittedSurface.of(model, domain, points, responses, coarse, coarse_values)
+        surface = DesignSurface.of(model, domain, points, responses, coarse, coarse_values)
         spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
         probes, expected = surface.probes() / size, saved.probes / size
@@ -629,14 +625,11 @@ class Surrogate(Shown):
             place = (number % np.uint64(k)).astype(np.intp)
             signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
             values = values + residuals[np.arange(n), place] * signs
-        if not self._surface.usable.all():
-            nearest = self._surface.nearest(columns)
-            is_failed = ~self._surface.usable[nearest]
-            values[is_failed] = self.responses[nearest[is_failed]]
-        return values
+        unit = self.domain.scaled(columns)
+        return with_failures(values, unit, self._surface.unit, self.responses)
 
 
-def labelled(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
+def with_output_labels(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
     """Return values of rows in the shape of a batch, with the labels of the outputs."""
     values = values.reshape((*batch, *surrogate.responses.shape[1:]))
     return values if surrogate._named is None else surrogate._named.by_key(values)

@@ -17,7 +17,7 @@ from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class RunTable:
     """Runs, and the names of their outputs."""
 
     domain: Ranges
@@ -32,9 +32,9 @@ class Table:
         return Outputs(self.outputs) if is_named else None
 
 
-def read_table(caller: str, inputs: Any, responses: Any) -> Table:
+def read_table(caller: str, inputs: Any, responses: Any) -> RunTable:
     """Read runs; raise TypeError or ValueError at the first cell that is not as expected."""
-    named = _columns(f"{caller}: inputs", inputs, inputs)
+    named = _named_columns(f"{caller}: inputs", inputs, inputs)
     names = [name or f"x{i}" for i, (name, _) in enumerate(named, 1)]
     if len(set(names)) < len(names):
         raise ValueError(f"{caller}: inputs: got the names {names}, expected different ones")
@@ -58,7 +58,7 @@ def read_table(caller: str, inputs: Any, responses: Any) -> Table:
                 "input that varies between them; leave the column out"
             )
         ranges.append(Range(name, low, high))
-    outputs = _columns(f"{caller}: responses", responses, inputs)
+    outputs = _named_columns(f"{caller}: responses", responses, inputs)
     parts, labels = [], []
     for name, column in outputs:
         _refuse_length(f"{caller}: responses{name and f': {name}'}", column, n)
@@ -72,7 +72,7 @@ def read_table(caller: str, inputs: Any, responses: Any) -> Table:
     m = values.shape[1]
     if not all(labels) or len(set(labels)) < m:
         labels = ["response"] if m == 1 else [f"response[{i}]" for i in range(m)]
-    return Table(domain, points, values[:, 0] if m == 1 else values, tuple(labels))
+    return RunTable(domain, points, values[:, 0] if m == 1 else values, tuple(labels))
 
 
 def read_csv(
@@ -113,7 +113,7 @@ def read_csv(
             label = f"{caller}: line {reader.line_num}"
             rows.append(
                 [
-                    _number(cells[place], decimal, f"{label}: {name}")
+                    _number_in_cell(cells[place], decimal, f"{label}: {name}")
                     for place, name in zip(places, wanted, strict=True)
                 ]
             )
@@ -121,7 +121,7 @@ def read_csv(
     return {name: table[name] for name in inputs}, {name: table[name] for name in outputs}
 
 
-def _number(cell: str, decimal: str, label: str) -> float:
+def _number_in_cell(cell: str, decimal: str, label: str) -> float:
     """Return the number of a cell; NaN of an empty one."""
     text = cell.strip()
     try:
@@ -134,7 +134,7 @@ def _number(cell: str, decimal: str, label: str) -> float:
         ) from None
 
 
-def _columns(label: str, values: Any, inputs: Any) -> list[tuple[str, Floats]]:
+def _named_columns(label: str, values: Any, inputs: Any) -> list[tuple[str, Floats]]:
     """Return columns (n, *event) in the order of the inputs' index; names are empty without one."""
 
     def column(part: Any, name: str) -> Floats:

@@ -15,7 +15,7 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import observed_set
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import have_emulated_points
 from prbayes.model.random_variable import Node
 from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
@@ -35,11 +35,6 @@ class DesignErrors:
         return float(np.linalg.norm(errors)) if errors else np.nan
 
 
-def is_emulated(evaluator: Evaluator) -> bool:
-    """Return whether all designs have emulated samples; True without a design."""
-    return all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-
-
 def design_error(sampling: SamplingDistribution) -> DesignErrors:
     """Return the distance to the optimum of another design along the worst axis."""
     points = emulators = np.nan
@@ -50,13 +45,12 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
         # cut it into parts of equal mass, and count as exact.
         if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
-        if [bound for bound in designs.values() if bound.design.is_emulated]:
-            emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
+        emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
     return DesignErrors(points, emulators)
 
 
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
-    """Return the error of the optimum by emulators, (r,).
+    """Return the error of the optimum by emulators, (r,); NaN if no design has an emulator.
 
     It is the spread of minima by emulators that lack a block of the runs, around the minimum by all
     runs. The same descent finds that minimum, because it may differ from the optimum for other
@@ -67,6 +61,8 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
         node.reweighted.design.without_each_block() if node.reweighted else []
         for node in evaluator.nodes
     ]
+    if not any(left_out):
+        return np.full(sampling.stderr.size, np.nan)
     observed = observed_set(evaluator)
     whole = BatchObjective.of(evaluator, scales, observed)
     descent = descent_of(sampling, whole, is_rough=True)
@@ -101,7 +97,7 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5
-    if is_emulated(evaluator):
+    if have_emulated_points(evaluator):
         # This is the rate of points that fill d dimensions evenly, for functions with a jump along
         # a surface. The rate of smooth functions is up to 1/2 + 1/d (He and Owen 2016,
         # doi:10.1111/rssb.12132).

@@ -19,6 +19,7 @@ from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.propagation.reweighted import same_points
 from prbayes.response.distributions import PopulationSampler
 
@@ -46,30 +47,9 @@ class DataSets:
 # -- specimens in common ---------------------------------------------------------------------------
 
 
-def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[Indices], int]:
-    """Return the specimen's number of each observation, by simulator, and the number of specimens.
-
-    An observation without a label is a specimen of its own.
-    """
-    numbers: dict[object, int] = {}
-    total = 0
-    by_simulator = []
-    for node in nodes:
-        if node.specimens is None:
-            rows = np.arange(total, total + len(node.observed))
-            total += rows.size
-        else:
-            labels = node.specimens.tolist()
-            for label in labels:
-                total += numbers.setdefault(label, total) == total
-            rows = np.array([numbers[label] for label in labels], dtype=np.intp)
-        by_simulator.append(rows)
-    return by_simulator, total
-
-
 def dependent(nodes: Sequence[Node]) -> bool:
     """Return whether a specimen has several observations."""
-    numbers, total = specimens(nodes)
+    numbers, total = number_specimens(nodes)
     return total < np.concatenate(numbers).size
 
 
@@ -79,7 +59,7 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
 
     if all(node.specimens is None for node in nodes):
         return [[k] for k in range(len(nodes))]
-    numbers, total = specimens(nodes)
+    numbers, total = number_specimens(nodes)
     measures = np.array([np.isin(np.arange(total), number) for number in numbers])
     _, group = connected_components(measures @ measures.T)
     return [np.flatnonzero(group == g).tolist() for g in np.unique(group)]
@@ -212,7 +192,7 @@ def sets_along(
         drawn_counts = _drawn_counts(evaluator, responses, masses, rng)
         sets = _counted_sets(evaluator, responses, drawn_counts)
         return sets, [csr_array(count.astype(np.float64)) for count in drawn_counts]
-    numbers, total = specimens(nodes)
+    numbers, total = number_specimens(nodes)
     size = (len(thetas), total)
     points: dict[int, Indices] = {}
     counts = []
@@ -252,7 +232,7 @@ def simulated_points(
     """
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
-    size = specimens(nodes)[1] + more
+    size = number_specimens(nodes)[1] + more
     responses = [values[0] for values, _ in populations]
     points: dict[int, Indices] = {}
     for group in _aligned_groups(nodes):
@@ -282,7 +262,7 @@ def _points_of(mass: Floats, uniform: Floats) -> Indices:
 
 def sets_at(evaluator: Evaluator, populations: list[Floats], points: list[Indices]) -> DataSets:
     """Return data sets of specimens, which are given as indices of the responses (n,)."""
-    numbers, _ = specimens(evaluator.nodes)
+    numbers, _ = number_specimens(evaluator.nodes)
     values, weights = [], []
     for k, (node, responses) in enumerate(zip(evaluator.nodes, populations, strict=True)):
         is_observable = observable(responses, node.target)
@@ -344,7 +324,7 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     Specimens that cannot be observed are replaced, as in `simulated_sets`.
     """
     nodes = evaluator.nodes
-    numbers, total = specimens(nodes)
+    numbers, total = number_specimens(nodes)
     node_groups = _aligned_groups(nodes)
     data = {}
     for group, generator in zip(node_groups, rng.spawn(len(node_groups)), strict=True):
@@ -412,7 +392,7 @@ def dirichlet_weights(
     Observations with the same label are weighted together.
     """
     rng = np.random.default_rng([seed, 2])
-    numbers, total = specimens(simulators)
+    numbers, total = number_specimens(simulators)
     gains = rng.standard_exponential((n_sets, total))
     weights = []
     for number, simulator in zip(numbers, simulators, strict=True):

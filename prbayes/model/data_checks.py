@@ -25,7 +25,12 @@ from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.proposals import Modes
 
-# Data beside the first responses, for all metrics.
+# Checks of the data against the first responses, for all metrics.
+
+
+def output_labels(name: str, outputs: Sequence[str]) -> list[str]:
+    """Return how messages name the outputs of a simulator, or its only one."""
+    return [f"{name}[{output}]" for output in outputs] or [name]
 
 
 def warn_out_of_range(
@@ -38,8 +43,8 @@ def warn_out_of_range(
     simulated = responses.reshape(len(responses), -1).T
     if len(columns) != len(simulated):
         return
-    labels = [f"{name}[{output}]" for output in outputs] or [name]
-    for label, column, values in zip(labels, columns, simulated, strict=True):
+    triples = zip(output_labels(name, outputs), columns, simulated, strict=True)
+    for label, column, values in triples:
         measured, finite = column[np.isfinite(column)], values[np.isfinite(values)]
         if not measured.size or finite.size < 16:  # few responses do not show the range
             continue
@@ -79,7 +84,7 @@ def outlier_findings(
     columns = observed.reshape(len(observed), -1).T
     # A user's own propagation may store no response.
     simulated = responses.reshape(len(responses), -1).T if responses.size else np.empty((0, 0))
-    labels = [f"{name}[{output}]" for output in outputs] or [name]
+    labels = output_labels(name, outputs)
     findings = []
 
     def add(label: str, values: Floats, where: str, advice: str) -> None:
@@ -138,9 +143,8 @@ def check_constant(
     finite = values[np.isfinite(values).all(axis=1)]
     if len(finite) < (2 if is_stored else 8):
         return ()
-    labels = [f"{name}[{output}]" for output in outputs] or [name]
     findings = []
-    for label, column in zip(labels, finite.T, strict=True):
+    for label, column in zip(output_labels(name, outputs), finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
         text = (
@@ -423,11 +427,11 @@ def data_findings(
             rounded_outputs.append((label, step, share))
         sample = y[counted & np.isfinite(y[:, j]), j]
         counts, p_values = count_at_ends(sample, step, options.draws, options.seed)
-        ends = {
-            "largest": (sample.max(), "(None, {:.6g})"),
-            "smallest": (sample.min(), "({:.6g}, None)"),
-        }
-        for (side, (limit, argument)), count, p in zip(ends.items(), counts, p_values, strict=True):
+        ends = (
+            ("largest", sample.max(), "(None, {:.6g})"),
+            ("smallest", sample.min(), "({:.6g}, None)"),
+        )
+        for (side, limit, argument), count, p in zip(ends, counts, p_values, strict=True):
             if p <= options.censored:
                 text = (
                     f"{label}: got {count} of {len(sample)} values equal to the {side}, "
@@ -437,26 +441,35 @@ def data_findings(
                 findings.append(Finding("censored-data", text, "likelihood.md#censored-data"))
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
     if rounded_outputs:
-        names, all_steps, shares = zip(*rounded_outputs, strict=True)
-        listed = ", ".join(f"{step:.4g}" for step in dict.fromkeys(all_steps))
-        argument = listed if len(set(all_steps)) == 1 else "the step of each output"
-        text = (
-            f"{', '.join(names)}: got values that are all multiples of a step of {listed} (up to "
-            f"{max(shares):.3g} standard deviations), expected exact values, or a step of at most "
-            f"{largest_step:g} standard deviations; pass rounded={argument}."
-        )
-        findings.insert(0, Finding("rounded-data", text, "likelihood.md#rounded-data"))
+        findings.insert(0, _rounding_finding(rounded_outputs, largest_step))
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
-        groups = identical_specimens(exact)
-        listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
-        more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
-        text = (
-            f"Got specimens {listed}{more} (counted from 0) with identical values of all outputs, "
-            "expected different ones; leave out copies, pass specimens= and error= for repeated "
-            "readings, or rounded= for coarse ones."
-        )
-        findings.append(Finding("identical-specimens", text, "likelihood.md#identical-specimens"))
+        findings.append(_repeats_finding(identical_specimens(exact)))
     return tuple(findings)
+
+
+def _repeats_finding(groups: Sequence[Sequence[int]]) -> Finding:
+    """Return the finding of groups of identical specimens."""
+    listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
+    more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
+    text = (
+        f"Got specimens {listed}{more} (counted from 0) with identical values of all outputs, "
+        "expected different ones; leave out copies, pass specimens= and error= for repeated "
+        "readings, or rounded= for coarse ones."
+    )
+    return Finding("identical-specimens", text, "likelihood.md#identical-specimens")
+
+
+def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: float) -> Finding:
+    """Return the finding of rounded outputs: label, step, and step in standard deviations."""
+    names, steps, shares = zip(*outputs, strict=True)
+    listed = ", ".join(f"{step:.4g}" for step in dict.fromkeys(steps))
+    argument = listed if len(set(steps)) == 1 else "the step of each output"
+    text = (
+        f"{', '.join(names)}: got values that are all multiples of a step of {listed} (up to "
+        f"{max(shares):.3g} standard deviations), expected exact values, or a step of at most "
+        f"{largest:g} standard deviations; pass rounded={argument}."
+    )
+    return Finding("rounded-data", text, "likelihood.md#rounded-data")
 
 
 # Runs of a response, for the log-likelihood by specimen.
@@ -559,12 +572,12 @@ def refuse_unused_inputs(
     surface = fit_emulator(z, outputs)
     jacobian = surface(z)[1][:, :, list(inputs)]
     spread = outputs.std(axis=0)
-    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
+    values, directions = _singular_vectors(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, list(inputs.values()))
 
 
-def _singular(jacobian: Floats) -> tuple[Floats, Floats]:
+def _singular_vectors(jacobian: Floats) -> tuple[Floats, Floats]:
     """Return singular values, (k, d), and right singular vectors, (k, d, d)."""
     finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     if finite.shape[1] < finite.shape[2]:

@@ -18,9 +18,9 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.measurement import Measurement
-from prbayes.model.random_variable import Node, nodes, response_name
+from prbayes.model.evaluator import Evaluator, with_data
+from prbayes.model.random_variable import nodes, response_name
+from prbayes.model.simulator_with_data import SimulatorWithData
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.response.dims import is_random
@@ -69,7 +69,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
 
 
 def _simulator(
-    simulator: Node | Measurement, named: Set[Any], propagation: str, n_points: int
+    simulator: SimulatorWithData, named: Set[Any], propagation: str, n_points: int
 ) -> dict[str, str]:
     """Return the description of a simulator."""
     inputs = []
@@ -234,10 +234,9 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
     Dims (failure) and (failure, column): the arguments of the response one after the other, NaN
     where another simulator has more of them. The replacement, ``instead``, is NaN for none.
     """
-    simulators: list[Node | Measurement] = [*evaluator.nodes, *evaluator.measurements]
     failures = [
         (simulator.name, simulator.responses.replacement, failure)
-        for simulator in simulators
+        for simulator in with_data(evaluator)
         for failure in simulator.responses.failed
     ]
     columns = max((failure.inputs.size for _, _, failure in failures), default=0)
@@ -258,8 +257,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
-    observed = {node.name: node.observed for node in evaluator.nodes}
-    observed |= {m.name: m.observed for m in evaluator.measurements}
+    observed = {simulator.name: simulator.observed for simulator in with_data(evaluator)}
     return labelled_responses(evaluator, observed)
 
 
@@ -272,8 +270,7 @@ def labelled_responses(
     """
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
-    simulators: list[Node | Measurement] = [*evaluator.nodes, *evaluator.measurements]
-    for simulator in simulators:
+    for simulator in with_data(evaluator):
         name, outputs = simulator.name, simulator.outputs
         if name in values:
             if outputs.event:

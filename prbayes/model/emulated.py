@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.emulators.emulator import fit_emulator
-from prbayes.metrics.base import Metric
+from prbayes.emulators.emulator import fit_emulator, with_failures
+from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
@@ -29,7 +29,7 @@ from prbayes.model.measurement import (
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError, responding_weights
 from prbayes.propagation.importance import new_specimens
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
@@ -40,20 +40,20 @@ from prbayes.specimens.emulation import Surface
 
 
 @dataclass(frozen=True)
-class EmulatedSizes:
+class EmulatedPopulationSizes:
     """Sizes of emulated samples."""
 
-    # Specimens of a population in plots and scores: the error of a quantile is far below the width
-    # of a posterior band.
+    # Specimens of a population in plots and scores, so many that the error of a quantile is far
+    # below the width of a posterior band.
     specimens: int = 1024
-    # Populations of the result, and specimens of each, in the weighted sample of a decision. Twice
-    # as many change probabilities by less than their reported error.
+    # Populations, and specimens of each population, in the weighted sample of a decision. Twice as
+    # many change probabilities by less than their reported error.
     populations: int = 64
     of_each: int = 64
     blocks: int = 8  # parts of the sample whose differences give its error
 
 
-_SIZES = EmulatedSizes()
+_SIZES = EmulatedPopulationSizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,9 @@ class EmulatedResponse:
 
     coordinates: Coordinates
     z: Floats  # (n, d): coordinates of the runs
-    y: Floats  # (n, m): their outputs; +inf is a failed specimen, NaN a run without response
-    surface: Surface  # through the finite runs
-    columns: slice  # the outputs of the surface that are those of the response
+    y: Floats  # (n, m): outputs of the runs; +inf is a failed specimen, NaN no response
+    surface: Surface  # surface through the finite runs
+    columns: slice  # columns of the surface that belong to the response
     event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
     error: Floats  # (m,): root mean square error of left-out runs, near the specimens
     is_continued: bool = True  # whether there is a response beyond the runs' range
@@ -94,7 +94,7 @@ class EmulatedResponse:
         # Slopes are differences to points further inside, by 2 % of the range at most.
         share = 0.02 / np.maximum((np.abs(beyond) / self._width).max(axis=1), 1e-12)
         inner = self._in_range(ends - share[:, None] * beyond)
-        with np.errstate(invalid="ignore"):  # both may be infinite
+        with np.errstate(invalid="ignore"):  # infinite values have no difference
             difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
@@ -111,13 +111,7 @@ class EmulatedResponse:
     def _at(self, z: Floats) -> Floats:
         """Return the outputs at coordinates within the runs' range, (n, m)."""
         values = self.surface.values(z)[:, self.columns]
-        is_finite = np.isfinite(self.y).all(axis=1)
-        if not is_finite.all():
-            from scipy.spatial import cKDTree
-
-            _, nearest = cKDTree(self.z / self._width).query(z / self._width)
-            values = np.where(is_finite[nearest, None], values, self.y[nearest])
-        return values
+        return with_failures(values, z / self._width, self.z / self._width, self.y)
 
 
 def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
@@ -128,7 +122,7 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     preparation = prepared(likelihood)
     run_z = preparation.emulation.z
     runs = likelihood.coordinates.inputs(run_z)
-    points = values_of(runs, likelihood.inputs, responses.inputs)
+    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
     values = responses(points, [])
     coordinates = Coordinates.of_prior(responses.inputs)
     z = coordinates.of(points, 1)
@@ -140,7 +134,8 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
             f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
             "prb.predict, which computes responses at new specimens"
         )
-    # Runs within the range of the specimens' roots; all if few are.
+    # Left-out errors count at runs within the range of the specimens' roots, or at all runs if few
+    # are there.
     roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
     low, high = np.quantile(roots, [0.01, 0.99], axis=0)
     is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
@@ -154,7 +149,7 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 
-def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
+def values_of_inputs(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
     """Return the values of a subset of the inputs, from those of all inputs of a response."""
     places = [
         next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
@@ -170,21 +165,21 @@ class EmulatedSimulator:
     likelihood: SpecimenLikelihood
     measurement: Measurement
     place: int | None = None  # index of the group; None without groups
-    name: str = field(init=False)  # such as 'y', or 'y[Adler]' of a group
+    name: str = field(init=False)  # name such as 'y', or 'y[Adler]' of a group
     group: str = field(init=False)  # name of the group, empty without groups
-    rows: NDArray[np.intp] = field(init=False)  # (N,): which of the measurement's rows these are
+    rows: NDArray[np.intp] = field(init=False)  # (N,): indices among the rows of the measurement
     observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
-    weights: Floats = field(init=False)  # of the specimens, (N,); they sum to one
-    specimens: NDArray[Any] | None = field(init=False)  # (N,): labels
-    n_specimens: float = field(init=False)  # effective number
+    weights: Floats = field(init=False)  # (N,): weights of the specimens, of sum one
+    specimens: NDArray[Any] | None = field(init=False)  # (N,): labels of the specimens
+    n_specimens: float = field(init=False)  # effective number of specimens
     metric: Metric = field(init=False)
     inputs: Inputs = field(init=False)
     responses: Responses = field(init=False)
     outputs: Outputs = field(init=False)
-    has_specimens: bool = field(init=False)  # whether a population has specimens without a run
+    # Whether responses of a population's specimens are known without further runs.
+    has_specimens: bool = field(init=False)
 
-    is_emulated: ClassVar[Literal[True]] = True
-    # As of a Node: no response is weighted.
+    # A `Node` has its design here.
     reweighted: ClassVar[None] = None
     max_lost: float = field(init=False)  # largest share of a population without response
 
@@ -244,7 +239,7 @@ class EmulatedSimulator:
         if responses.same_as(self.responses):
             emulated = self._emulated
             runs = self.likelihood.coordinates.inputs(emulated.z)
-            points = values_of(runs, self.likelihood.inputs, responses.inputs)
+            points = values_of_inputs(runs, self.likelihood.inputs, responses.inputs)
             values = emulated.y.reshape(len(emulated.z), *emulated.event)
             responses.refuse_change(points, values, self.responses)
             return emulated
@@ -256,12 +251,25 @@ class EmulatedSimulator:
         The quasi-random numbers are the same for all calls.
         """
         size, n = len(parents[0]), _SIZES.specimens
+        values = self._emulated(self.draw_specimens(parents, n))
+        return values.reshape(size, n, *self.measurement.event), np.full((size, n), 1 / n)
+
+    def draw_specimens(self, parents: Sequence[Floats], n: int) -> list[Floats]:
+        """Return n specimens of each of k populations, (k n, *event) by input."""
         rng = np.random.default_rng(0)
         specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
         specimens = at_conditions(self.inputs, specimens, self.conditions)
-        flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
-        values = self._emulated(flat).reshape(size, n, *self.measurement.event)
-        return values, np.full((size, n), 1 / n)
+        return [x.reshape(-1, *x.shape[2:]) for x in specimens]
+
+    def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
+        """Return the discrepancies of populations from a prepared metric, (k,)."""
+        values, weights = self.populations(parents)
+        weights = responding_weights(values, weights)
+        return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(values))])
+
+    def weighted_sample(self, parents: Sequence[Floats]) -> EmulatedSample:
+        """Return specimens whose weights make populations near those at parents."""
+        return EmulatedSample.of(self, parents)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
@@ -293,14 +301,17 @@ class EmulatedSample:
     """
 
     simulator: EmulatedSimulator
-    points: list[Floats]  # (n, *event) by input
+    points: list[Floats]  # (n, *event): values of each input
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
-    blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
-    inputs: Inputs  # of the specimens
+    blocks: NDArray[np.intp]  # (n,): index of the eighth, which represents the mixture itself
+    inputs: Inputs  # inputs of the simulator
     n_points: int  # number of specimens
+    _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
-    has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
+    has_runs: ClassVar[Literal[False]] = False  # whether points are runs, as those of a design
+    on_line: ClassVar[bool] = False  # whether the points are a quadrature rule
+    is_continued: ClassVar[bool] = True  # whether responses are constant beyond the runs
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
@@ -310,23 +321,43 @@ class EmulatedSample:
         parents = [parent[rows] for parent in parents]
         of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
         of_each *= _SIZES.blocks
-        specimens, _ = new_specimens(
-            simulator.name, simulator.inputs, list(parents), of_each, np.random.default_rng(0)
-        )
-        specimens = at_conditions(simulator.inputs, specimens, simulator.conditions)
-        flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
-        log_p = _log_density(simulator.inputs, parents, flat)
+        flat = simulator.draw_specimens(parents, of_each)
+        log_p = _population_log_densities(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
         return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
-        return values_of(self.points, self.inputs, inputs)
+        return values_of_inputs(self.points, self.inputs, inputs)
+
+    def values_of(self, responses: Responses) -> Floats:
+        """Return a response of the specimens, (n,) or (n, m)."""
+        return self._emulator(responses)(self.points_of(responses.inputs))
+
+    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+        """Return a response at any points, (n,) or (n, m), and with two errors of it.
+
+        The errors are that at left-out runs, and that beyond the range of the runs.
+        """
+        emulator = self._emulator(responses)
+        inputs = values_of_inputs(points, self.inputs, responses.inputs)
+        values = emulator(inputs)
+        return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
+
+    def n_runs_of(self, responses: Responses) -> int:
+        """Return the number of runs behind a response."""
+        return len(self._emulator(responses).z)
+
+    def _emulator(self, responses: Responses) -> EmulatedResponse:
+        """Return the emulator of a response, which the first call for the response fits."""
+        if responses not in self._emulators:
+            self._emulators[responses] = self.simulator.emulator(responses)
+        return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
-        log_p = _log_density(self.inputs, parents, self.points) - self.log_mixture
+        log_p = _population_log_densities(self.inputs, parents, self.points) - self.log_mixture
         largest = log_p.max(axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
             weights = np.exp(log_p - largest)
@@ -345,7 +376,9 @@ class EmulatedSample:
             )
 
 
-def _log_density(inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]) -> Floats:
+def _population_log_densities(
+    inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
+) -> Floats:
     """Return log-densities of specimens in populations, (k, n)."""
     function = compiled_log_density(inputs)
     step = max(1, AT_ONCE // len(points[0]))

@@ -32,13 +32,14 @@ from prbayes.model.random_variable import (
     nodes,
     simulators,
 )
+from prbayes.model.simulator_with_data import SimulatorWithData
 from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     measurements_of,
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.propagation.base import Bound, responding_weights
+from prbayes.propagation.base import responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
@@ -74,12 +75,13 @@ class Evaluator:
     model: pm.Model
     hyperparameters: Hyperparameters  # names, transforms and prior of theta
     nodes: tuple[Node, ...]  # simulators with a metric of distributions
-    likelihoods: tuple[SpecimenLikelihood, ...]  # one for simulators with common specimens
-    measurements: tuple[Measurement, ...]  # simulators with a log-likelihood by specimen
-    emulated: tuple[EmulatedSimulator, ...]  # the populations of these, by group
+    # Simulators with a log-likelihood by specimen, by group, whose populations are emulated.
+    emulated: tuple[EmulatedSimulator, ...]
     # Whether the nodes have the data and designs of the model, whose graph is the objective then.
     has_graph: bool = True
     functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
+    likelihoods: tuple[SpecimenLikelihood, ...] = field(init=False)  # one for common specimens
+    measurements: tuple[Measurement, ...] = field(init=False)  # simulators with all of their groups
     # The nodes, then simulators whose responses are emulated, by group.
     simulators: list[PopulationSimulator] = field(init=False, repr=False)
     reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
@@ -90,6 +92,8 @@ class Evaluator:
     def __post_init__(self) -> None:
         """Set the attributes of all simulators, and of the other terms."""
         vars(self).update(
+            likelihoods=tuple(dict.fromkeys(e.likelihood for e in self.emulated)),
+            measurements=tuple(dict.fromkeys(e.measurement for e in self.emulated)),
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
             responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
@@ -103,17 +107,10 @@ class Evaluator:
         refuse_replaced_expressions(model)
         hyperparameters = Hyperparameters.of(model)  # refuses a model before its first runs
         computed = tuple(nodes(model).values())
-        likelihoods = tuple(dict.fromkeys(specimen_likelihoods(model).values()))
-        for likelihood in likelihoods:
+        evaluator = cls(model, hyperparameters, computed, tuple(emulated_simulators(model)))
+        for likelihood in evaluator.likelihoods:
             likelihood.cache["hyperparameters"] = weakref.ref(hyperparameters)
-        return cls(
-            model,
-            hyperparameters,
-            computed,
-            likelihoods,
-            tuple(measurements_of(model).values()),
-            tuple(emulated_simulators(model)),
-        )
+        return evaluator
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the model by cloudpickle: models of PyMC have no plain pickle."""
@@ -139,15 +136,14 @@ class Evaluator:
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
-        if self.likelihoods:
+        for likelihood in self.likelihoods:
             values = variables_at(self.hyperparameters, thetas)
-            for likelihood in self.likelihoods:
-                # Populations in blocks, so that memory stays constant with many specimens.
-                step = max(1, 4 * AT_ONCE // len(likelihood.readings))
-                for first in range(0, len(thetas), step):
-                    rows = slice(first, first + step)
-                    at_rows = {name: value[rows] for name, value in values.items()}
-                    total[rows] += log_likelihoods(likelihood, at_rows).sum(axis=1)
+            # Populations in blocks, so that memory stays constant with many specimens.
+            step = max(1, 4 * AT_ONCE // len(likelihood.readings))
+            for first in range(0, len(thetas), step):
+                rows = slice(first, first + step)
+                at_rows = {name: value[rows] for name, value in values.items()}
+                total[rows] += log_likelihoods(likelihood, at_rows).sum(axis=1)
         observed = self.model.observed_RVs
         variables = [rv for rv in observed if not isinstance(rv.owner.op, ObservedRV)]
         if variables or self.model.potentials:
@@ -162,7 +158,7 @@ class Evaluator:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
         budget().check()
         node = self.nodes[k]
-        return node.bound.discrepancies(self.parents(thetas, k), target or node.target)
+        return node.discrepancies(self.parents(thetas, k), target or node.target)
 
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); an invalid theta does not affect the rest."""
@@ -438,6 +434,16 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
 # Runs and designs.
 
 
+def with_data(evaluator: Evaluator) -> list[SimulatorWithData]:
+    """Return all simulators, each with the specimens of all of its groups."""
+    return [*evaluator.nodes, *evaluator.measurements]
+
+
+def have_emulated_points(evaluator: Evaluator) -> bool:
+    """Return whether all designs have points with emulated responses."""
+    return all(bound.design.has_emulated_points for bound in evaluator.reweighted.values())
+
+
 def is_current(evaluator: Evaluator) -> bool:
     """Return whether the model still has the evaluator's data; `pymc.set_data` changes them."""
     model = evaluator.model
@@ -470,18 +476,15 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
 
     The same one if no design is large, or if the smaller designs do not support theta, (d,).
     """
-    bounds: list[Bound] = []
-    for node in evaluator.nodes:
-        bound = node.reweighted
-        if bound is not None and bound.n_points >= _LARGE:
-            bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
-        else:
-            bounds.append(node.bound)
-    if bounds == [node.bound for node in evaluator.nodes]:
+    smaller = {
+        name: bound.copied(bound.design.rows(bound.blocks == 0))
+        for name, bound in evaluator.reweighted.items()
+        if bound.n_points >= _LARGE
+    }
+    if not smaller:
         return evaluator
-    pairs = zip(evaluator.nodes, bounds, strict=True)
-    coarse_nodes = tuple(replace(node, bound=bound) for node, bound in pairs)
-    coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
+    coarse_nodes = [replace(n, bound=smaller.get(n.name, n.bound)) for n in evaluator.nodes]
+    coarse = replace(evaluator, nodes=tuple(coarse_nodes), has_graph=False)
     for name, values in coarse.support(theta[None]).items():
         if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
             return evaluator

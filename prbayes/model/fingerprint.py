@@ -148,21 +148,21 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
         if simulator.reweighted is not None:
             design = simulator.reweighted.design
             batches = len(design.batch_sizes) + design.n_emulated_samples
-        observed, weights, labels = _sorted(observed, simulator.weights, labels)
+        observed, weights, labels = _in_fixed_order(observed, simulator.weights, labels)
         fields = {
             "n_points": bound.n_runs,
             "batches": batches,
             "epsilon": simulator.epsilon_value,
             # A design grows at its end: the first responses stay the same.
             "responses": _tuples(bound.first_responses[:8].ravel()),
-            "points": _points(simulator),
+            "points": _first_points(simulator),
         }
     else:
         of_specimens = simulator.groups, *simulator.covariates.values(), simulator.conditions
         if all(values is None for values in of_specimens):
             n = len(observed)
             equal = np.full(n, 1 / n) if weights is None else weights / weights.sum()
-            fields = {"with_metric": _digests(*_sorted(observed, equal, labels))}
+            fields = {"with_metric": _digests(*_in_fixed_order(observed, equal, labels))}
     _, of_weights, of_labels = _digests(observed, weights, labels)
     return SimulatorIdentity(
         name=simulator.name,
@@ -176,7 +176,7 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
     )
 
 
-def _sorted(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
+def _in_fixed_order(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
     """Return data in an order of their own: a metric's result does not depend on theirs."""
     order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
     return observed[order], weights[order], None if labels is None else labels[order]
@@ -188,7 +188,7 @@ def _digests(observed: Floats, weights: Floats | None, labels: Any) -> tuple[str
     return _digest(observed), _digest(weights), of_labels
 
 
-def _points(node: Node) -> tuple[tuple[float, ...], ...]:
+def _first_points(node: Node) -> tuple[tuple[float, ...], ...]:
     """Return the aleatory inputs of the first two responses, a row for each.
 
     One response alone may agree with another by chance, as at zero.
@@ -254,7 +254,7 @@ def as_attributes(identity: Identity | None) -> dict[str, str]:
     return {} if identity is None else json_attribute("identity", asdict(identity))
 
 
-def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
+def identity_from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
     """Return the identity that a file has; None for results of other tools."""
     try:
         return from_text(attributes["identity"])
@@ -271,7 +271,7 @@ def require_same(
     """Raise a ValueError with all that differs, up to a level; unknown identities pass."""
     if got is None or expected is None:
         return
-    texts = differences(got, expected, level)
+    texts = problem_differences(got, expected, level)
     if texts:
         raise ValueError(
             f"{caller}: got a result of another problem: {'; '.join(texts)}; {_REMEDIES[level]}"
@@ -281,20 +281,20 @@ def require_same(
 def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -> None:
     """Raise a ValueError unless a model has a result's responses, also at the result's points.
 
-    `differences` compares responses at the same points, which are drawn through the priors. With
-    other priors, or another propagation, two responses of each simulator are computed.
+    `problem_differences` compares responses at the same points, which are drawn through the priors.
+    With other priors, or another propagation, two responses of each simulator are computed.
     """
     stored = {} if got is None else {simulator.name: simulator for simulator in got.simulators}
     for node in nodes(model).values():
         saved = stored.get(node.name)
-        if saved is None or not saved.points or saved.points == _points(node):
+        if saved is None or not saved.points or saved.points == _first_points(node):
             continue
         shapes = node.inputs.event_shapes
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         columns = np.split(np.array(saved.points), ends[:-1], axis=1)
         aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
         values = node.responses(aleatory, []).ravel()
-        if not _close(values, saved.responses[: values.size]):
+        if not _agree(values, saved.responses[: values.size]):
             raise ValueError(
                 f"{caller}: got a result of another problem: the response of {node.name} has other "
                 f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"
@@ -322,7 +322,7 @@ def require_together(
     return expected
 
 
-def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
+def problem_differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     """Return the differences of two problems, up to a level, as texts; numbers up to rounding."""
     if got.shapes != expected.shapes:
         texts = []
@@ -346,10 +346,10 @@ def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
         terms = got.terms or "none", expected.terms or "none"
         priors.append(_unlike("other likelihood terms", *terms))
     if not priors and got.thetas and expected.thetas:
-        has_same_points = _close(got.thetas, expected.thetas)
-        if not (has_same_points and _close(got.log_prior, expected.log_prior)):
+        has_same_points = _agree(got.thetas, expected.thetas)
+        if not (has_same_points and _agree(got.log_prior, expected.log_prior)):
             priors = ["the priors have other densities"]
-        elif not _close(got.log_other, expected.log_other):
+        elif not _agree(got.log_other, expected.log_other):
             priors = ["other likelihood terms, or potentials, have other values"]
     minimised = []
     if got.prior_minimised is not None and expected.prior_minimised is not None:
@@ -395,7 +395,7 @@ def _simulator_differences(
     has_same_points = same_priors and a.propagation == b.propagation and not mixed
     if inputs[0] != inputs[1]:
         populations.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
-    elif has_same_points and not _close(a.responses, b.responses):
+    elif has_same_points and not _agree(a.responses, b.responses):
         populations.append(f"the response of {a.name} has other values at the same points")
     optimum = [
         _unlike(f"{field} of {a.name}", getattr(a, field), getattr(b, field))
@@ -404,10 +404,10 @@ def _simulator_differences(
     ]
     has_same_design = (a.n_points, a.batches) == (b.n_points, b.batches)
     is_comparable = a.discrepancies and b.discrepancies and has_same_design
-    if not optimum and is_comparable and not _close(a.discrepancies, b.discrepancies):
+    if not optimum and is_comparable and not _agree(a.discrepancies, b.discrepancies):
         optimum.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
     posterior, run = [], []
-    if not _close([a.epsilon], [b.epsilon]):
+    if not _agree([a.epsilon], [b.epsilon]):
         posterior.append(_unlike(f"epsilon of {a.name}", a.epsilon, b.epsilon))
     if not has_same_design:
         run.append(_unlike(f"number of responses of {a.name}", a.n_points, b.n_points))
@@ -423,7 +423,7 @@ def _unlike(what: str, got: object, expected: object) -> str:
     return f"{what}: got {got}, expected {expected}"
 
 
-def _close(got: Any, expected: Any) -> bool:
+def _agree(got: Any, expected: Any) -> bool:
     """Return whether numbers are the same up to rounding, relative to the largest of them."""
     a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     size = np.abs(a[np.isfinite(a)]).max(initial=0.0)

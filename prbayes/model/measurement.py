@@ -20,6 +20,7 @@ from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters, parent_values
+from prbayes.model.simulator_with_data import new_observed, number_specimens
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.response.distributions import PriorSampler
@@ -37,17 +38,17 @@ class Measurement:
 
     name: str
     metric: LogLikelihood
-    observed: Floats  # (N,) or (N, m)
+    observed: Floats  # (N,) or (N, m): measured responses
     weights: Floats | None  # (N,): factors of the specimens' log-likelihoods, which sum to N
-    specimens: NDArray[Any] | None  # (N,): labels
+    specimens: NDArray[Any] | None  # (N,): labels of the specimens
     inputs: Inputs
     responses: Responses
     propagation: Propagation
     outputs: Outputs
     groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
-    # By name, (N,): conditions on which the population of a specimen depends.
+    # Values, (N,) by name, of the conditions on which the population of a specimen depends.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
-    conditions: Floats | None = None  # (N, C): those that are inputs of the response
+    conditions: Floats | None = None  # (N, C): values of conditions that are inputs
     # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
@@ -90,42 +91,34 @@ class Measurement:
         values = np.asarray(data, dtype=np.float64)
         if np.array_equal(values, self.observed, equal_nan=True):
             return self
-        if values.ndim != self.observed.ndim or values.shape[1:] != self.event:
-            raise ValueError(
-                f"{self.name}: observed: got shape {values.shape}, expected "
-                f"{('N', *self.event)}, as when the simulator was made"
-            )
-        is_plain = self.groups is None and self.weights is None and self.specimens is None
-        is_plain = is_plain and not self.covariates and self.conditions is None
-        if len(values) != len(self.observed) and not is_plain:
-            raise ValueError(
-                f"{self.name}: observed: got {len(values)} specimens, expected "
-                f"{len(self.observed)}, as many as there are groups, conditions, weights= or "
-                "specimens=; build the model again with those of the new ones"
-            )
-        return replace(self, observed=values)
+        of_rows = (self.groups, self.weights, self.specimens, self.conditions)
+        is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
+        aligned = "groups, conditions, weights= or specimens="
+        return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
 
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
     """Readings of S specimens in the M outputs of all simulators."""
 
-    readings: Readings  # repeated readings of an output by their weighted mean, with its error
-    scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
-    repeats: Repeats | None  # None if no output of a specimen was read repeatedly
-    numbers: tuple[NDArray[np.intp], ...]  # (N,) by simulator: specimen of each row
-    groups: NDArray[np.intp] | None  # (S,)
-    covariates: Floats  # (C, S)
+    # Readings, where the weighted mean stands for repeated readings of an output.
+    readings: Readings
+    # (S, M): standard deviation of the readings' error, in units of an unknown error.
+    scale: Floats
+    repeats: Repeats | None  # scatter of repeated readings; None if there are none
+    numbers: tuple[NDArray[np.intp], ...]  # (N,): specimen of each row, by simulator
+    groups: NDArray[np.intp] | None  # (S,): index of each specimen's group
+    covariates: Floats  # (C, S): values of the conditions that populations depend on
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
-    conditions: Floats | None  # (S, C)
-    coordinates: Floats | None  # (S, C): those of the conditions
+    conditions: Floats | None  # (S, C): values of the conditions that are inputs
+    coordinates: Floats | None  # (S, C): coordinates of these conditions
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
         """Stack the readings of simulators; raise if those of a specimen cannot be combined."""
         first = measurements[0]
-        numbers, size = _validated_counts(measurements)
+        numbers, size = number_specimens(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         conditions = coordinates = None
         variables = [first.inputs.aleatory[place] for place in first.inputs.conditions]
@@ -135,17 +128,21 @@ class StackedReadings:
             for k, variable in enumerate(variables):
                 of_rows = [np.asarray(m.conditions)[:, k] for m in measurements]
                 kind = f"values of {variable.name}"
-                conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)
+                conditions[:, k] = _value_by_specimen(kind, measurements, of_rows, numbers, size)
                 coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
         readings, scales, repeats = zip(*parts, strict=True)
         groups = None
         if first.groups is not None:
             of_rows = [np.asarray(m.groups) for m in measurements]
-            groups = _by_specimen("groups", measurements, of_rows, numbers, size).astype(np.intp)
+            groups = _value_by_specimen("groups", measurements, of_rows, numbers, size).astype(
+                np.intp
+            )
         covariates = np.empty((len(first.covariates), size))
         for covariate, name in zip(covariates, first.covariates, strict=True):
             of_rows = [m.covariates[name] for m in measurements]
-            covariate[:] = _by_specimen(f"values of {name}", measurements, of_rows, numbers, size)
+            covariate[:] = _value_by_specimen(
+                f"values of {name}", measurements, of_rows, numbers, size
+            )
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
             width = 2 * np.ptp(measurement.range, axis=0)
@@ -163,18 +160,6 @@ class StackedReadings:
             conditions,
             coordinates,
         )
-
-
-def _validated_counts(measurements: Sequence[Measurement]) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the specimen of each row, by simulator, and the number of specimens."""
-    first: dict[object, int] = {}
-    numbers = []
-    for k, measurement in enumerate(measurements):
-        labels: list[object] = [(k, i) for i in range(len(measurement.observed))]
-        if measurement.specimens is not None:
-            labels = measurement.specimens.tolist()
-        numbers.append(np.array([first.setdefault(x, len(first)) for x in labels], dtype=np.intp))
-    return numbers, len(first)
 
 
 def _averaged(
@@ -208,7 +193,7 @@ def _averaged(
     return averaged(readings, measurement.scale, numbers, count)
 
 
-def _by_specimen(
+def _value_by_specimen(
     kind: str,
     measurements: Sequence[Measurement],
     values: Sequence[NDArray[Any]],
@@ -234,9 +219,9 @@ def _by_specimen(
 class SpecimenLikelihood:
     """Data and settings of a log-likelihood of specimens, measured by one simulator or several."""
 
-    measurements: tuple[Measurement, ...]  # of simulators with the same inputs
+    measurements: tuple[Measurement, ...]  # measurements with the same inputs
     model: Any = None  # weak reference to a pymc.Model
-    shared_emulation: Emulation | None = None  # of the same responses, for other data
+    shared_emulation: Emulation | None = None  # emulator that was fitted for other data
     options: SpecimenOptions = field(default_factory=SpecimenOptions)
     # Values that are computed at their first use, such as the points of the specimens.
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)

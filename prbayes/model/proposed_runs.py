@@ -16,7 +16,7 @@ from prbayes.emulators.runs import Runs, continued
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.specimen_preparation import PopulationDraws, Populations
+from prbayes.model.specimen_preparation import PopulationDraws, SpecimenPopulations
 from prbayes.numerics.points import farthest_rows
 from prbayes.response.call import checked
 from prbayes.response.inputs import model_on_context
@@ -138,7 +138,7 @@ def _arguments(
     """Return a response's arguments, (n, *event), for specimens of the prior."""
     inputs = responses.inputs
     if likelihood is not None:
-        populations = Populations(likelihood)
+        populations = SpecimenPopulations(likelihood)
         thetas = populations.hyperparameters.prior_thetas(2048, seed)
         z = PopulationDraws(populations, thetas).specimens(16)
         return inputs.fill(likelihood.coordinates.inputs(z), [])

@@ -17,7 +17,7 @@ from functools import partial
 from inspect import signature
 from math import ceil
 from traceback import walk_stack
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -50,6 +50,7 @@ from prbayes.model.data_checks import (
     warn_out_of_range,
 )
 from prbayes.model.locking import lock
+from prbayes.model.simulator_with_data import new_observed
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import RunCost, duration
@@ -67,26 +68,25 @@ class Node:
 
     name: str
     target: Discrepancy  # the metric, prepared against the observed responses
-    bound: Bound  # the propagation at work
-    propagation: Propagation  # its configuration
+    bound: Bound  # the propagation, prepared for this simulator
+    propagation: Propagation  # configuration of the propagation
     epsilon: Any  # shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
     # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
     same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = SINGLE_OUTPUT  # of a run
+    outputs: Outputs = SINGLE_OUTPUT  # outputs of a run
     group: str = ""  # name of the group of its specimens
 
     # Attributes of the target and of the bound.
     metric: Metric = field(init=False)
     observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
-    weights: Floats = field(init=False)  # of the specimens, (N,); they sum to one
+    weights: Floats = field(init=False)  # (N,): weights of the specimens, of sum one
     inputs: Inputs = field(init=False)
     responses: Responses = field(init=False)  # the response, and how it is called
-    has_specimens: bool = field(init=False)  # whether a population has specimens without a run
+    # Whether responses of a population's specimens are known without further runs.
+    has_specimens: bool = field(init=False)
     max_lost: float = field(init=False)  # largest share of a population without response
     reweighted: ReweightedBound | None = field(init=False)  # the bound, if it has a design
-
-    is_emulated: ClassVar[Literal[False]] = False
 
     def __post_init__(self) -> None:
         """Set the attributes of the target and of the bound."""
@@ -104,6 +104,15 @@ class Node:
     def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
         return self.bound.populations(list(parents))
+
+    def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
+        """Return the discrepancies of populations from a prepared metric, (k,)."""
+        return self.bound.discrepancies(parents, target)
+
+    def weighted_sample(self, parents: Sequence[Floats]) -> ReweightedBound:
+        """Return specimens whose weights make populations: those of the design."""
+        assert self.reweighted is not None
+        return self.reweighted
 
     @property
     def epsilon_value(self) -> float:
@@ -125,39 +134,29 @@ class Node:
         data = np.asarray(data)
         if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
             return self
-        values = np.asarray(data, dtype=np.float64)
-        if values.shape[1:] != target.event or values.ndim != target.observed.ndim:
-            raise ValueError(
-                f"{self.name}: observed: got shape {values.shape}, expected "
-                f"{('N', *target.event)}, as when the simulator was made"
-            )
-        n = len(target.weights)
-        is_same_size = len(values) == n
-        if not is_same_size and (self.specimens is not None or np.ptp(target.weights) > 0):
-            raise ValueError(
-                f"{self.name}: observed: got {len(values)} specimens, expected "
-                f"{n}, as many as there are specimens= or weights=; build the "
-                "model again with those of the new ones"
-            )
+        is_aligned = self.specimens is not None or bool(np.ptp(target.weights) > 0)
+        values = new_observed(self, data, "specimens= or weights=", is_aligned=is_aligned)
+        is_same_size = len(values) == len(target.weights)
         try:
             target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        changed = self.comparing(target.metric.for_inputs(target, bound.inputs.dimensions))
+        changed = with_target(self, target.metric.for_inputs(target, bound.inputs.dimensions))
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
         return changed
-
-    def comparing(self, target: Discrepancy) -> Node:
-        """Return the same simulator with another prepared metric."""
-        bound = self.bound.copied()
-        bound.target = target
-        return replace(self, target=target, bound=bound)
 
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
         epsilon = shared_epsilon(self.name, self.epsilon_value)
         return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+
+
+def with_target(node: Node, target: Discrepancy) -> Node:
+    """Return the same simulator with another prepared metric."""
+    bound = node.bound.copied()
+    bound.target = target
+    return replace(node, target=target, bound=bound)
 
 
 @dataclass(frozen=True, eq=False)
@@ -478,7 +477,7 @@ def building(terms: str) -> Iterator[None]:
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
-def _log_density(
+def _metric_log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
     """Return the log-density of the observed data: a graph of the parents and of epsilon.
@@ -639,7 +638,7 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     targets = common_targets(computed_nodes, [node.target for node in computed_nodes])
     for (rv, node), target in zip(by_variable.items(), targets, strict=True):
         if target is not node.target:
-            by_variable[rv] = node.comparing(target)
+            by_variable[rv] = with_target(node, target)
             rv.owner.op.assign(rv.owner, by_variable[rv])
     return by_variable
 

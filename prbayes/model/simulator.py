@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -26,7 +26,6 @@ from prbayes._validate import (
     positive_number,
     refuse_huge,
     refuse_single_precision,
-    sample_labels,
     sample_weights,
     texts,
 )
@@ -35,9 +34,10 @@ from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import SummaryLikelihood
-from prbayes.model.conditions import observed_at_conditions, stacked_values
+from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
+from prbayes.model.observed_data import ObservedData, observed_at_conditions, read_data
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
@@ -45,7 +45,6 @@ from prbayes.model.random_variable import (
     Specification,
     effective_specimens,
     has_default_epsilon,
-    known_value,
     rv_signature,
     share_bandwidths,
     shared_epsilon,
@@ -58,27 +57,21 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.response.compile import PLAIN
-from prbayes.response.condition import (
-    known_covariates,
-    refuse_covariates,
-    refuse_vectors_of_specimens,
-)
+from prbayes.response.condition import refuse_covariates, refuse_vectors_of_specimens
 from prbayes.response.dims import values_of
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
     Inputs,
-    group_indices,
     is_group,
     model_on_context,
     read_inputs,
     set_units,
 )
-from prbayes.response.outputs import Outputs, in_order_of, read_observed
+from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
-# Settings of a propagation for calls of the response.
+# Options of a propagation that concern the calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
 
 
@@ -200,87 +193,63 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     caller = f"prb.Simulator({name!r}, ...)"
     refuse_single_precision(caller, config.floatX)
     model = model_on_context(None, caller)
-    # A model within another one puts its own name before those of its variables.
-    name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
-    if model.name_for(name) in model.named_vars:
-        raise ValueError(
-            f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
-            "name; to run this again, run `with pm.Model():` and all below it again"
-        )
-    arguments = _read_arguments(name, response, inputs, model)
-    if isinstance(observed, Summary):
-        unused = [metric, epsilon, weights, specimens, dims, arguments.groups]
-        metric, observed = _read_summary(name, observed, unused, propagation)
-    observed, metric = observed_at_conditions(name, observed, metric, inputs)
-    weights = in_order_of(weights, observed, f"{name}: weights")
-    values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
-    outputs = _with_units(name, units, arguments, response, outputs)
-    n = np.shape(values)[0] if np.ndim(values) else 1
-    refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, n)
-    size = n if rows is None else len(np.asarray(weights))
-    weights = weights if rows is None else None
-    metric = LogLikelihood() if metric is None else metric
-    by_specimen = isinstance(metric, Metric) and metric.by_specimen
-    if by_specimen:
-        _refuse_by_specimen(name, arguments, epsilon, propagation)
-        if rows is not None:
-            metric = cast(LogLikelihood, metric).of_frequencies(rows, size)
-        values = checked_specimens(name, values, outputs)
-    else:
-        refuse_covariates(name, arguments.covariates)
-        target = _prepared_metric(name, metric, values, weights)
+    name = _new_name(name, model)
+    flag(progressbar, "progressbar")
+    variables = _read_inputs(name, response, inputs, model)
     settings = Reweighted() if propagation is None else propagation
     if not isinstance(settings, Propagation):
         raise TypeError(
             f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
-    calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
-    calls |= {"outputs": outputs, "caller": name, "scatter": None if settings.is_random else 0.01}
-    labels = checked_labels(f"{name}: specimens", specimens, observed, len(values))
-    if by_specimen:
-        settings.check_likelihood(name)
-        partners = _with_common_specimens(name, labels, model)
-        arguments = _inputs_of_partners(name, arguments, partners)
-        inputs_of_specimens = [arguments.aleatory[place] for place in arguments.conditions]
-        conditions = stacked_values(known_covariates(name, inputs_of_specimens, size, rows))
-        if weights is not None:
-            weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-        responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
-        covariates = known_covariates(name, arguments.covariates, size, rows)
-        extras = _measurement_variables(name, model, metric, partners)
-        measurement = Measurement(
-            name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
-            settings, outputs, groups, covariates, conditions, extras,
-        )  # fmt: skip
-        return _add_measurement(model, measurement, partners, observed, dims)
-    if labels is not None:
-        _refuse_ambiguous_labels(name, labels, list(simulators(model).values()))
-    if dims is not None:
-        dims = _checked_dims(name, dims, target.observed.shape, model)
-    if epsilon is not None:
-        positive_number(epsilon, f"{name}: epsilon")
-    flag(progressbar, "progressbar")
-    parts = [(name, target, labels, "")]
-    if arguments.groups is not None and groups is not None:
-        parts = _parts_by_group(name, target, labels, arguments.groups, groups, dims)
-    variables = []
-    for place, (part_name, part, part_labels, group) in enumerate(parts):
-        responses = Responses(part_name, response, arguments, **calls)
-        scale = 1 / effective_specimens(part, part_labels) if is_likelihood(part) else np.nan
-        scale = scale if epsilon is None else epsilon
-        specification = Specification(
-            part_name, part, responses, settings, shared_epsilon(part_name, scale), part_labels,
-            outputs=outputs, group=group, progressbar=progressbar,
-        )  # fmt: skip
-        data = observed if arguments.groups is None else part.observed
-        variables.append(_add_simulator(model, specification, place, data, dims))
-    share_bandwidths(model)
-    return tuple(variables) if arguments.groups is not None else variables[0]
+    if isinstance(observed, Summary):
+        unused = [metric, epsilon, weights, specimens, dims, variables.groups]
+        metric, observed = _read_summary(name, observed, unused, settings)
+    observed, metric = observed_at_conditions(name, observed, metric, inputs)
+    data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
+    data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
+    refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
+    arguments = _Arguments(name, model, response, variables, data, settings, epsilon, progressbar)
+    metric = LogLikelihood() if metric is None else metric
+    if isinstance(metric, Metric) and metric.by_specimen:
+        return _add_measurement(arguments, cast(LogLikelihood, metric))
+    return _add_by_metric(arguments, metric)
+
+
+@dataclass(frozen=True, eq=False)
+class _Arguments:
+    """Validated arguments of a simulator."""
+
+    name: str
+    model: pm.Model
+    response: Callable[..., Any]
+    inputs: Inputs
+    data: ObservedData
+    propagation: Propagation
+    epsilon: float | None
+    progressbar: bool
+
+    def responses(self, name: str, inputs: Inputs, scatter: float | None) -> Responses:
+        """Return the response of inputs, and how the propagation calls it."""
+        calls: dict[str, Any] = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
+        calls |= {"outputs": self.data.outputs, "caller": self.name, "scatter": scatter}
+        return Responses(name, self.response, inputs, **calls)
+
+
+def _new_name(name: str, model: pm.Model) -> str:
+    """Return the name of a variable that the model does not have yet."""
+    # A nested model puts its name before the names of its variables.
+    name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
+    if model.name_for(name) in model.named_vars:
+        raise ValueError(
+            f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
+            "name; to run this again, run `with pm.Model():` and all below it again"
+        )
+    return name
 
 
 def _read_summary(
-    name: str, summary: Summary, unused: Sequence[Any], propagation: Propagation | None
+    name: str, summary: Summary, unused: Sequence[Any], propagation: Propagation
 ) -> tuple[Metric, Floats]:
     """Return metric and values of a data sheet; raise for what has no use without specimens."""
     names = ("metric=", "epsilon=", "weights=", "specimens=", "dims=", "groups")
@@ -292,7 +261,7 @@ def _read_summary(
             f"no single specimens, and its likelihood needs no scale; leave {text} out, or write a "
             "simulator for each data sheet"
         )
-    if isinstance(propagation, Propagation) and propagation.is_random:
+    if propagation.is_random:
         raise TypeError(
             f"{name}: propagation: got {called(propagation)}, whose likelihood would be random, "
             "expected prb.Reweighted(n) or prb.Resimulated(n) for a prb.Summary"
@@ -300,45 +269,25 @@ def _read_summary(
     return SummaryLikelihood(summary), summary.values
 
 
-def _read_arguments(
+def _read_inputs(
     name: str, response: Callable[..., Any], inputs: Sequence[Any], model: pm.Model
 ) -> Inputs:
     """Return the inputs of a response; raise if they are not as described."""
     refuse_uncallable(name, response)
-    arguments = read_inputs(name, inputs, model)
+    variables = read_inputs(name, inputs, model)
     if isinstance(response, Runs):
-        refuse_misfit(name, response, arguments.sizes)
-        response.refuse_inputs(name, arguments)
+        refuse_misfit(name, response, variables.sizes)
+        response.refuse_inputs(name, variables)
     for rv in simulators(model):
-        if rv in arguments.parents:
+        if rv in variables.parents:
             raise TypeError(
                 f"{name}: got inputs that depend on the simulator {rv.name}, expected "
                 "hyperparameters; let one response call the other, or return the outputs of both "
                 "from one response, with prb.Joint(metric)"
             )
-    for parent in arguments.parents:
+    for parent in variables.parents:
         refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
-    return arguments
-
-
-# The log-likelihood by specimen.
-
-
-def _read_specimens(
-    name: str, observed: Any, arguments: Inputs, weights: Any, specimens: Any
-) -> tuple[Floats, Outputs, NDArray[np.intp] | None, NDArray[np.intp] | None]:
-    """Return values and outputs of the specimens, their groups, and their rows by frequency."""
-    groups, measured = None, observed
-    if arguments.groups is not None:
-        groups, measured = group_indices(name, observed, arguments.groups)
-    if isinstance(measured, Variable):
-        measured = _present_numbers(name, measured)
-    values, outputs = read_observed(name, measured)
-    rows = _frequencies(name, weights, np.shape(values)[:1], observed, specimens)
-    if rows is not None:
-        values = values[rows]
-        groups = None if groups is None else groups[rows]
-    return values, outputs, groups, rows
+    return variables
 
 
 def _with_units(
@@ -356,7 +305,8 @@ def _with_units(
     names = [*set_units(inputs, response, units), name, *outputs.names]
     unknown = [key for key in units if key not in names]
     if unknown:
-        refuse_misfit(name, response, inputs.sizes, outputs)  # names other arguments than these
+        # A response with arguments of other names is the likelier mistake.
+        refuse_misfit(name, response, inputs.sizes, outputs)
         raise KeyError(
             f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
         )
@@ -366,56 +316,56 @@ def _with_units(
     return replace(outputs, units=tuple(of_outputs)) if any(of_outputs) else outputs
 
 
-def _frequencies(
-    name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
-) -> NDArray[np.intp] | None:
-    """Return the row of each specimen where weights are frequencies, whole numbers; else None."""
-    frequencies = np.asarray(weights)
-    if weights is None or frequencies.dtype.kind not in "iu":
-        return None
-    if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
-        raise ValueError(
-            f"{name}: weights: got {frequencies.tolist()!s:.60}, expected {shape} frequencies, "
-            "whole numbers from 0 whose sum is at least 2, one for each observed value"
-        )
-    if specimens is not None or isinstance(observed, Variable):
-        conflicting = "pm.Data" if specimens is None else "specimens="
-        raise TypeError(
-            f"{name}: weights: got whole numbers, which are frequencies, beside {conflicting}, "
-            "expected a row for each specimen; pass np.repeat(observed, weights), or relative "
-            "weights as floats"
-        )
-    return np.repeat(np.arange(frequencies.size), frequencies)
+# The log-likelihood by specimen.
 
 
-def _add_measurement(
-    model: pm.Model,
-    measurement: Measurement,
-    partners: Sequence[SpecimenLikelihood],
-    observed: Any,
-    dims: str | Sequence[str] | None,
-) -> TensorVariable:
+def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVariable:
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
-    name, inputs = measurement.name, measurement.inputs
+    name, model, data = arguments.name, arguments.model, arguments.data
+    _refuse_by_specimen(name, arguments.inputs, arguments.epsilon, arguments.propagation)
+    if data.rows is not None:
+        metric = metric.of_frequencies(data.rows, data.n_rows)
+    values = _checked_specimens(name, data.values, data.outputs)
+    arguments.propagation.check_likelihood(name)
+    partners = _with_common_specimens(name, data.labels, model)
+    inputs = _inputs_of_partners(name, arguments.inputs, partners)
+    weights = data.weights
+    if weights is not None:
+        weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+    conditions = data.known_values([inputs.aleatory[place] for place in inputs.conditions])
+    measurement = Measurement(
+        name,
+        metric,
+        values,
+        weights,
+        data.labels,
+        inputs,
+        arguments.responses(name, inputs, 0.0),
+        arguments.propagation,
+        data.outputs,
+        data.groups,
+        data.known_values(inputs.covariates),
+        stacked_values(conditions),
+        _measurement_variables(name, model, metric, partners),
+    )
     likelihood = _joint_likelihood(measurement, partners, model)
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
     names = tuple(m.name for m in likelihood.measurements)
     with_dims = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
-    if specimen_labels(likelihood) is not None and (with_dims or dims is not None):
+    if specimen_labels(likelihood) is not None and (with_dims or data.dims is not None):
         raise ValueError(
             f"{name}: dims: got dimensions of {(with_dims or [name])[0]}, whose specimens have "
             "several readings, expected none: log-likelihoods are by specimen; leave dims= out"
         )
-    if dims is not None:
-        dims = _checked_dims(name, dims, measurement.observed.shape, model)
     constants = {v: pt.constant(measurement.covariates[str(v.name)]) for v in inputs.covariates}
     constants |= {v: pt.constant(measurement.groups) for v in filter(is_group, inputs.parents)}
     params = [constants.get(v, v) for v in likelihood.variables(names)]
     params += joined
     signature = rv_signature([p.type.ndim for p in params], len(measurement.event))
     operation = SpecimenRV(signature=signature, reference=weakref.ref(likelihood), simulators=names)
-    data = _pymc_data(observed, measurement.observed)
-    rv = SimulatorDistribution(name, *params, operation=operation, observed=data, dims=dims)
+    rv = SimulatorDistribution(
+        name, *params, operation=operation, observed=data.for_pymc(values), dims=data.dims
+    )
     for partner in joined:
         partner.owner.op.assign(partner.owner, likelihood)
     return rv
@@ -539,7 +489,7 @@ def _measurement_variables(
 
 
 def _refuse_by_specimen(
-    name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation | None
+    name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation
 ) -> None:
     """Raise where the log-likelihood by specimen does not apply, and name the metric that does."""
     remedy = "use metric=prb.AreaMetric()"
@@ -548,7 +498,7 @@ def _refuse_by_specimen(
             f"{name}: epsilon: got {epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
             "and has no scale to choose; leave epsilon= out"
         )
-    if isinstance(propagation, Propagation) and propagation.is_random:
+    if propagation.is_random:
         raise TypeError(
             f"{name}: propagation: got {called(propagation)}, expected stored responses of a "
             f"deterministic response for prb.LogLikelihood(); {remedy}, or leave propagation= out"
@@ -571,7 +521,7 @@ def _refuse_by_specimen(
     refuse_without_density(name, inputs)
 
 
-def checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
+def _checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
     """Return measured outputs, (N,) or (N, m), of at least two specimens."""
     values = np.asarray(observed, dtype=np.float64)
     if values.ndim not in (1, 2) or len(values) < 2:
@@ -605,12 +555,48 @@ def checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
 # Metrics of distributions.
 
 
-def _add_simulator(
+def _add_by_metric(
+    arguments: _Arguments, metric: Metric
+) -> TensorVariable | tuple[TensorVariable, ...]:
+    """Add an observed variable with a metric of distributions, or one for each group."""
+    name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
+    refuse_covariates(name, inputs.covariates)
+    target = _prepared_metric(name, metric, data.values, data.weights)
+    if data.labels is not None:
+        _refuse_ambiguous_labels(name, data.labels, list(simulators(model).values()))
+    if arguments.epsilon is not None:
+        positive_number(arguments.epsilon, f"{name}: epsilon")
+    parts = [(name, target, data.labels, "")]
+    if inputs.groups is not None:
+        parts = _parts_by_group(target, inputs.groups, data)
+    scatter = None if arguments.propagation.is_random else 0.01
+    variables = []
+    for place, (part_name, part, labels, group) in enumerate(parts):
+        scale = 1 / effective_specimens(part, labels) if is_likelihood(part) else np.nan
+        scale = scale if arguments.epsilon is None else arguments.epsilon
+        specification = Specification(
+            part_name,
+            part,
+            arguments.responses(part_name, inputs, scatter),
+            arguments.propagation,
+            shared_epsilon(part_name, scale),
+            labels,
+            outputs=data.outputs,
+            group=group,
+            progressbar=arguments.progressbar,
+        )
+        values = part.observed if inputs.groups is not None else data.for_pymc(part.observed)
+        variables.append(_add_specification(model, specification, place, values, data.dims))
+    share_bandwidths(model)
+    return tuple(variables) if inputs.groups is not None else variables[0]
+
+
+def _add_specification(
     model: pm.Model,
     specification: Specification,
     place: int,
     observed: Any,
-    dims: str | Sequence[str] | None,
+    dims: tuple[str, ...] | None,
 ) -> TensorVariable:
     """Add an observed variable with a metric of distributions; place is that of its group."""
     name, target, labels = specification.name, specification.target, specification.specimens
@@ -638,25 +624,20 @@ def _add_simulator(
     signature = rv_signature([p.type.ndim for p in params], len(target.event))
     simulator = replace(specification, same_inputs=tuple(same_inputs))
     operation = SimulatorRV(signature=signature, reference=weakref.ref(simulator))
-    data = _pymc_data(observed, target.observed)
-    rv = SimulatorDistribution(name, *params, operation=operation, observed=data, dims=dims)
-    rv.owner.op.owner = weakref.ref(rv.owner)  # before a clone of the model claims it
+    rv = SimulatorDistribution(name, *params, operation=operation, observed=observed, dims=dims)
+    rv.owner.op.owner = weakref.ref(rv.owner)  # at once, since a clone of the model may claim it
     return rv
 
 
 def _parts_by_group(
-    name: str,
-    target: Discrepancy,
-    labels: NDArray[Any] | None,
-    groups: Groups,
-    places: NDArray[np.intp],
-    dims: str | Sequence[str] | None,
+    target: Discrepancy, groups: Groups, data: ObservedData
 ) -> list[tuple[str, Discrepancy, NDArray[Any] | None, str]]:
-    """Return name, target, labels and group of each group; places (N,) are those of specimens."""
-    if dims is not None:
+    """Return name, target, labels and group of each group."""
+    name, labels, places = data.name, data.labels, np.asarray(data.groups)
+    if data.dims is not None:
         raise ValueError(
-            f"{name}: dims: got {list(dims)}, expected none: specimens are divided into the groups "
-            f"{groups.names}, each with observed values of its own; leave dims= out"
+            f"{name}: dims: got {list(data.dims)}, expected none: specimens are divided into the "
+            f"groups {groups.names}, each with observed values of its own; leave dims= out"
         )
     place_of: dict[object, int] = {}
     for label, place in zip([] if labels is None else labels.tolist(), places, strict=False):
@@ -675,15 +656,6 @@ def _parts_by_group(
         part = _prepared_metric(part_name, target.metric, target.observed[rows], weights)
         parts.append((part_name, part, None if labels is None else labels[rows], group))
     return parts
-
-
-def checked_labels(
-    name: str, specimens: ArrayLike | None, observed: Any, size: int
-) -> NDArray[Any] | None:
-    """Return the labels of the specimens, (N,), in the order of the observed ones."""
-    if specimens is None:
-        return None
-    return sample_labels(in_order_of(specimens, observed, name), size, name)
 
 
 def _prepared_metric(
@@ -743,57 +715,6 @@ def _warn_shared_specimens(
                     "before, or use prb.sample, whose posterior counts them once.",
                 )
             )
-
-
-# Arguments of both kinds.
-
-
-def _present_numbers(name: str, observed: Any) -> Any:
-    """Return the present numbers of `pymc.Data`."""
-    values = None if hasattr(observed.type, "dims") else known_value(observed)
-    if values is None:
-        raise TypeError(
-            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
-        )
-    return values
-
-
-def _pymc_data(observed: Any, values: Floats) -> Any:
-    """Return the data of an observed variable: `pymc.Data` as it is, else the values.
-
-    Values with NaN are a constant, in which PyMC does not look for missing values to impute.
-    """
-    if isinstance(observed, Variable):
-        return observed
-    return pt.constant(values) if np.isnan(values).any() else values
-
-
-def _checked_dims(
-    name: str, dims: object, shape: tuple[int, ...], model: pm.Model
-) -> tuple[str, ...]:
-    """Return names of the observed dimensions, which the model has in the lengths of the data."""
-    names = [dims] if isinstance(dims, str) else dims
-    if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
-        raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
-    if len(names) != len(shape):
-        raise ValueError(
-            f"{name}: dims: got {names}, expected {len(shape)} names, one for each dimension of "
-            f"observed, {shape}"
-        )
-    lengths = model.dim_lengths
-    for dim, size in zip(names, shape, strict=True):
-        if dim not in lengths:
-            raise ValueError(
-                f"{name}: dims: got {dim!r}, expected one of the model's dimensions, "
-                f"{list(lengths)}; add it with pm.Model(coords={{{dim!r}: ...}})"
-            )
-        length = int(lengths[dim].eval(mode=PLAIN))
-        if length != size:
-            raise ValueError(
-                f"{name}: dims: got {dim!r} of length {length}, expected {size}, as many as there "
-                "are observed values"
-            )
-    return tuple(names)
 
 
 def _refuse_ambiguous_labels(

@@ -45,10 +45,10 @@ from prbayes.model.random_variable import (
 from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.model.unknown_error import ReadingDensity
 from prbayes.numerics.threads import one_thread
-from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
 from prbayes.specimens.response_share import ResponseShare
+from prbayes.specimens.weighted_points import WeightedPoints
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
@@ -66,19 +66,20 @@ def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
     return result
 
 
-def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
-    """Return the points of the specimens of each group, the values of the shared variables.
+def _array_values(likelihood: SpecimenLikelihood) -> tuple[list[Floats], Floats]:
+    """Return the present values of `arrays`: refits put those of other specimens there."""
+    shared, log_a = arrays(likelihood)
+    return [variable.get_value(borrow=True) for variable in shared], log_a.get_value(borrow=True)
 
-    Refits put the points of other specimens there.
-    """
-    shared, shared_log_a = arrays(likelihood)
-    log_a = shared_log_a.get_value(borrow=True)
+
+def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
+    """Return the points of the specimens of each group."""
+    x, log_a = _array_values(likelihood)
     last: tuple[Any, list[WeightedPoints]] = likelihood.cache.get("points by group", (None, []))
     if last[0] is not log_a:
-        x = [variable.get_value(borrow=True) for variable in shared]
         groups = [rows for _, rows in likelihood.by_group]
-        inputs = likelihood.inputs
-        points = [WeightedPoints.of(inputs, [v[rows] for v in x], log_a[rows]) for rows in groups]
+        density = likelihood.density
+        points = [WeightedPoints.of(density, [v[rows] for v in x], log_a[rows]) for rows in groups]
         last = likelihood.cache["points by group"] = (log_a, points)
     return last[1]
 
@@ -94,10 +95,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
         parents = likelihood.parents(values, group, rows)
-        if likelihood.error_is_known:
-            result[:, rows] = likelihood.density.log_likelihoods(parents, points)
-        else:
-            result[:, rows] = _with_unknown_error(likelihood, errors, parents, points, rows)
+        result[:, rows] = _of_points(likelihood, errors, parents, points, rows)
     if share is not None:
         result -= log_shares(likelihood, values, share)
     if repeats is not None:
@@ -127,9 +125,7 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     have a gross error have next to none. A specimen without a point in one of the halves is left
     out.
     """
-    shared, shared_log_a = arrays(likelihood)
-    log_a = shared_log_a.get_value(borrow=True)
-    x = [variable.get_value(borrow=True) for variable in shared]
+    x, log_a = _array_values(likelihood)
     size, half = len(next(iter(values.values()))), log_a.shape[1] // 2
     variance = np.zeros(size)
     errors = _errors(likelihood, values)
@@ -138,11 +134,8 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
         logs = []
         for part in (slice(half), slice(half, None)):
             of_half = [v[rows, part] for v in x]
-            points = WeightedPoints.of(likelihood.inputs, of_half, log_a[rows, part])
-            if likelihood.error_is_known:
-                of_points = likelihood.density.log_likelihoods(parents, points)
-            else:
-                of_points = _with_unknown_error(likelihood, errors, parents, points, rows, part)
+            points = WeightedPoints.of(likelihood.density, of_half, log_a[rows, part])
+            of_points = _of_points(likelihood, errors, parents, points, rows, part)
             logs.append(_with_gross_errors(likelihood, values, of_points, rows))
         with np.errstate(invalid="ignore"):
             difference = logs[0] - logs[1]
@@ -171,7 +164,7 @@ def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
 
 
 @one_thread()
-def _with_unknown_error(
+def _of_points(
     likelihood: SpecimenLikelihood,
     errors: Floats,
     parents: Sequence[Floats],
@@ -183,10 +176,12 @@ def _with_unknown_error(
 
     The points are ``columns`` of all points.
     """
+    if likelihood.error_is_known:
+        return points.log_likelihoods(parents)
     result = np.empty((len(errors), len(rows)))
     order = np.lexsort(errors.T)
     of_readings = _reading_density(likelihood).at_errors(errors[order])
-    of_points = likelihood.density.at_points([p[order] for p in parents], points)
+    of_points = points.log_densities([p[order] for p in parents])
     for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):
         result[k] = log_sum_exp(log_p + points.log_a + of_error[rows, columns])
     return result
@@ -304,11 +299,10 @@ def draw_inputs(
     has no gross errors: the inputs are then those of any specimen. Values are those of the model's
     variables by name, (P, *shape).
     """
-    shared, shared_log_a = arrays(likelihood)
-    log_a = shared_log_a.get_value(borrow=True)
+    all_points, log_a = _array_values(likelihood)
     errors = _errors(likelihood, values)
     size, n = len(errors), len(log_a)
-    inputs = [np.empty((size, n, *v.get_value(borrow=True).shape[2:])) for v in shared]
+    inputs = [np.empty((size, n, *v.shape[2:])) for v in all_points]
     probability = None
     gross_share = _gross_share(likelihood.measurements[0], values)
     if gross_share is not False:
@@ -319,7 +313,7 @@ def draw_inputs(
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(values, group, rows)
         by_point = likelihood.inputs.for_points(parents, log_a.shape[1])
-        x = [variable.get_value(borrow=True)[rows] for variable in shared]
+        x = [v[rows] for v in all_points]
         flat = [v.reshape(-1, *v.shape[2:]) for v in x]
         for k in range(size):
             density = likelihood.density.at([parent[k : k + 1] for parent in by_point], flat)
@@ -394,13 +388,15 @@ def draw_readings(
             break
         outputs[is_missing] = draw_outputs()[is_missing]
     if measurement is None:
-        return _with_errors(rng, outputs, likelihood.readings, likelihood.measurements, values)
+        return _with_reading_errors(
+            rng, outputs, likelihood.readings, likelihood.measurements, values
+        )
     outputs = outputs[..., output_columns(likelihood, measurement)]
-    readings = _with_errors(rng, outputs, measurement.readings, [measurement], values)
+    readings = _with_reading_errors(rng, outputs, measurement.readings, [measurement], values)
     return readings.reshape(size, n, *measurement.event)
 
 
-def _with_errors(
+def _with_reading_errors(
     rng: np.random.Generator,
     outputs: Floats,
     readings: Readings,

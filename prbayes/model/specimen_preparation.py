@@ -18,20 +18,20 @@ from scipy.special import chdtri, ndtri
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.emulators.runs import Runs as TableRuns
+from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
     data_findings,
     emulator_findings,
     misfit_findings,
     outlier_findings,
+    output_labels,
     refuse_unreachable,
     refuse_unused_inputs,
     repeat_findings,
     unreached,
 )
 from prbayes.model.measurement import (
-    Measurement,
     SpecimenLikelihood,
     output_columns,
     specimen_labels,
@@ -41,7 +41,6 @@ from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.propagation.population_density import WeightedPoints
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
@@ -56,6 +55,7 @@ from prbayes.specimens.points import (
 )
 from prbayes.specimens.proposals import Proposals
 from prbayes.specimens.response_share import ResponseShare, response_share
+from prbayes.specimens.weighted_points import WeightedPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,17 +134,19 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     for response in responses if not likelihood.has_table else []:
         response.on_start = partial(log_first_runs, cost, f"Reweighted(n={n})", response)
-    runs = Runs(likelihood)
+    runs = CheckedRuns(likelihood)
     try:
         data = specimen_data(likelihood)
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
         refined, share = response_share(
             # A call of a table's surface is no run.
-            OfTables.of(likelihood, TableRuns.__call__) if likelihood.has_table else runs,
+            OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
             data,
             first.emulation,
-            lambda share: Populations(likelihood).posterior(points.z, points.log_a, share=share),
+            lambda share: SpecimenPopulations(likelihood).posterior(
+                points.z, points.log_a, share=share
+            ),
         )
         if share is not None and likelihood.inputs.conditions:
             raise DesignError(
@@ -175,7 +177,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
 
 
 @dataclass(eq=False)
-class Runs:
+class CheckedRuns:
     """Outputs of runs at coordinates; checks the first ones for range and influence."""
 
     likelihood: SpecimenLikelihood
@@ -233,7 +235,7 @@ def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[f
 
 def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     """Return the specimens, what is known of them, and the populations of the model."""
-    populations = Populations(likelihood)
+    populations = SpecimenPopulations(likelihood)
     coordinates, conditions = likelihood.coordinates, likelihood.stacked.coordinates
     known = np.full((len(likelihood.readings), coordinates.size), np.nan)
     if conditions is not None:
@@ -250,18 +252,16 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         gross_errors=likelihood.measurements[0].gross_errors is not False,
         options=replace(likelihood.options, n_first=first_run_count(likelihood)),
         name=likelihood.name,
-        output_names=tuple(name for m in likelihood.measurements for name in _output_names(m)),
+        output_names=tuple(
+            label
+            for m in likelihood.measurements
+            for label in output_labels(m.name, m.outputs.names)
+        ),
         labels=specimen_labels(likelihood),
     )
 
 
-def _output_names(measurement: Measurement) -> list[str]:
-    """Return the names of the outputs of a simulator, as messages have them."""
-    name = measurement.name
-    return [f"{name}[{label}]" for label in measurement.outputs.names] or [name]
-
-
-def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Preparation:
+def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Return the emulator, the points and findings of both."""
     likelihood = runs.likelihood
     if likelihood.has_table:
@@ -275,11 +275,11 @@ def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Pre
         points, proposals, draws = specimen_points(data, emulation, population)
     else:
         emulation, points, proposals, draws = emulate(runs, data, emulation)
-    findings = tuple(_findings(likelihood, emulation, points, proposals))
+    findings = tuple(_preparation_findings(likelihood, emulation, points, proposals))
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
 
-def _findings(
+def _preparation_findings(
     likelihood: SpecimenLikelihood,
     emulation: Emulation,
     points: SpecimenPoints,
@@ -324,7 +324,7 @@ def _data_findings(
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
             values,
-            labels=_output_names(m),
+            labels=output_labels(m.name, m.outputs.names),
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
         )
@@ -347,7 +347,7 @@ def log_shares(
 
 
 @dataclass(frozen=True, eq=False)
-class Populations:
+class SpecimenPopulations:
     """Populations of a model's hyperparameters, evaluated at points of its specimens."""
 
     likelihood: SpecimenLikelihood
@@ -376,8 +376,8 @@ class Populations:
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
             if smoothing is None:
-                points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
-                result[:, rows] = likelihood.density.log_likelihoods(parents, points)
+                points = WeightedPoints.of(likelihood.density, [v[rows] for v in x], weights[rows])
+                result[:, rows] = points.log_likelihoods(parents)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
@@ -508,7 +508,7 @@ def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
 class PopulationDraws:
     """Draws of the hyperparameters, (S, d)."""
 
-    populations: Populations
+    populations: SpecimenPopulations
     thetas: Floats
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:

@@ -108,7 +108,7 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
     box = np.stack([np.maximum(bounds[0], low - (high - low) / 2), bounds[1]])
     box[1] = np.minimum(bounds[1], high + (high - low) / 2)
     if (box[0] >= box[1]).any():
-        names = _columns(likelihood)
+        names = _column_names(likelihood)
         prior = _as_inputs(coordinates, bounds)
         table_ends = _as_inputs(coordinates, ranges)
         j = int(np.argmax(box[0] >= box[1]))
@@ -166,7 +166,9 @@ def _asked(likelihood: SpecimenLikelihood, specimens: Floats, ranges: Floats) ->
     asked = np.quantile(_as_inputs(coordinates, specimens), [0.005, 0.995], axis=0)
     parts = [
         f"{name} from {low:.4g} to {high:.4g}, where the runs have {least:.4g} to {most:.4g}"
-        for name, low, high, least, most in zip(_columns(likelihood), *asked, *ends, strict=True)
+        for name, low, high, least, most in zip(
+            _column_names(likelihood), *asked, *ends, strict=True
+        )
         if low < least or high > most
     ]
     return "; ".join(parts) or "the corners of the ranges"
@@ -193,7 +195,7 @@ def _table(measurement: Measurement) -> Runs:
     return cast(Runs, measurement.responses.function)
 
 
-def _columns(likelihood: SpecimenLikelihood) -> list[str]:
+def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
     """Return the name of each aleatory number, as in the table."""
     m = likelihood.measurements[0]
     names: list[str] = []

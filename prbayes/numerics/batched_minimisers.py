@@ -175,7 +175,7 @@ def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) 
     for size in sizes:
         # Points and values of the simplices, (B, r + 1, r) and (B, r + 1), the best point first.
         simplices = x[:, None] + np.concatenate([np.zeros((1, r)), size * np.eye(r)])
-        points, all_values = _sorted(simplices, value(simplices, np.arange(n_rows)))
+        points, all_values = _best_first(simplices, value(simplices, np.arange(n_rows)))
         converged = np.zeros(n_rows, dtype=bool)
         # A simplex shrinks about a millionfold in 60 iterations for each parameter.
         for _ in range(60 * r):
@@ -197,7 +197,7 @@ def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) 
     return Minima(x, values, converged)
 
 
-def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
+def _best_first(points: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Return simplices with their best point first."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
@@ -243,4 +243,4 @@ def _step(
         nearer = vertex + (1 - 1 / n) * (points[shrinks, 1:] - vertex)
         points[shrinks, 1:] = nearer
         values[shrinks, 1:] = value(nearer, rows[shrinks])
-    return _sorted(points, values)
+    return _best_first(points, values)

@@ -118,6 +118,7 @@ class Search:
     uses_gradient: bool = field(init=False)  # whether the method receives gradients
     # whether gradients jump, so that line searches end in ever smaller steps
     has_kinks: bool = field(init=False)
+    is_random: bool = field(init=False)  # whether evaluations draw specimens
 
     def __post_init__(self) -> None:
         nodes = self.evaluator.nodes
@@ -133,6 +134,7 @@ class Search:
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
         object.__setattr__(self, "uses_gradient", method.gradient and not random)
         object.__setattr__(self, "has_kinks", has_kinks)
+        object.__setattr__(self, "is_random", bool(random))
 
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; for a user's metric its value at theta."""
@@ -400,7 +402,7 @@ def approach(
     response. Returns theta itself where there is overlap.
     """
     evaluator = search.evaluator
-    if [node for node in evaluator.nodes if node.bound.random]:
+    if search.is_random:
         return theta, trace
     # With a weight effective sample size below two the design does not reach the population at all.
     ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]

@@ -13,10 +13,16 @@ from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information, oriented
 from prbayes.inference.checks.identification import unidentified_names
-from prbayes.inference.design_error import DesignErrors, design_error, is_emulated
+from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
-from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
+from prbayes.model.evaluator import (
+    Evaluator,
+    Shortcoming,
+    have_emulated_points,
+    n_design_runs,
+    shortcomings,
+)
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import (
     OVERLAP,
@@ -116,7 +122,7 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     if fit.ridge is not None and local is not None:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-    elif fit.pilot is None or (local is not None and is_emulated(evaluator)):
+    elif fit.pilot is None or (local is not None and have_emulated_points(evaluator)):
         # Take the prior's variance for elements whose variance is not known.
         covariance = fit.covariance
         is_finite = np.isfinite(covariance)
@@ -231,7 +237,7 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    if not is_emulated(evaluator) or errors.emulators > _SHARE * AGREE:
+    if not have_emulated_points(evaluator) or errors.emulators > _SHARE * AGREE:
         # Assume that the error of a design of several inputs falls with the power .65 of its size.
         # Add at most as many runs as there are, because the estimate of the error is itself
         # uncertain.
@@ -257,7 +263,7 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
             continue
         previous = bound.n_runs
         batch = bound.config.n
-        if bound.design.is_emulated:
+        if bound.design.has_emulated_points:
             batch = max(batch // 4, bound.responses.workers)
         batches = max(1, round((factor - 1) * previous / batch))
         size = min(batches * batch, bound.config.most - previous)
@@ -308,7 +314,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         has_room = {
             name
             for name in names
-            if not bounds[name].design.is_emulated
+            if not bounds[name].design.has_emulated_points
             and len(bounds[name].design.batch_sizes) <= MAX_ROUNDS
         }
         _add_runs(evaluator, best, has_room)
@@ -347,7 +353,7 @@ def draw_samples(
     is_drawn = False
     for k, node in enumerate(evaluator.nodes):
         bound = node.reweighted
-        if bound is None or not bound.design.is_emulated or node.name not in names:
+        if bound is None or not bound.design.has_emulated_points or node.name not in names:
             continue
         if not larger or bound.design.emulated_size < SIZES.largest:
             parents = valid_parents(bound, _components(evaluator, thetas, k))

@@ -40,7 +40,7 @@ from prbayes.model.parameters import Hyperparameters, variables_at
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
-    Populations,
+    SpecimenPopulations,
     prepared,
     specimen_data,
 )
@@ -549,7 +549,7 @@ def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> fl
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why a model of log-likelihoods by specimen cannot be fitted to other data, or None."""
     others = len(evaluator.model.observed_RVs) > len(evaluator.measurements)
-    if evaluator.nodes or others or evaluator.model.potentials:
+    if others or evaluator.model.potentials:
         return (
             "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
         )
@@ -631,7 +631,7 @@ def specimen_pool(
         replace(preparation.emulation, offsets=None),
         preparation.proposals.residuals.population,
     )
-    draws = _Copies(PopulationDraws(Populations(likelihood), preparation.thetas), n)
+    draws = _Copies(PopulationDraws(SpecimenPopulations(likelihood), preparation.thetas), n)
     points, _ = agreeing_points(data, proposals, data.options.points, draws)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)

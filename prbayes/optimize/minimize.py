@@ -408,7 +408,7 @@ def _fit(
     fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
     problem.fits.append(fit)
     is_unset = np.isnan(evaluator.epsilon)
-    if len(evaluator.nodes) > 1 and is_unset.any():
+    if is_unset.size > 1 and is_unset.any():
         noise = noise_floors(evaluator, fit.theta, SETS)
         scales = np.where(is_unset, noise, evaluator.epsilon)
         fit = replace(minimise(search, fit.theta, scales, fit.trace), pilot=pilot)
@@ -560,7 +560,9 @@ def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
     evaluator = search.evaluator
     sentences = [f"{', '.join(at_edge)} reached the edge of the support."] if at_edge else []
     designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
-    emulated = [design.summary(name) for name, design in designs.items() if design.is_emulated]
+    emulated = [
+        design.summary(name) for name, design in designs.items() if design.has_emulated_points
+    ]
     if emulated and np.isfinite(fit.design_error):
         error = f"{fit.design_error:.2g} standard errors"
         emulated.append(f"Another design's optimum would differ by {error}.")

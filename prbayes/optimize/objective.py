@@ -127,7 +127,8 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
         finite = values[np.isfinite(values)]
         if finite.size and np.ptp(finite) > 0:
             terms = "other likelihood terms or potentials"
-    if not terms and len(evaluator.nodes) == 1:
+    epsilon = evaluator.epsilon
+    if not terms and epsilon.size == 1:
         return np.ones(1)
     unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]
     if terms and unset:
@@ -139,7 +140,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
             "prb.set_epsilon(model, dict(prb.calibrate_epsilon(prb.minimize(alone))))"
         )
     sizes = np.array([node.target.scale for node in evaluator.nodes])
-    return np.where(np.isnan(evaluator.epsilon), sizes, evaluator.epsilon)
+    return np.where(np.isnan(epsilon), sizes, epsilon)
 
 
 # SciPy's minimisers that need no Hessian

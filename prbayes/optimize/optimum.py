@@ -36,12 +36,13 @@ from prbayes.model.evaluator import (
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
+    with_data,
 )
 from prbayes.model.fingerprint import (
     Identity,
     Level,
     as_attributes,
-    from_attributes,
+    identity_from_attributes,
     identity_of,
     require_same,
 )
@@ -441,9 +442,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
 
 def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
-    responses = [node.bound.responses for node in evaluator.nodes]
-    responses += [measurement.responses for measurement in evaluator.measurements]
-    return sum(r.computed for r in responses)
+    return sum(simulator.responses.computed for simulator in with_data(evaluator))
 
 
 def point_text(evaluator: Evaluator, theta: Floats) -> str:
@@ -562,11 +561,11 @@ def identity_in(result: Any) -> Identity | None:
     if isinstance(result, Optimum):
         return result.search.identity
     if isinstance(result, xr.Dataset):
-        return from_attributes(result.attrs)
+        return identity_from_attributes(result.attrs)
     if not isinstance(result, xr.DataTree):
         return None
     group = "posterior" if "posterior" in result.children else "optimum"
-    return from_attributes(result[group].attrs) if group in result.children else None
+    return identity_from_attributes(result[group].attrs) if group in result.children else None
 
 
 def element_order(optimum: Optimum, evaluator: Evaluator) -> list[int]:

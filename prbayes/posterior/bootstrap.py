@@ -84,28 +84,13 @@ def bootstrap(
     (1, 50)
     """
     clock = time.perf_counter()
-    by_specimen = is_specimen_optimum(optimum)
-    if not by_specimen:
-        optimum = require_refits(optimum, "bootstrap", "; use prb.sample_smc")
     positive_integer(draws, "draws", minimum=2)
     flag(parametric, "parametric")
     seed = seed_number(random_seed)
-    evaluator = optimum.evaluator
+    refitted = _specimen_estimates if is_specimen_optimum(optimum) else _metric_estimates
     with shown(progressbar):
-        if by_specimen:
-            thetas, converged = _specimen_estimates(optimum, draws, seed, parametric=parametric)
-        else:
-            sampling = optimum.sampling()
-            names = evaluator.hyperparameters.readable_names
-            _require_identified(unidentified_directions(sampling.local.unidentified, names))
-            if parametric:
-                data = simulated_sets(evaluator, optimum.theta, draws, seed)
-            else:
-                data = reweighted_sets(evaluator, draws, seed)
-            x, converged = refit(sampling, data)
-            if is_prepared_by_data(sampling.evaluator):
-                x, converged = refit_prepared(sampling, data, x)
-            thetas = sampling.thetas(x)
+        thetas, converged = refitted(optimum, draws, seed, parametric=parametric)
+    evaluator = optimum.evaluator
     attrs = {
         "sampler": "parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         "converged": float(converged.mean()),
@@ -119,6 +104,24 @@ def bootstrap(
         "observed_data": observed_dataset(evaluator),
     }
     return xr.DataTree.from_dict(groups)
+
+
+def _metric_estimates(
+    optimum: Optimum, draws: int, seed: int, *, parametric: bool
+) -> tuple[Floats, Bools]:
+    """Return minimisers of the discrepancies, (draws, d), and whether they converged."""
+    optimum = require_refits(optimum, "bootstrap", "; use prb.sample_smc")
+    evaluator, sampling = optimum.evaluator, optimum.sampling()
+    names = evaluator.hyperparameters.readable_names
+    _require_identified(unidentified_directions(sampling.local.unidentified, names))
+    if parametric:
+        data = simulated_sets(evaluator, optimum.theta, draws, seed)
+    else:
+        data = reweighted_sets(evaluator, draws, seed)
+    x, converged = refit(sampling, data)
+    if is_prepared_by_data(sampling.evaluator):
+        x, converged = refit_prepared(sampling, data, x)
+    return sampling.thetas(x), converged
 
 
 def _specimen_estimates(

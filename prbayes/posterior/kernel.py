@@ -22,7 +22,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
 from prbayes._validate import Floats, called, positive_integer, real_array, share
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
+from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
 from prbayes.model.parameters import Hyperparameters
 from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
@@ -400,7 +400,7 @@ class Checkpoint:
             raise StoreError(self._refusal("was written by another version of prbayes"))
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = settings["entropy"]
-        reasons = differences(problem, self.problem, Level.RUN)
+        reasons = problem_differences(problem, self.problem, Level.RUN)
         for key in sorted({*settings, *self.settings}):
             got, expected = settings.get(key), self.settings.get(key)
             if got != expected:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
-from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
+from prbayes.inference.resampling import SETS, aligned, groups, observable
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
     ScoreOptions,
@@ -32,6 +32,7 @@ from prbayes.metrics.score import (
     tabulated_scores,
 )
 from prbayes.model.evaluator import Evaluator, coarser_evaluator
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
@@ -255,7 +256,7 @@ def _group_scores(
     options: EstimateLikelihoodOptions,
 ) -> StoredScores | ResimulatedScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies."""
-    numbers, total = specimens(evaluator.nodes)
+    numbers, total = number_specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
     populations = [_derivatives(evaluator, k, point, options) for k in members]
@@ -355,7 +356,7 @@ def score_obstacle(evaluator: Evaluator) -> str | None:
             return f"{node.name} has a {metric}, whose gradient is no mean over specimens"
         if np.ptp(node.target.weights) > 1e-12:
             return f"{node.name} has observed responses of unequal weights"
-    numbers, _ = specimens(evaluator.nodes)
+    numbers, _ = number_specimens(evaluator.nodes)
     for members in groups(evaluator.nodes):
         expected = np.unique(numbers[members[0]])
         is_same = [np.array_equal(np.sort(numbers[k]), expected) for k in members]

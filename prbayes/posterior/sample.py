@@ -27,12 +27,7 @@ from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
 from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
-from prbayes.posterior.target import (
-    Target,
-    estimate_target,
-    require_density,
-    specimen_target,
-)
+from prbayes.posterior.target import Target, posterior_target, require_density
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -153,11 +148,7 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     with designs_as_before(evaluator):
         chains = None
         for _ in range(MAX_ROUNDS + 1):
-            if evaluator.nodes:
-                assert optimum is not None
-                target = estimate_target(evaluator, optimum)
-            else:
-                target = specimen_target(evaluator, optimum)
+            target = posterior_target(evaluator, optimum)
             modes = modes_of(target)
             if modes is None:
                 break
@@ -210,10 +201,7 @@ def importance_chains(
     sample = importance_sample(target.log_posterior, modes, size, seed, options, prior)
     if not sample.is_reliable:
         return None
-    log_likelihood = None
-    if target.evaluator.nodes:
-        log_prior = hyperparameters.log_prior(sample.draws)
-        log_likelihood = (sample.log_density - log_prior).reshape(shape)
+    log_prior = hyperparameters.log_prior(sample.draws)
     coords = {"chain": np.arange(settings.chains), "draw": np.arange(settings.draws)}
     lp = ["chain", "draw"], sample.log_density.reshape(shape)
     return Chains(
@@ -225,7 +213,7 @@ def importance_chains(
             "log_marginal_likelihood": sample.log_evidence,
         },
         sample_stats=xr.Dataset({"lp": lp}, coords=coords),
-        log_likelihood=log_likelihood,
+        log_likelihood=(sample.log_density - log_prior).reshape(shape),
     )
 
 

@@ -117,17 +117,19 @@ def simulation_based_calibration(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)
-    obstacle_of = summary_obstacle if evaluator.nodes else simulation_obstacle
-    obstacle = obstacle_of(evaluator)
+    obstacle = simulation_obstacle(evaluator)
+    if evaluator.nodes:
+        obstacle = summary_obstacle(evaluator)
+        if obstacle is None and evaluator.other_terms:
+            raise ValueError(
+                "simulation_based_calibration: got a model with likelihood terms or potentials "
+                "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes "
+                "only"
+            )
     if obstacle is not None:
         raise ValueError(
             f"simulation_based_calibration: {obstacle}, and data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
-        )
-    if evaluator.nodes and evaluator.other_terms:
-        raise ValueError(
-            "simulation_based_calibration: got a model with likelihood terms or potentials "
-            "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
         )
     settings = SamplingSettings(draws=draws, adjustment=adjustment, random_seed=seed)
     jobs = [range(n)[start : start + _CHUNK] for start in range(0, n, _CHUNK)]
@@ -266,7 +268,7 @@ def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dic
     rng = np.random.default_rng([settings.random_seed, number])
     hyperparameters = evaluator.hyperparameters
     theta = hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
-    data = fresh_data(evaluator, theta[0], rng) if evaluator.nodes else {}
+    data = fresh_data(evaluator, theta[0], rng)
     values = hyperparameters.constrained(theta)
     # With a log-likelihood by specimen the emulator stands for the response.
     pools = [

@@ -26,7 +26,12 @@ from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    needs_refits,
+    refit,
+    summary_obstacle,
+)
 from prbayes.inference.resampling import groups, observable, observed_set, sets_along
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
@@ -79,7 +84,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     For data sheets the log-density of the metric is the likelihood.
     """
     require_density(evaluator)
-    if evaluator.nodes[0].metric.exact_likelihood:
+    if summary_obstacle(evaluator) is not None:
 
         def log_likelihood(thetas: Floats) -> Floats:
             return evaluator(thetas).log_likelihood(evaluator.epsilon)
@@ -89,6 +94,14 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     is_mean = score_obstacle(evaluator) is None
     likelihood_of = estimate_likelihood if is_mean else refit_likelihood
     return _target_of(likelihood_of(evaluator, optimum))
+
+
+def posterior_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
+    """Return the posterior given the metrics' estimate, or that of log-likelihoods by specimen."""
+    if not evaluator.nodes:
+        return specimen_target(evaluator, optimum)
+    assert optimum is not None
+    return estimate_target(evaluator, optimum)
 
 
 def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
@@ -103,12 +116,13 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
 
 def require_density(evaluator: Evaluator) -> None:
     """Raise if the density of the metrics' estimate is not known."""
-    sheets = [node.name for node in evaluator.nodes if node.metric.exact_likelihood]
-    if len(sheets) == len(evaluator.nodes):
+    is_sheet = [node.metric.exact_likelihood for node in evaluator.nodes]
+    if all(is_sheet):
         return
-    if sheets:
+    if any(is_sheet):
+        name = evaluator.nodes[is_sheet.index(True)].name
         raise ValueError(
-            f"{sheets[0]}: observed: got a prb.Summary in a model with a metric of distributions, "
+            f"{name}: observed: got a prb.Summary in a model with a metric of distributions, "
             "expected prb.LogLikelihood() for the specimens of other simulators: leave their "
             "metric= out, or use prb.sample_smc with adjustment=None"
         )

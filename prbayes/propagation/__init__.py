@@ -1,4 +1,4 @@
-"""Propagation of a population of inputs to responses: stored, simulated again, or by specimen."""
+"""Propagation of a population of inputs to responses: stored with weights, or simulated again."""
 
 from prbayes.propagation.base import Bound, DesignError, Propagation
 

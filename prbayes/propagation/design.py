@@ -21,7 +21,7 @@ from prbayes.propagation.importance import (
     Mixture,
     MixtureSampler,
     Sample,
-    fit_emulator,
+    concatenated,
     mixture_of,
     spread_over,
 )
@@ -57,8 +57,8 @@ class Design:
     on_line: bool = False
 
     @property
-    def is_emulated(self) -> bool:
-        """Whether responses between the runs are emulated."""
+    def has_emulated_points(self) -> bool:
+        """Whether there are points between the runs, whose responses are emulated."""
         return self.emulated is not None
 
     def rows(self, mask: NDArray[np.bool_]) -> Design:
@@ -147,8 +147,7 @@ class DesignSampler:
             moving = moving_inputs(self.mixtures.name, inputs, components, points)
         else:
             moving = design.moving
-            pairs = zip(design.runs.points, points, strict=True)
-            points = tuple(np.concatenate([a, b]) for a, b in pairs)
+            points = concatenated(design.runs.points, points)
             values = np.concatenate([design.runs.values, values])
             mixture = design.mixture.joined(mixture)
             batch_sizes = (*design.batch_sizes, n)
@@ -178,7 +177,7 @@ class DesignSampler:
         # 32 populations determine the mixing weight of the emulator.
         weights = self.weights(runs, spread_over(components, 32))
         if emulator is None:
-            emulator = fit_emulator(self.emulator, runs, weights)
+            emulator = DesignEmulator.fit(self.emulator, runs, weights)
         else:
             emulator = emulator.for_populations(weights)
         if emulator is None:

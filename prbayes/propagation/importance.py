@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator
-from prbayes.emulators.selection import Runs, weight_of_runs
+from prbayes.emulators.selection import TrainingRuns, weight_of_runs
 from prbayes.emulators.surfaces import as_surface
 from prbayes.numerics.points import base_points, inside
 from prbayes.numerics.threads import one_thread
@@ -37,8 +37,7 @@ class Mixture:
 
     def joined(self, more: Mixture) -> Mixture:
         """Return the mixture of the points of both."""
-        pairs = zip(self.components, more.components, strict=True)
-        components = tuple(np.concatenate([a, b]) for a, b in pairs)
+        components = concatenated(self.components, more.components)
         return Mixture(components, np.concatenate([self.counts, more.counts]))
 
 
@@ -242,7 +241,7 @@ class Sample:
 class DesignEmulator:
     """An emulator of one response, fitted to the runs of a design."""
 
-    runs: Runs
+    runs: TrainingRuns
     emulator: Emulator
     left_out: Floats  # (n, m): predictions of runs that were left out
     event: tuple[int, ...]  # shape of one response: () or (m,)
@@ -252,6 +251,26 @@ class DesignEmulator:
     # in the populations that matter.
     error: float = np.nan
     worst_output: int = 0
+
+    @classmethod
+    @one_thread()
+    def fit(cls, emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator | None:
+        """Fit an emulator to runs; None where the runs alone are as good.
+
+        ``emulator`` is a surface or a regressor, or a text for the best of several surfaces.
+        ``weights``, (T, n), are those of the runs in the populations that matter.
+        """
+        x = columns(runs.points)
+        y = runs.values.reshape(len(runs), -1)
+        fitted = TrainingRuns(x, y, weights.mean(axis=0), runs.blocks)
+        tried = ROUGH_CANDIDATES if isinstance(emulator, str) else [as_surface(emulator)]
+        try:
+            best = fitted.fit(tried)
+            left_out = fitted.left_out_predictions(best)
+        except np.linalg.LinAlgError:
+            return None
+        fit = cls(fitted, best, left_out, runs.values.shape[1:], weights)
+        return fit.for_populations(weights)
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for populations; None where the runs alone are as good."""
@@ -304,32 +323,12 @@ class DesignEmulator:
         # Weights are p / g: the mean over all points together is one.
         of_points = log_density - np.log((1 - self.run_share) * (m + n) / m)
         of_runs = runs.log_density - np.log(self.run_share * (m + n) / n)
-        pairs = zip(points, runs.points, strict=True)
         return Sample(
-            points=tuple(np.concatenate([a, b]) for a, b in pairs),
+            points=concatenated(points, runs.points),
             values=np.concatenate([values, runs.values]),
             log_density=np.concatenate([of_points, of_runs]),
             blocks=np.concatenate([blocks, runs.blocks]),
         )
-
-
-@one_thread()
-def fit_emulator(emulator: Any, runs: Sample, weights: Floats) -> DesignEmulator | None:
-    """Fit an emulator to runs; None where the runs alone are as good.
-
-    ``emulator`` is a surface or a regressor, or a text for the best of several. ``weights``,
-    (T, n), are those of the runs in the populations that matter.
-    """
-    x = columns(runs.points)
-    y = runs.values.reshape(len(runs), -1)
-    fitted = Runs(x, y, weights.mean(axis=0), runs.blocks)
-    try:
-        best = fitted.fit(ROUGH_CANDIDATES if isinstance(emulator, str) else [as_surface(emulator)])
-        left_out = fitted.left_out_predictions(best)
-    except np.linalg.LinAlgError:
-        return None
-    fit = DesignEmulator(fitted, best, left_out, runs.values.shape[1:], weights)
-    return fit.for_populations(weights)
 
 
 def columns(points: Sequence[Floats]) -> Floats:
@@ -358,4 +357,9 @@ def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floa
     share = (1 - SIZES.prior_share) / (near * len(posteriors))
     shares = np.full(SIZES.from_prior + near * len(posteriors), share)
     shares[: SIZES.from_prior] = SIZES.prior_share / SIZES.from_prior
-    return [np.concatenate(same) for same in zip(*parts, strict=True)], shares
+    return list(concatenated(*parts)), shares
+
+
+def concatenated(*parts: Sequence[Floats]) -> tuple[Floats, ...]:
+    """Return arrays by input, each of which joins those of the parts."""
+    return tuple(map(np.concatenate, zip(*parts, strict=True)))

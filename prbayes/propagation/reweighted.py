@@ -39,7 +39,6 @@ from prbayes.propagation.importance import (
     DesignEmulator,
     MixtureSampler,
     Sample,
-    fit_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
 from prbayes.propagation.population_density import PopulationDensity, normalise
@@ -233,6 +232,7 @@ class ReweightedBound(Bound):
 
     stored: ClassVar[bool] = True
     has_runs: ClassVar[Literal[True]] = True  # as points, unlike emulated specimens
+    is_continued: ClassVar[bool] = False  # whether responses are constant beyond the runs
 
     def __init__(
         self,
@@ -263,7 +263,7 @@ class ReweightedBound(Bound):
         runs = self._design.runs
         self.first_points, self.first_responses = runs.points, runs.values
         refuse_all_nan(name, runs.values)
-        if not self._design.is_emulated:
+        if not self._design.has_emulated_points:
             _report_low_ess(self, components)
 
     @property
@@ -361,6 +361,15 @@ class ReweightedBound(Bound):
         has_runs = len(values) < self.n_points
         return np.concatenate([values, at_runs]) if has_runs else values
 
+    def n_runs_of(self, responses: Responses) -> int:
+        """Return the number of runs behind a response."""
+        return self.n_runs
+
+    @property
+    def on_line(self) -> bool:
+        """Whether the points are a quadrature rule of one continuous number."""
+        return self._design.on_line
+
     def refuse_change(self, responses: Responses) -> None:
         """Raise if the design's own response gives other values now than at the runs."""
         runs = self._design.runs
@@ -411,7 +420,7 @@ class ReweightedBound(Bound):
         design = self._design
         assert design.emulator is not None
         runs = replace(design.runs, values=at_runs)
-        emulator = fit_emulator(self.config.emulator, runs, design.emulator.weights)
+        emulator = DesignEmulator.fit(self.config.emulator, runs, design.emulator.weights)
         # With half of the population, the bias of the emulator is as large as the scatter of runs.
         # The runs have the share that the design's own response gave them.
         most = 0.5

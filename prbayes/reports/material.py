@@ -21,12 +21,12 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import (
     Identity,
     Level,
-    differences,
+    identity_from_attributes,
     identity_of,
+    problem_differences,
     require_same,
     require_together,
 )
-from prbayes.model.fingerprint import from_attributes as identity_of_attributes
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
@@ -211,7 +211,7 @@ def gather(
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
     for label, (_, predicted) in validation.items():
-        identities[f"validation, {label}"] = identity_of_attributes(predicted.attrs)
+        identities[f"validation, {label}"] = identity_from_attributes(predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
@@ -344,7 +344,9 @@ def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | 
         return
     expected = identity_of(model)
     posteriors = {label: identity for label, identity in identities.items() if identity is not None}
-    if posteriors and all(differences(i, expected, Level.PRIORS) for i in posteriors.values()):
+    if posteriors and all(
+        problem_differences(i, expected, Level.PRIORS) for i in posteriors.values()
+    ):
         label, identity = next(iter(posteriors.items()))
         require_same(identity, expected, f"Report: {label}", Level.PRIORS)
 
@@ -413,7 +415,7 @@ def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
     identity = identity_in(result)
     if model is None or identity is None:
         return model
-    return None if differences(identity, identity_of(model), Level.OPTIMUM) else model
+    return None if problem_differences(identity, identity_of(model), Level.OPTIMUM) else model
 
 
 # -- schema of results in files --------------------------------------------------------------

@@ -225,7 +225,7 @@ def _fmpy() -> Any:
     return fmpy
 
 
-def _digest(path: str | Path) -> str:
+def _file_digest(path: str | Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -260,7 +260,7 @@ def _read_unit(path: Path) -> tuple[Unit, Any]:
         )
     unit = Unit(
         str(path.absolute()),
-        _digest(path),
+        _file_digest(path),
         str(description.modelName),
         str(interface.modelIdentifier),
         str(description.guid),
@@ -569,7 +569,7 @@ class _OpenUnit:
 
     def __init__(self, unit: Unit) -> None:
         is_file = Path(unit.path).is_file()
-        if not is_file or _digest(unit.path) != unit.digest:
+        if not is_file or _file_digest(unit.path) != unit.digest:
             what = "has changed since" if is_file else "is not there"
             raise RuntimeError(
                 f"{unit.name}: got {unit.path}, which {what}, expected the file with which the "

@@ -100,7 +100,7 @@ def check_call_settings(
 
 
 @dataclass
-class Runs:
+class StoredRuns:
     """Runs of a response that simulators with the same inputs and settings share."""
 
     # Batches of stored points, (n, *event) for each aleatory input, and their responses, (n,) or
@@ -175,7 +175,7 @@ class Responses:
         self.scatter = scatter
         # Called with the number of runs of a call, and the seconds of one: NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
-        self.runs = Runs()
+        self.runs = StoredRuns()
         self._is_checked = False
         self._written_form = written_form(function)
         self._n_reused = 0
@@ -190,7 +190,7 @@ class Responses:
         """Return the same function with its own counts, and the same executor and store."""
         duplicate = copy.copy(self)
         duplicate._tally = self._tally.copied()
-        duplicate.runs = Runs(list(self.runs.stored), users=set(self.runs.users))
+        duplicate.runs = StoredRuns(list(self.runs.stored), users=set(self.runs.users))
         return duplicate
 
     def share(self, other: Responses) -> None:

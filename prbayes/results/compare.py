@@ -275,7 +275,7 @@ def _scores(
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
             default: Sequence[Metric] = _METRICS
-            if simulator.is_emulated:  # its log-likelihood replaces the kernel form
+            if simulator.metric.by_specimen:  # its log-likelihood replaces the kernel form
                 default = _METRICS[:-1]
             if simulator.observed.ndim > 1:
                 default = [Joint(metric) for metric in default]  # the same in all directions
@@ -284,12 +284,7 @@ def _scores(
                 selection = [simulator.metric]
             for metric in selection:
                 target = metric.against(simulator.observed, simulator.weights)
-                if simulator.is_emulated:
-                    responses, weights = evaluator.populations(thetas, k)
-                    rows = range(len(thetas))
-                    totals = np.array([target.of(responses[[i]], weights[[i]])[0] for i in rows])
-                else:
-                    totals = simulator.bound.discrepancies(evaluator.parents(thetas, k), target)
+                totals = simulator.discrepancies(evaluator.parents(thetas, k), target)
                 inner = getattr(metric, "metric", None)
                 name = type(metric).__name__
                 if isinstance(inner, Metric):

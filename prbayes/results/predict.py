@@ -231,7 +231,7 @@ def predict(
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
         **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
-        "specimens_id": _digest(*drawn.specimens),
+        "specimens_id": _array_digest(*drawn.specimens),
         "random_seed": str(seed),
         "findings": as_json((*findings_of(response), *report(*width_of_epsilon(result, model)))),
         **_calibration_attributes(result, model),
@@ -484,7 +484,7 @@ def _predicted(
     results: list[_Predicted] = []
     emulated: EmulatedResponse | None = None
     for group_points in by_group:
-        if simulator is not None and not simulator.is_emulated:
+        if isinstance(simulator, Node):
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
             continue
         parents = [group_points[str(rv.name)] for rv in inputs.parents]
@@ -703,7 +703,7 @@ def specimen_names(labels: ArrayLike) -> list[str]:
 
 def data_digest(observed: Floats) -> str:
     """Return a digest of measured values, (n,) or (n, m), in any order."""
-    return _digest(observed[in_order(observed)])
+    return _array_digest(observed[in_order(observed)])
 
 
 def in_order(observed: Floats) -> NDArray[np.intp]:
@@ -713,7 +713,7 @@ def in_order(observed: Floats) -> NDArray[np.intp]:
     return np.lexsort(observed.T[::-1])
 
 
-def _digest(*arrays: Floats) -> str:
+def _array_digest(*arrays: Floats) -> str:
     """Return 16 hexadecimal digits of the bytes of arrays."""
     digest = hashlib.sha256()
     for array in arrays:

@@ -17,7 +17,6 @@ from scipy.special import chdtri, ndtri
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import fit_normal
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
 from prbayes.specimens.points import (
     Draws,
@@ -33,6 +32,7 @@ from prbayes.specimens.points import (
     typical_specimens,
 )
 from prbayes.specimens.proposals import Normal, Proposals
+from prbayes.specimens.weighted_points import fit_normal
 
 
 def first_runs(dimensions: int) -> int:

@@ -23,12 +23,9 @@ from prbayes.metrics.readings import Readings
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import (
-    fit_normal,
-    normal_log_density,
-)
 from prbayes.specimens.emulation import Emulation, half_difference
 from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
+from prbayes.specimens.weighted_points import fit_normal, normal_log_density
 
 
 @dataclass(frozen=True)

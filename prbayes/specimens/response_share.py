@@ -23,11 +23,12 @@ from scipy.special import logsumexp, stdtrit
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.design import first_runs
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import SpecimenData
+from prbayes.specimens.weighted_points import WeightedPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +51,8 @@ class ResponseShare:
         integrals = []
         for rows in (slice(self.with_response), slice(self.with_response, None)):
             of_rows = [v[None, rows] for v in x]
-            points = WeightedPoints.of(density.inputs, of_rows, log_b[None, rows])
-            integrals.append(density.log_likelihoods(parents, points)[:, 0])
+            points = WeightedPoints.of(density, of_rows, log_b[None, rows])
+            integrals.append(points.log_likelihoods(parents)[:, 0])
         inside, outside = integrals
         is_finite = np.isfinite(inside)
         log_ratio = outside - np.where(is_finite, inside, 0)

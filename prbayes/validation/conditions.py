@@ -20,7 +20,7 @@ from prbayes._validate import Floats, Seed, called, flag, real_array, sample_lab
 from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
-from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
+from prbayes.model.fingerprint import Identity, Level, identity_from_attributes, require_together
 from prbayes.model.parameters import element_name
 from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
@@ -197,7 +197,9 @@ def read_case(
             "expected the same draws of one posterior in all; pass the same result and n_draws= "
             "to prb.predict"
         )
-    identities = {f"{c.name}: predicted": from_attributes(c.attributes) for c in conditions}
+    identities = {
+        f"{c.name}: predicted": identity_from_attributes(c.attributes) for c in conditions
+    }
     # Projections of one condition have the same specimens.
     n_by_condition = {c.base_name: np.unique(c.numbers).size for c in conditions}
     return Case(

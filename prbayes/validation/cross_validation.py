@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
 from prbayes.inference.refits import refit
-from prbayes.inference.resampling import DataSets, specimens
+from prbayes.inference.resampling import DataSets
 from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
 from prbayes.metrics.likelihood import LogLikelihood
@@ -26,6 +26,7 @@ from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
 from prbayes.response.condition import is_condition
@@ -96,27 +97,16 @@ def cross_validate(
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    by_specimen = is_specimen_optimum(optimum)
-    if by_specimen:
-        refits = specimen_refits(optimum, "cross_validate")
-        require_minimiser(optimum, "cross_validate")
-    else:
-        require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
+    engine = _specimen_engine if is_specimen_optimum(optimum) else _metric_engine
+    refitted, losses = engine(optimum)
     evaluator = optimum.evaluator
     folds = most_folds(optimum, 5) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
     held_out, training, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
-        if by_specimen:
-            thetas, converged = refits.reweighted(training)
-        else:
-            observed = [node.target.observed for node in evaluator.nodes]
-            sampling = optimum.sampling()
-            x, converged = refit(sampling, DataSets(observed, training))
-            thetas = sampling.thetas(x)
-    losses = _mean_log_losses if by_specimen else _discrepancies
-    scores, weights = _scores(evaluator, thetas, held_out)
+        thetas, converged = refitted(training)
+    scores, weights = _specimen_scores(evaluator, thetas, held_out)
     dims = ["fold", "simulator"]
     return CrossValidationTable(
         {
@@ -126,7 +116,7 @@ def cross_validate(
             "converged": ("fold", converged),
             "score": ("specimen", scores),
             "weight": ("specimen", weights),
-            "data": ("simulator", [_digest(simulator) for simulator in evaluator.simulators]),
+            "data": ("simulator", [_data_digest(simulator) for simulator in evaluator.simulators]),
         },
         coords={
             "fold": np.arange(folds),
@@ -134,6 +124,32 @@ def cross_validate(
         },
         attrs={"random_seed": str(seed), **versions()},
     )
+
+
+# Estimates of weighted data sets, weights (S, n_k) -> (S, d), with which of them converged; and
+# losses of estimates, (S, simulators).
+type _Refit = Callable[[list[Floats]], tuple[Floats, NDArray[np.bool_]]]
+type _Loss = Callable[[Evaluator, Floats, list[Floats]], Floats]
+
+
+def _specimen_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
+    """Return how log-likelihoods by specimen are refitted and judged, or raise if they cannot."""
+    refits = specimen_refits(optimum, "cross_validate")
+    require_minimiser(optimum, "cross_validate")
+    return refits.reweighted, _mean_log_losses
+
+
+def _metric_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
+    """Return how metrics of distributions are refitted and judged, or raise if they cannot."""
+    require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
+
+    def refitted(weights: list[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+        observed = [node.target.observed for node in optimum.evaluator.nodes]
+        sampling = optimum.sampling()
+        x, converged = refit(sampling, DataSets(observed, weights))
+        return sampling.thetas(x), converged
+
+    return refitted, _mean_discrepancies
 
 
 class CrossValidationTable(Table):
@@ -188,7 +204,7 @@ class Ranking(Table):
 
 def most_folds(optimum: Optimum, limit: int) -> int:
     """Return the largest number of folds of two specimens or more, at most a limit."""
-    _, total = specimens(optimum.evaluator.simulators)
+    _, total = number_specimens(optimum.evaluator.simulators)
     return max(2, min(limit, total // 2))
 
 
@@ -200,7 +216,7 @@ def _folds(
     Return weights of held-out observations and of the other ones, which sum to one, (folds, n_k) by
     simulator; and numbers of held-out observations, (folds, simulators).
     """
-    numbers, total = specimens(simulators)
+    numbers, total = number_specimens(simulators)
     if total < 2 * folds:
         raise ValueError(f"folds: got {folds} for {total} specimens, expected at most {total // 2}")
     # The 3 makes random numbers differ from others with the same seed.
@@ -223,7 +239,7 @@ def _folds(
     return held_out, [w / w.sum(axis=1, keepdims=True) for w in training], np.array(sizes).T
 
 
-def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
+def _mean_discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
     """Return discrepancies (folds, simulators) for weights of the data; NaN without any weight."""
     columns = []
     for k, (node, by_fold) in enumerate(zip(evaluator.nodes, data, strict=True)):
@@ -259,9 +275,11 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     return np.array(columns).T
 
 
-def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tuple[Floats, Floats]:
+def _specimen_scores(
+    evaluator: Evaluator, thetas: Floats, held_out: list[Floats]
+) -> tuple[Floats, Floats]:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
-    numbers, total = specimens(evaluator.simulators)
+    numbers, total = number_specimens(evaluator.simulators)
     scores, counts = np.zeros(total), np.zeros(total)
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
@@ -286,7 +304,7 @@ def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tup
     return scores, counts
 
 
-def _digest(simulator: PopulationSimulator) -> str:
+def _data_digest(simulator: PopulationSimulator) -> str:
     """Return a digest of observed values, weights and labels, in order."""
     labels = [] if simulator.specimens is None else simulator.specimens.tolist()
     content = simulator.observed.tobytes() + simulator.weights.tobytes() + repr(labels).encode()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pymc as pm
@@ -29,7 +29,7 @@ from prbayes._validate import (
 )
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
@@ -124,8 +124,7 @@ def calibrate_each(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)
-    simulators: list[Any] = [*evaluator.nodes, *evaluator.measurements]
-    simulator, *more = simulators
+    simulator, *more = with_data(evaluator)
     if more:
         raise TypeError(
             f"{caller}: got a model with the simulators {simulator.name} and {more[0].name}, "
@@ -145,7 +144,8 @@ def calibrate_each(
     settings = SamplingSettings(draws=draws, random_seed=seed)
     fleet = Fleet(evaluator, observed, further, settings, alpha)
     if evaluator.likelihoods:
-        fleet = replace(fleet, likelihood=_common_likelihood(evaluator, observed))
+        likelihood = _common_likelihood(evaluator, observed)
+        fleet = SpecimenFleet(**vars(fleet), likelihood=likelihood)
     jobs = [names[first : first + 25] for first in range(0, len(names), 25)]
     with shown(progressbar), progress("products", len(names)) as advance:
         if executor is None:
@@ -228,24 +228,19 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """Products with a common model, and the points of all their specimens."""
+    """Products with a common model, whose simulator has a metric of distributions."""
 
     evaluator: Evaluator
     observed: Mapping[str, Floats]
-    further: Mapping[str, Floats]  # of a validity test
+    further: Mapping[str, Floats]  # measured responses for a validity test
     settings: SamplingSettings
     alpha: float
-    likelihood: SpecimenLikelihood | None = None  # of the specimens of all products, in order
 
-    def part(self, names: Sequence[str]) -> Fleet:
+    def part(self, names: Sequence[str]) -> Self:
         """Return the fleet of some products."""
-        likelihood = self.likelihood
-        if likelihood is not None:
-            rows = np.concatenate([self._rows(name) for name in names])
-            likelihood = _of_rows(likelihood, rows)
         observed = {name: self.observed[name] for name in names}
         further = {name: self.further[name] for name in names if name in self.further}
-        return replace(self, observed=observed, further=further, likelihood=likelihood)
+        return replace(self, observed=observed, further=further)
 
     def calibrated(
         self, names: Sequence[str], advance: Callable[[], Any] = lambda: None
@@ -260,13 +255,6 @@ class Fleet:
                     results.append(Calibration({}, finding=f"{name}: {error}"))
             advance()
         return results
-
-    def _rows(self, name: str) -> NDArray[np.intp]:
-        """Return the rows of a product among the specimens of all."""
-        names = list(self.observed)
-        sizes = [len(values) for values in self.observed.values()]
-        first = sum(sizes[: names.index(name)])
-        return np.arange(first, first + len(self.observed[name]))
 
     def _calibrated(self, name: str) -> Calibration:
         """Return the posterior and the validity test of one product."""
@@ -286,32 +274,24 @@ class Fleet:
     def _posterior(self, evaluator: Evaluator) -> tuple[dict[str, Floats], float]:
         """Return draws of the hyperparameters, and Pareto k of importance sampling."""
         variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
-        chains = None
-        if evaluator.likelihoods:
-            # Without the groups of ArviZ, which take as long as the draws.
-            target = specimen_target(evaluator, None)
-            modes = modes_of(target)
-            chains = None if modes is None else importance_chains(target, modes, self.settings)
-        if chains is not None:
-            values = evaluator.hyperparameters.constrained(chains.thetas[0])
-            return {name: values[name] for name in variables}, chains.sampler["pareto_k"]
         posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
         pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
         return {name: posterior[name].values[0] for name in variables}, pareto_k
 
     def _evaluator(self, name: str) -> Evaluator:
         """Return the evaluator of a product's data."""
-        if self.likelihood is None:
-            (node,) = self.evaluator.nodes
-            return self.evaluator.observing({node.name: self.observed[name]})
-        likelihood = _of_rows(self.likelihood, self._rows(name))
-        return replace(
-            self.evaluator,
-            likelihoods=(likelihood,),
-            measurements=likelihood.measurements,
-            emulated=(EmulatedSimulator(likelihood, likelihood.measurements[0]),),
-            has_graph=False,
-        )
+        (node,) = self.evaluator.nodes
+        return self.evaluator.observing({node.name: self.observed[name]})
+
+    def _draw(
+        self, evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
+    ) -> Floats:
+        """Return responses of points of the populations, (P, n), by weight."""
+        free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
+        responses, weights = evaluator.populations(evaluator.hyperparameters.thetas_of(free), 0)
+        levels = (np.arange(n) + rng.random((len(weights), 1))) / n
+        rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
+        return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
 
     def _predicted(
         self, evaluator: Evaluator, values: Mapping[str, Floats], n: int = 50
@@ -320,13 +300,53 @@ class Fleet:
         rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
         thinned = {name: value[rows] for name, value in values.items()}
         rng = np.random.default_rng(self.settings.random_seed)
-        if evaluator.likelihoods:
-            (likelihood,) = evaluator.likelihoods
-            responses = draw_readings(likelihood, rng, thinned, n, likelihood.measurements[0])
-        else:
-            responses = _resampled(evaluator, thinned, rng, n)
+        responses = self._draw(evaluator, thinned, rng, n)
         dims = ("chain", "draw", "sample", "output")[: responses.ndim + 1]
         return xr.DataArray(responses[None], dims=dims)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SpecimenFleet(Fleet):
+    """Products whose simulator has the log-likelihood by specimen, with points of all specimens."""
+
+    likelihood: SpecimenLikelihood  # likelihood of the specimens of all products, in order
+
+    def part(self, names: Sequence[str]) -> Self:
+        """Return the fleet of some products."""
+        rows = np.concatenate([self._rows(name) for name in names])
+        return replace(super().part(names), likelihood=_of_rows(self.likelihood, rows))
+
+    def _rows(self, name: str) -> NDArray[np.intp]:
+        """Return the rows of a product among the specimens of all."""
+        names = list(self.observed)
+        sizes = [len(values) for values in self.observed.values()]
+        first = sum(sizes[: names.index(name)])
+        return np.arange(first, first + len(self.observed[name]))
+
+    def _posterior(self, evaluator: Evaluator) -> tuple[dict[str, Floats], float]:
+        """Return draws of the hyperparameters, and Pareto k of importance sampling."""
+        # Without the groups of ArviZ, which take as long as the draws.
+        target = specimen_target(evaluator, None)
+        modes = modes_of(target)
+        chains = None if modes is None else importance_chains(target, modes, self.settings)
+        if chains is None:
+            return super()._posterior(evaluator)
+        values = evaluator.hyperparameters.constrained(chains.thetas[0])
+        variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
+        return {name: values[name] for name in variables}, chains.sampler["pareto_k"]
+
+    def _evaluator(self, name: str) -> Evaluator:
+        """Return the evaluator of a product's data."""
+        likelihood = _of_rows(self.likelihood, self._rows(name))
+        emulated = (EmulatedSimulator(likelihood, likelihood.measurements[0]),)
+        return replace(self.evaluator, emulated=emulated, has_graph=False)
+
+    def _draw(
+        self, evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
+    ) -> Floats:
+        """Return readings of new specimens, (P, n) or (P, n, m)."""
+        (likelihood,) = evaluator.likelihoods
+        return draw_readings(likelihood, rng, values, n, likelihood.measurements[0])
 
 
 def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
@@ -400,18 +420,6 @@ def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
         f"No inputs in the range of the priors reproduce the readings of {is_poor.sum()} of "
         f"{len(is_poor)} specimens."
     )
-
-
-def _resampled(
-    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
-) -> Floats:
-    """Return responses of points of the populations, (P, n), by weight."""
-    hyperparameters = evaluator.hyperparameters
-    free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
-    responses, weights = evaluator.populations(hyperparameters.thetas_of(free), 0)
-    levels = (np.arange(n) + rng.random((len(weights), 1))) / n
-    rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
-    return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
 
 
 def _tree(

@@ -22,10 +22,11 @@ from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
 from prbayes.inference.refits import SamplingDistribution, refit
-from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
+from prbayes.inference.resampling import groups, sets_at, simulated_points
 from prbayes.model.evaluator import read_inputs_of_copy, shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
@@ -437,7 +438,7 @@ class JointNull(Null):
         """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
         evaluator, theta = self.optimum.evaluator, self.optimum.theta
         rng_of_ties = case.rng(1)
-        numbers, n_new = _validated_counts(evaluator.nodes, tested)
+        numbers, n_new = _numbers_in_calibration(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
         for t in tested:
             responses, weights = populations[t.simulator]
@@ -554,11 +555,11 @@ def _require_population(condition: Condition, values: Floats, weights: Floats) -
         )
 
 
-def _validated_counts(
+def _numbers_in_calibration(
     nodes: Sequence[Node], tested: list[_Tested]
 ) -> tuple[list[NDArray[np.intp]], int]:
     """Return the numbers of each condition's specimens in the calibration, and how many are new."""
-    node_numbers, total = specimens(nodes)
+    node_numbers, total = number_specimens(nodes)
     # The points of a group of simulators are drawn together.
     group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}
     number_and_group: dict[str, tuple[int, int]] = {}

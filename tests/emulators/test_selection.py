@@ -13,7 +13,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.emulator import CANDIDATES, fit_emulator
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
-from prbayes.emulators.selection import CrossValidation, Runs, points_needed, weight_of_runs
+from prbayes.emulators.selection import CrossValidation, TrainingRuns, points_needed, weight_of_runs
 from prbayes.emulators.surfaces import FOLDS, Polynomial, Surface
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
@@ -90,10 +90,10 @@ def test_points_needed_leave_enough_for_every_fold(degree: int) -> None:
 # -- runs of an emulator ---------------------------------------------------------------------------
 
 
-def runs(y: Any, n: int = 64, d: int = 2, importance: Any = None) -> Runs:
+def runs(y: Any, n: int = 64, d: int = 2, importance: Any = None) -> TrainingRuns:
     x = np.random.default_rng(3).standard_normal((n, d))
     importance = np.full(n, 1 / n) if importance is None else importance
-    return Runs(x, np.asarray(y(x)), importance, np.arange(n) * 8 // n)
+    return TrainingRuns(x, np.asarray(y(x)), importance, np.arange(n) * 8 // n)
 
 
 def two(x: Floats) -> Floats:
@@ -105,7 +105,9 @@ def test_a_run_that_is_left_out_has_no_influence(model: Surface) -> None:
     known = runs(two)
     expected = known.left_out_predictions(known.fit([model]))
     block = known.blocks == 3
-    other = Runs(known.x, np.where(block[:, None], 7.0, known.y), known.importance, known.blocks)
+    other = TrainingRuns(
+        known.x, np.where(block[:, None], 7.0, known.y), known.importance, known.blocks
+    )
     found = other.left_out_predictions(other.fit([model]))
     np.testing.assert_allclose(found[block], expected[block], rtol=1e-7)
     assert np.abs(expected - known.y).max() > 0
@@ -129,7 +131,7 @@ def test_where_the_nearest_run_failed_the_prediction_fails(lost: float) -> None:
 def test_repeated_runs_and_far_points() -> None:
     known = runs(two)
     x, y, blocks = (np.concatenate([v, v]) for v in (known.x, known.y, known.blocks))
-    twice = Runs(x, y, np.full(128, 1 / 128), blocks)
+    twice = TrainingRuns(x, y, np.full(128, 1 / 128), blocks)
     found = twice.predict(twice.fit([RadialBasis()]), known.x)
     np.testing.assert_allclose(found, known.y, rtol=1e-6, atol=1e-6)
     # Far away predictions stay within the range of the runs beyond their ends.
@@ -149,7 +151,7 @@ def test_of_too_many_runs_some_far_ones_are_kept(monkeypatch: pytest.MonkeyPatch
 
 def test_units_do_not_matter() -> None:
     known = runs(two)
-    other = Runs(1e6 * known.x + 5, 1e-9 * known.y, known.importance, known.blocks)
+    other = TrainingRuns(1e6 * known.x + 5, 1e-9 * known.y, known.importance, known.blocks)
     predictions = known.left_out_predictions(known.fit(CANDIDATES))
     again = other.left_out_predictions(other.fit(CANDIDATES))
     np.testing.assert_allclose(again * 1e9, predictions, rtol=1e-3, atol=1e-3)

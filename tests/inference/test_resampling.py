@@ -23,9 +23,9 @@ from prbayes.inference.resampling import (
     sets_along,
     siblings,
     simulated_sets,
-    specimens,
 )
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import differences
 from prbayes.propagation.reweighted import designs_restored, same_points
 
@@ -96,7 +96,7 @@ def test_numbers_and_groups_of_specimens() -> None:
     assert not dependent(nodes)
     assert groups(nodes) == [[0], [1], [2]]
     nodes = shared().nodes
-    numbers, total = specimens(nodes)
+    numbers, total = number_specimens(nodes)
     assert total == N + 9
     np.testing.assert_array_equal(numbers[0], numbers[1][::-1])
     assert set(numbers[2]).isdisjoint(numbers[0])
@@ -106,7 +106,7 @@ def test_numbers_and_groups_of_specimens() -> None:
     assert siblings(nodes, {"c"}) == {"c"}
     assert aligned(nodes[:2])
     assert not aligned(nodes)
-    assert specimens(repeated().nodes)[1] == N // 2
+    assert number_specimens(repeated().nodes)[1] == N // 2
     assert dependent(repeated().nodes)
     # a and c have no label in common, but both share with b: if one design moves, all three do.
     labels = {"a": range(10), "c": range(10, 20), "d": range(30, 40), "b": range(5, 15)}

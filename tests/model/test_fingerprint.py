@@ -23,10 +23,10 @@ from prbayes.model.fingerprint import (
     Level,
     as_attributes,
     as_text,
-    differences,
-    from_attributes,
     from_text,
+    identity_from_attributes,
     identity_of,
+    problem_differences,
     require_same,
 )
 from prbayes.model.random_variable import nodes
@@ -115,7 +115,7 @@ def test_changes_make_another_problem_from_their_level_on(change: str) -> None:
     changed = identified(Problem(**changes))
     for at in Level:
         if at < level:
-            assert differences(changed, identity(), at) == []
+            assert problem_differences(changed, identity(), at) == []
             continue
         with pytest.raises(ValueError, match=message):
             require_same(changed, identity(), "here", at)
@@ -142,8 +142,8 @@ class Named:
 )
 def test_the_same_problem(copy_of: Callable[[], pm.Model], level: Level) -> None:
     model = copy_of()
-    assert differences(identity_of(Evaluator.of(model)), identity(), level) == []
-    assert differences(identity_of(model), identity(), level) == []
+    assert problem_differences(identity_of(Evaluator.of(model)), identity(), level) == []
+    assert problem_differences(identity_of(model), identity(), level) == []
 
 
 def test_the_order_of_variables_makes_no_other_problem() -> None:
@@ -157,7 +157,7 @@ def test_the_order_of_variables_makes_no_other_problem() -> None:
         return model
 
     first, second = (identity_of(Evaluator.of(model_of(names))) for names in ("ab", "ba"))
-    assert differences(first, second, Level.OPTIMUM) == []
+    assert problem_differences(first, second, Level.OPTIMUM) == []
 
 
 def test_a_larger_design_is_another_run_of_the_same_problem() -> None:
@@ -166,8 +166,8 @@ def test_a_larger_design_is_another_run_of_the_same_problem() -> None:
     assert node.reweighted is not None
     node.reweighted.add([np.array([1.0, 2.0])])
     grown = identity_of(Evaluator.of(model))
-    assert differences(grown, identity(), Level.POSTERIOR) == []
-    assert "number of responses of y" in differences(grown, identity(), Level.RUN)[0]
+    assert problem_differences(grown, identity(), Level.POSTERIOR) == []
+    assert "number of responses of y" in problem_differences(grown, identity(), Level.RUN)[0]
 
 
 def test_values_of_densities_are_compared() -> None:
@@ -179,17 +179,17 @@ def test_values_of_densities_are_compared() -> None:
     evaluator = Evaluator.of(model)
     before = identity_of(evaluator)
     model.set_data("at", 1.0)
-    (text,) = differences(identity_of(evaluator), before, Level.OPTIMUM)
+    (text,) = problem_differences(identity_of(evaluator), before, Level.OPTIMUM)
     assert "potentials, have other values" in text
     # Priors that print the same
     first, second = (identified(Problem(prior=(1.0, sd))) for sd in (1.0, 1.0 + 1e-4))
     assert first.priors == second.priors
-    assert "the priors have other densities" in differences(first, second, Level.OPTIMUM)
+    assert "the priors have other densities" in problem_differences(first, second, Level.OPTIMUM)
     # Rounding is tolerated.
     for relative, is_same in ((1e-9, True), (1e-4, False)):
         numbers = tuple(x * (1 + relative) for x in identity().log_prior)
         changed = replace(identity(), log_prior=numbers)
-        assert (differences(changed, identity(), Level.RUN) == []) is is_same
+        assert (problem_differences(changed, identity(), Level.RUN) == []) is is_same
 
 
 def test_the_function_of_a_metric_is_compared_by_its_values() -> None:
@@ -199,7 +199,7 @@ def test_the_function_of_a_metric_is_compared_by_its_values() -> None:
 
         return identified(Problem(metric=prb.FunctionMetric(distance, weighted=True)))
 
-    text = differences(identity_at(1.0), identity_at(2.0), Level.OPTIMUM)[0]
+    text = problem_differences(identity_at(1.0), identity_at(2.0), Level.OPTIMUM)[0]
     assert "discrepancy of y has other values" in text
 
 
@@ -215,7 +215,7 @@ def test_an_identity_computes_no_response_and_compares_them(
     assert len(found.simulators[0].responses) == 8
     assert len(found.log_prior) == 4
     changed = identity_of(Problem(slope=4.0, propagation=propagation).model())
-    texts = differences(changed, found, Level.POPULATIONS)
+    texts = problem_differences(changed, found, Level.POPULATIONS)
     assert texts == ["the response of y has other values at the same points"]
     # A user's own propagation may store no points.
     monkeypatch.setattr(node.bound, "first_points", ())
@@ -225,11 +225,11 @@ def test_an_identity_computes_no_response_and_compares_them(
 def test_text_and_back() -> None:
     original = replace(identity(), prior_minimised=True, log_other=(0.0, -np.inf, np.nan, 1.0))
     back = from_text(as_text(original))
-    assert differences(back, original, Level.RUN) == []
+    assert problem_differences(back, original, Level.RUN) == []
     assert as_text(back) == as_text(original)
-    assert from_attributes(as_attributes(original)) is not None
+    assert identity_from_attributes(as_attributes(original)) is not None
     for damaged in ({}, {"identity": "{"}, {"identity": "[1]"}, {"identity": '{"shapes": 3}'}):
-        assert from_attributes(damaged) is None
+        assert identity_from_attributes(damaged) is None
     assert as_attributes(replace(identity(), terms=("x" * 70_000,))) == {}
     # Results of other tools have none.
     require_same(None, identity(), "here")
@@ -275,12 +275,12 @@ def test_results_have_an_identity(tmp_path: Path) -> None:
     assert optimum().search.identity is not None
     assert optimum().search.identity.prior_minimised is False
     tree = optimum().to_datatree()
-    assert from_attributes(tree["optimum"].attrs) == optimum().search.identity
+    assert identity_from_attributes(tree["optimum"].attrs) == optimum().search.identity
     posterior().to_netcdf(tmp_path / "draws.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as saved:
-        found = from_attributes(saved["posterior"].attrs)
+        found = identity_from_attributes(saved["posterior"].attrs)
     assert found is not None
-    assert differences(found, identity(), Level.POSTERIOR) == []
+    assert problem_differences(found, identity(), Level.POSTERIOR) == []
 
 
 def predict_with(result: Any, change: str) -> xr.DataArray:

@@ -14,15 +14,15 @@ from scipy.stats import halfnorm, norm, truncnorm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.specimen_preparation import Populations
+from prbayes.model.specimen_preparation import SpecimenPopulations
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)
 
 
-def populations_of(model: pm.Model) -> Populations:
+def populations_of(model: pm.Model) -> SpecimenPopulations:
     (likelihood,) = specimen_likelihoods(model).values()
-    return Populations(likelihood)
+    return SpecimenPopulations(likelihood)
 
 
 def normal_model(scale: float = 1.0) -> pm.Model:
@@ -34,7 +34,7 @@ def normal_model(scale: float = 1.0) -> pm.Model:
     return model
 
 
-def points_at(populations: Populations, x: Floats) -> tuple[Floats, Floats]:
+def points_at(populations: SpecimenPopulations, x: Floats) -> tuple[Floats, Floats]:
     """Return one point for each specimen, at its inputs, with the number of the density of x."""
     z = populations.likelihood.coordinates.of([x], 1)[:, None]
     return z, -populations.likelihood.coordinates.log_jacobian(z)
@@ -129,7 +129,7 @@ def test_specimens_that_no_population_reaches() -> None:
 def test_a_model_that_is_gone() -> None:
     model: Any = normal_model()
     populations = populations_of(model)
-    gone = Populations(replace(populations.likelihood, model=lambda: None))
+    gone = SpecimenPopulations(replace(populations.likelihood, model=lambda: None))
     with pytest.raises(RuntimeError, match="build the model again"):
         _ = gone.hyperparameters
 

@@ -8,8 +8,8 @@ from scipy import optimize
 
 from prbayes._validate import Floats
 from prbayes.numerics.batched_minimisers import (
+    _best_first,
     _bfgs,
-    _sorted,
     _step,
     descend,
     descend_by_simplex,
@@ -179,7 +179,7 @@ def test_steps_are_those_of_scipys_adaptive_simplex(r: int) -> None:
 
     rows = np.arange(len(CENTERS))
     simplices = np.tile(np.vstack([np.zeros(r), 2.0 * np.eye(r)]), (len(rows), 1, 1))
-    points, values = _sorted(simplices, value(simplices, rows))
+    points, values = _best_first(simplices, value(simplices, rows))
     for _ in range(40):
         points, values = _step(value, points, values, rows)
     for row in rows:

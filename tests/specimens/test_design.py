@@ -15,7 +15,6 @@ from scipy.stats import norm
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.population_density import fit_normal
 from prbayes.specimens.design import corrected, emulate, first_emulation, first_runs, most_runs
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import (
@@ -26,6 +25,7 @@ from prbayes.specimens.points import (
     fit_proposals,
     normal_of,
 )
+from prbayes.specimens.weighted_points import fit_normal
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.validation.fleet import Fleet
+from prbayes.validation.fleet import SpecimenFleet
 
 QUIET = {"progressbar": False}
 
@@ -84,17 +84,17 @@ def test_a_product_that_no_inputs_reproduce_is_a_finding_of_its_own() -> None:
 
 
 def test_a_failure_leaves_the_other_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    calibrated = Fleet._posterior
+    calibrated = SpecimenFleet._posterior
     calls = 0
 
-    def failing(self: Fleet, evaluator: Any) -> Any:
+    def failing(self: SpecimenFleet, evaluator: Any) -> Any:
         nonlocal calls
         calls += 1
         if calls == 2:
             raise np.linalg.LinAlgError("Singular matrix")
         return calibrated(self, evaluator)
 
-    monkeypatch.setattr(Fleet, "_posterior", failing)
+    monkeypatch.setattr(SpecimenFleet, "_posterior", failing)
     tree = prb.calibrate_each(products(3), model=model_of([1.0, 2.0]), draws=20, **QUIET)
     assert tree["products"]["finding"].values.tolist() == ["", "p1: Singular matrix", ""]
     is_missing = np.isnan(tree["posterior"]["mu"]).all(("chain", "draw")).values

@@ -1,0 +1,234 @@
+"""Observed data of a simulator, read once and aligned specimen by specimen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
+
+from prbayes._validate import Floats, called, real_array, sample_labels
+from prbayes.metrics.base import Metric
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.random_variable import known_value
+from prbayes.response.compile import PLAIN
+from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
+from prbayes.response.inputs import Groups, group_indices
+from prbayes.response.outputs import Outputs, in_order_of, read_observed, refuse_other_order
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedData:
+    """Observed responses of N specimens, with what is known of each specimen."""
+
+    name: str  # name of the simulator, for messages
+    original: Any  # observed values as the user has them: numbers or `pymc.Data`
+    values: Floats  # (N,) or (N, m): measured responses
+    outputs: Outputs
+    groups: NDArray[np.intp] | None  # (N,): index of the group; None without groups
+    weights: Any  # (N,): relative weights; None for equal ones
+    labels: NDArray[Any] | None  # (N,): labels of the specimens; None without labels
+    # (N,): observed row of each specimen if the weights are frequencies, else None
+    rows: NDArray[np.intp] | None
+    n_rows: int  # number of observed rows
+    dims: tuple[str, ...] | None  # names of the observed dimensions
+
+    def __len__(self) -> int:
+        return _length(self.values)
+
+    def known_values(self, variables: Sequence[Any]) -> dict[str, Floats]:
+        """Return the values of conditions or covariates by name, (N,)."""
+        return known_covariates(self.name, variables, self.n_rows, self.rows)
+
+    def for_pymc(self, values: Floats) -> Any:
+        """Return the data of an observed variable: `pymc.Data` as it is, else the values.
+
+        Values with NaN are a constant, in which PyMC does not look for missing values to impute.
+        """
+        if isinstance(self.original, Variable):
+            return self.original
+        return pt.constant(values) if np.isnan(values).any() else values
+
+
+def read_data(
+    name: str,
+    observed: Any,
+    groups: Groups | None,
+    weights: Any,
+    specimens: ArrayLike | None,
+    dims: object,
+    model: pm.Model,
+) -> ObservedData:
+    """Return the observed data of a simulator; raise if arguments do not fit each other.
+
+    Weights and labels with an index are sorted as the observed values are. Integer weights are
+    frequencies: each observed row is repeated as many times.
+    """
+    weights = in_order_of(weights, observed, f"{name}: weights")
+    places, measured = None, observed
+    if groups is not None:
+        places, measured = group_indices(name, observed, groups)
+    if isinstance(measured, Variable):
+        measured = _present_numbers(name, measured)
+    values, outputs = read_observed(name, measured)
+    n_rows, rows = _length(values), None
+    if weights is not None and np.asarray(weights).dtype.kind in "iu":
+        rows = _rows_of_frequencies(name, weights, np.shape(values)[:1], observed, specimens)
+        values, weights = values[rows], None
+        places = None if places is None else places[rows]
+    labels = None
+    if specimens is not None:
+        label = f"{name}: specimens"
+        labels = sample_labels(in_order_of(specimens, observed, label), _length(values), label)
+    if dims is not None:
+        dims = _checked_dims(name, dims, np.shape(values), model)
+    return ObservedData(
+        name, observed, values, outputs, places, weights, labels, rows, n_rows, dims
+    )
+
+
+def _length(values: Floats) -> int:
+    """Return the number of specimens; one number is one specimen."""
+    return len(values) if np.ndim(values) else 1
+
+
+def _present_numbers(name: str, observed: Any) -> Any:
+    """Return the present numbers of `pymc.Data`."""
+    values = None if hasattr(observed.type, "dims") else known_value(observed)
+    if values is None:
+        raise TypeError(
+            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
+        )
+    return values
+
+
+def _rows_of_frequencies(
+    name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
+) -> NDArray[np.intp]:
+    """Return the observed row of each specimen, where weights are frequencies."""
+    frequencies = np.asarray(weights)
+    if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
+        raise ValueError(
+            f"{name}: weights: got {frequencies.tolist()!s:.60}, expected {shape} frequencies, "
+            "whole numbers from 0 whose sum is at least 2, one for each observed value"
+        )
+    if specimens is not None or isinstance(observed, Variable):
+        conflicting = "pm.Data" if specimens is None else "specimens="
+        raise TypeError(
+            f"{name}: weights: got whole numbers, which are frequencies, beside {conflicting}, "
+            "expected a row for each specimen; pass np.repeat(observed, weights), or relative "
+            "weights as floats"
+        )
+    return np.repeat(np.arange(frequencies.size), frequencies)
+
+
+def _checked_dims(
+    name: str, dims: object, shape: tuple[int, ...], model: pm.Model
+) -> tuple[str, ...]:
+    """Return names of the observed dimensions, which the model has in the lengths of the data."""
+    names = [dims] if isinstance(dims, str) else dims
+    if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
+        raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
+    if len(names) != len(shape):
+        raise ValueError(
+            f"{name}: dims: got {names}, expected {len(shape)} names, one for each dimension of "
+            f"observed, {shape}"
+        )
+    lengths = model.dim_lengths
+    for dim, size in zip(names, shape, strict=True):
+        if dim not in lengths:
+            raise ValueError(
+                f"{name}: dims: got {dim!r}, expected one of the model's dimensions, "
+                f"{list(lengths)}; add it with pm.Model(coords={{{dim!r}: ...}})"
+            )
+        length = int(lengths[dim].eval(mode=PLAIN))
+        if length != size:
+            raise ValueError(
+                f"{name}: dims: got {dim!r} of length {length}, expected {size}, as many as there "
+                "are observed values"
+            )
+    return tuple(names)
+
+
+def observed_at_conditions(
+    name: str, observed: Any, metric: Metric | None, inputs: Sequence[Any]
+) -> tuple[Any, Metric | None]:
+    """Return observed values and metric with a column for each value of a vector condition.
+
+    Refuses conditions of specimens with a metric of distributions.
+    """
+    vectors = [x for x in inputs if isinstance(x, ReadingsCondition)]
+    conditions = [*vectors, *(x for x in inputs if isinstance(x, Variable) and is_condition(x))]
+    if conditions and isinstance(metric, Metric) and not metric.by_specimen:
+        raise TypeError(
+            f"{name}: metric: got {called(metric)} with the condition {conditions[0].name} of each "
+            "specimen, expected prb.LogLikelihood(): a metric of distributions compares specimens "
+            "under the same conditions; leave metric= out, or write a simulator for each condition"
+        )
+    _refuse_other_order(name, observed, metric, inputs)
+    if not vectors:
+        return observed, metric
+    condition = vectors[0]
+    shape = condition.columns.shape
+    if any(x is not condition for x in vectors):
+        raise ValueError(
+            f"{name}: got the conditions {[str(x.name) for x in vectors]}, each with several "
+            "values of a specimen, expected one of them; compute the others in the response"
+        )
+    if isinstance(observed, Variable | Mapping) or np.shape(observed) != shape:
+        raise ValueError(
+            f"{name}: observed: got {called(observed)} of shape {np.shape(observed)}, expected an "
+            f"array of shape {shape}, that of the condition {condition.name}"
+        )
+    readings = real_array(observed, f"{name}: observed")
+    outside = ~np.isnan(readings) & (condition.columns < 0)
+    if outside.any():
+        row, column = np.argwhere(outside)[0].tolist()
+        raise ValueError(
+            f"{name}: observed: got {readings[row, column]:g} in row {row}, column {column}, where "
+            f"the condition {condition.name} is NaN, expected NaN in both, or a number in both"
+        )
+    dim = str(condition.name)
+    first = observed.dims[0] if hasattr(observed, "dims") else f"{name}_specimen"
+    coords = {k: v for k, v in getattr(observed, "coords", {}).items() if v.dims == (first,)}
+    coords[dim] = condition.data
+    scattered = xr.DataArray(_at_columns(readings, condition), dims=(first, dim), coords=coords)
+    changed: dict[str, Any] = {}
+    for role in ("error", "rounded", "censored"):
+        value = getattr(metric, role, None)
+        if value is None or isinstance(value, Variable):
+            continue
+        parts = [
+            _at_columns(x, condition, float(np.median(x))) if np.shape(x) == shape else x
+            for x in (value if role == "censored" else [value])
+        ]
+        changed[role] = tuple(parts) if role == "censored" else parts[0]
+    return scattered, replace(cast(LogLikelihood, metric), **changed) if changed else metric
+
+
+def _refuse_other_order(
+    name: str, observed: Any, metric: Metric | None, inputs: Sequence[Any]
+) -> None:
+    """Raise if conditions, errors or limits with labels are in another order than observed."""
+    for values in getattr(metric, "_labelled", ()):
+        refuse_other_order(values, observed, f"{name}: LogLikelihood")
+    for variable in ancestors([x for x in inputs if isinstance(x, Variable)]):
+        values = getattr(variable.tag, "labelled", None)
+        if values is not None:
+            refuse_other_order(values, observed, f"{name}: {variable.name}")
+
+
+def _at_columns(array: Any, condition: ReadingsCondition, missing: float = np.nan) -> Floats:
+    """Return values of readings, (N, T), at the columns of their values, (N, G)."""
+    columns = condition.columns
+    result = np.full((len(columns), len(condition.data)), missing)
+    rows, places = np.nonzero(columns >= 0)
+    result[rows, columns[rows, places]] = np.asarray(array)[rows, places]
+    return result

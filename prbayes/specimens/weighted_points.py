@@ -1,0 +1,181 @@
+r"""Log-likelihoods of specimens in populations, from weighted points.
+
+The log-likelihood of specimen i, whose points x have the numbers A, is
+
+    log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik).
+
+Normal populations of such specimens are fitted by EM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from prbayes._stats import log_sum_exp
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.numerics.mixtures import normalised_weights
+from prbayes.numerics.threads import one_thread
+from prbayes.propagation.population_density import ExponentialForm, PopulationDensity
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedPoints:
+    """Points of N specimens, with the density of populations there."""
+
+    density: PopulationDensity
+    x: Sequence[Floats]  # (N, K, *event): values of each aleatory input
+    log_a: Floats  # (N, K): the numbers A
+    # Form for points in the order of (K, N), so that reductions are sums of long rows.
+    form: ExponentialForm | None
+
+    @classmethod
+    def of(cls, density: PopulationDensity, x: Sequence[Floats], log_a: Floats) -> WeightedPoints:
+        """Return the points with their form, if they have one population, and the inputs a form."""
+        form = None
+        if not density.inputs.nested and log_a.size:
+            flat = [v.swapaxes(0, 1).reshape(log_a.size, *v.shape[2:]) for v in x]
+            form = ExponentialForm.of(density.inputs.aleatory, flat)
+        return cls(density, x, log_a, form)
+
+    @cached_property
+    def _flat(self) -> list[Floats]:
+        """The points of all specimens one after the other, (N K, *event)."""
+        return [np.ascontiguousarray(v.reshape(self.log_a.size, *v.shape[2:])) for v in self.x]
+
+    @one_thread()
+    def log_likelihoods(self, parents: Sequence[Floats]) -> Floats:
+        """Return log p(y_i | theta), (S, N), of populations at parents, shapes (S, *shape).
+
+        Covariates are those of the specimens, (S, N).
+        """
+        form, log_a = self.form, self.log_a
+        n, count = log_a.shape
+        if form is None:
+            return self._by_graph(parents)
+        if self.density.inputs.covariates and n > 1:
+            return np.stack([log_sum_exp(logs + log_a) for logs in self.log_densities(parents)])
+        at_each = self.density.inputs.for_points(parents, len(form.anchors[0]))
+        with np.errstate(all="ignore"):
+            (at_anchors,) = self.density.log_density(*at_each, *form.anchors)
+        natural, is_rounded = form.natural_parameters(at_anchors)
+        # A is a statistic whose parameter is one. A large number replaces -inf, as a product of
+        # infinity and zero is NaN.
+        base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
+        terms = np.vstack([form.statistics, np.maximum(base, -1e300)]).T
+        parameters = np.vstack([natural.T, np.ones(len(natural))])
+        result = np.empty((n, len(natural)))
+        step = max(64, IN_CACHE // 4 // log_a.size)
+        rows = max(1, IN_CACHE // 4 // (step * n))
+        for first in range(0, len(natural), step):
+            block = parameters[:, first : first + step]
+            total: Any = -np.inf
+            for k in range(0, count, rows):
+                exponents = terms[k * n : (k + rows) * n] @ block
+                part = _log_sum_exp_first(exponents.reshape(-1, n, block.shape[1]))
+                total = np.logaddexp(total, part) if k else part
+            result[:, first : first + step] = total
+        if is_rounded.any():
+            narrow = [parent[is_rounded] for parent in parents]
+            result[:, is_rounded] = self._by_graph(narrow).T
+        return result.T
+
+    def log_densities(self, parents: Sequence[Floats]) -> Iterator[Floats]:
+        """Yield log p(x_ik | theta), (N, K), of each population."""
+        form, (n, count) = self.form, self.log_a.shape
+        if form is not None:
+            size, has_covariates = (
+                len(form.anchors[0]),
+                bool(self.density.inputs.covariates) and n > 1,
+            )
+            anchors = [np.concatenate([v] * (n if has_covariates else 1)) for v in form.anchors]
+            with np.errstate(all="ignore"):
+                at_each = self.density.inputs.for_points(parents, size)
+                (at_anchors,) = self.density.log_density(*at_each, *anchors)
+            natural, is_rounded = form.natural_parameters(at_anchors.reshape(-1, size))
+            natural = natural.reshape(len(parents[0]), -1, size, 1)
+            is_rounded = is_rounded.reshape(len(parents[0]), -1).any(axis=1)
+            statistics = np.ascontiguousarray(form.statistics.reshape(-1, count, n).T)
+            is_outside = ~form.is_inside.reshape(count, n).T
+        for s in range(len(parents[0])):
+            if form is None or is_rounded[s]:
+                of_draw = self.density.inputs.for_points([p[s : s + 1] for p in parents], count)
+                with np.errstate(all="ignore"):
+                    (logs,) = self.density.log_density(*of_draw, *self._flat)
+                yield np.where(np.isnan(logs), -np.inf, logs).reshape(n, count)
+                continue
+            logs = (statistics @ natural[s])[..., 0]
+            logs[is_outside] = -np.inf
+            yield logs
+
+    def _by_graph(self, parents: Sequence[Floats]) -> Floats:
+        """Return log-likelihoods by the compiled log-density."""
+        log_a = self.log_a
+        n, count = log_a.shape
+        result = np.full((len(parents[0]), n), -np.inf)
+        if not log_a.size:
+            return result
+        step = max(1, IN_CACHE // log_a.size)
+        for first in range(0, len(result), step):
+            block = slice(first, first + step)
+            of_block = self.density.inputs.for_points([parent[block] for parent in parents], count)
+            with np.errstate(all="ignore"):
+                (logs,) = self.density.log_density(*of_block, *self._flat)
+            logs = np.where(np.isnan(logs), -np.inf, logs)
+            result[block] = log_sum_exp(logs.reshape(-1, n, count) + log_a)
+        return result
+
+
+def _log_sum_exp_first(exponents: Floats) -> Floats:
+    """Return the log of the sum of exponentials over the first axis; exponents are overwritten."""
+    largest = exponents.max(axis=0)
+    exponents -= largest
+    np.exp(exponents, out=exponents)
+    total = np.log(exponents.sum(axis=0)) + largest
+    return np.where(largest < -1e299, -np.inf, total)
+
+
+type Normal = tuple[Floats, Floats]  # mean (d,) and lower Cholesky factor (d, d)
+
+
+def fit_normal(z: Floats, log_a: Floats, start: Any = None) -> Normal:
+    """Fit a normal population by EM to specimens with likelihood terms exp(log p(z) + log_a).
+
+    With a population as the start, five steps are taken.
+    """
+    columns = np.ascontiguousarray(z.reshape(-1, z.shape[-1]).T)
+    prior = 1e-12 * np.diag(np.maximum(columns.var(axis=1), 1e-300))
+
+    def moments(weights: Floats) -> tuple[Floats, Floats]:
+        flat = weights.ravel() / len(weights)
+        mean = columns @ flat
+        centred = columns - mean[:, None]
+        return mean, (centred * flat) @ centred.T + prior
+
+    if start is None:
+        mean, covariance = moments(normalised_weights(log_a))
+    else:
+        mean, covariance = start.mean, start.root @ start.root.T
+    for _ in range(30 if start is None else 5):
+        log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
+        previous_mean, previous_covariance = mean, covariance
+        mean, covariance = moments(normalised_weights(log_w))
+        variance = np.diag(covariance)
+        change = np.diag(covariance - previous_covariance) / variance
+        shift = (mean - previous_mean) / np.sqrt(variance)
+        if max(np.abs(change).max(), np.abs(shift).max()) < 1e-9:
+            break
+    return mean, np.linalg.cholesky(covariance)
+
+
+def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
+    """Return log-densities of points (..., d) in a normal population, (...)."""
+    d = z.shape[-1]
+    centred = np.ascontiguousarray(z.reshape(-1, d).T) - mean[:, None]
+    square = np.square(np.linalg.inv(root) @ centred).sum(axis=0)
+    constant = np.log(np.diag(root)).sum() + d / 2 * np.log(2 * np.pi)
+    return np.asarray(-0.5 * square - constant).reshape(z.shape[:-1])
