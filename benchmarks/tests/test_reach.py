@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import ndtri
 from scipy.stats import norm
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import exact_posteriors as exact
 from benchmarks import reach

@@ -14,8 +14,6 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 from scipy.special import gammaln
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from benchmarks.scoreboard import exact, study, table
 from benchmarks.scoreboard.problem import (
     Input,
@@ -45,7 +43,7 @@ from benchmarks.scoreboard.problems import (
 )
 from benchmarks.scoreboard.score import score, summary
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EVERY = pytest.mark.parametrize("name", sorted(PROBLEMS))
 
 

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import likelihood_coverage, likelihood_guards, many_inputs, readings_coverage
 from prbayes.model.evaluator import Evaluator
