@@ -1,7 +1,7 @@
 """Attacks on stores, checkpoints, results and workers: how many were tried, and what became of each.
 
-The attacks are those of `tests/helpers/attacks.py`, of which the tests try a few, and the response
-of `tests/helpers/hostile.py`. What is promised is told in ``docs/promises.md``.
+The attacks are those of `benchmarks.attacks`, of which the tests try a few, and the response of
+`benchmarks.hostile`. What is promised is told in ``docs/promises.md``.
 
     uv run python -m benchmarks.faults [--factor 20] [--out faults.json]
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -18,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import record
-
-ROOT = Path(__file__).parent
-sys.path.insert(0, str(ROOT.parent / "tests" / "helpers"))
+import prbayes as prb
+from benchmarks import hostile, record
+from benchmarks.attacks import ATTACKS, allowed
 
 EXECUTORS = ("nothing", "threads", "processes", "loky")
 # Two processes that are killed take seconds of which most is their start.
@@ -30,8 +28,6 @@ SLOW = {"two processes that write and are killed": 2}
 
 def on_disk(factor: int) -> dict[str, Any]:
     """Return outcomes of attacks on files, by what is attacked and how."""
-    from attacks import ATTACKS, allowed
-
     found = {}
     for name, (attack, n) in ATTACKS.items():
         tries = max(1, n * factor // SLOW.get(name, 1))
@@ -43,20 +39,15 @@ def on_disk(factor: int) -> dict[str, Any]:
 
 def on_workers(where: str, tries: int) -> dict[str, Any]:
     """Return outcomes of hostile responses on one kind of executor, by policy."""
-    from hostile import EXECUTORS as MADE
-    from hostile import on_workers as attack
-
-    import prbayes as prb
-
     replace, abort = prb.response.Replace(-1.0), prb.response.Abort()
     policies = (replace, prb.response.Retry(1, then=replace), abort)
     found = {}
     for policy in policies:
         outcomes: Counter[str] = Counter()
-        with tempfile.TemporaryDirectory() as folder, MADE[where]() as executor:
+        with tempfile.TemporaryDirectory() as folder, hostile.EXECUTORS[where]() as executor:
             for seed in range(tries):
                 store = Path(folder, str(seed))
-                outcomes.update(attack(where, executor, policy, store, seed))
+                outcomes.update(hostile.on_workers(where, executor, policy, store, seed))
         name = f"hostile responses, {where}, {type(policy).__name__}"
         found[name] = row(name, outcomes, {"that point failed", "refused"})
     return found
@@ -74,7 +65,7 @@ def main() -> None:
     """Try all, and write what was found."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--factor", type=int, default=20, help="times as many as in the tests")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "faults.json")
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "faults.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     found = on_disk(arguments.factor)

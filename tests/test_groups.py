@@ -54,7 +54,7 @@ def model() -> pm.Model:
 
 @pytest.fixture(scope="module")
 def optimum(model: pm.Model) -> prb.Optimum:
-    return prb.minimize(model, progressbar=False)
+    return prb.minimize(model, starts=0, progressbar=False)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_groups_are_simulators_written_separately(optimum: prb.Optimum) -> None:
         for name, mean in zip(NAMES, means, strict=True):
             given = {"metric": prb.ProbabilityResidual(), "observed": DATA.values[name == WHO]}
             prb.Simulator("y" + name, counting, pm.Normal.dist(mean, sigma), **given)
-    expected = prb.minimize(separate, progressbar=False)
+    expected = prb.minimize(separate, starts=0, progressbar=False)
     for i, name in enumerate(NAMES):
         error = expected.stderr[f"mu_{name}"]
         # Two designs, of 256 and 1024 points.
@@ -210,7 +210,7 @@ def test_several_outputs_have_groups() -> None:
     parts = list(nodes(model).values())
     assert [(node.name, len(node.observed)) for node in parts] == [(PARTS[0], 20), (PARTS[1], 30)]
     assert {node.outputs.labels for node in parts} == {("left", "right")}
-    optimum = prb.minimize(model, progressbar=False)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
     function = parts[0].responses.function
     predicted = prb.predict(optimum, function, specimen(model), n_samples=50)
     assert predicted.dims == ("chain", "draw", "supplier", "sample", "place")

@@ -5,19 +5,16 @@ from __future__ import annotations
 import ast
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import prbayes
+from benchmarks import pages
 
 PACKAGE = Path(prbayes.__file__).parent
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import pages  # noqa: E402
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # The site shows 90 characters of code in a line on a desktop; a reader's font or half a screen shows

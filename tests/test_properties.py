@@ -27,6 +27,7 @@ from prbayes._validate import Floats
 from prbayes.metrics.density import likelihood_bandwidth, twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import discrepancy_error
+from prbayes.response.compile import PLAIN
 
 EXAMPLES = int(os.environ.get("PRBAYES_EXAMPLES", "10"))
 MODELS = max(1, EXAMPLES // 10)
@@ -267,7 +268,10 @@ def evaluator_of(problem: dict[str, Any], propagation: Any) -> Evaluator:
     with pm.Model() as model:
         a, b = pm.Normal("a", 0, 0.5), pm.LogNormal("b", 0, 0.3)
         inputs = [FAMILIES[family](a, b) for family in problem["families"]]
-        truth = [pm.draw(FAMILIES[f](0.0, 1.0), 40, random_seed=rng) for f in problem["families"]]
+        truth = [
+            pm.draw(FAMILIES[family](0.0, 1.0), 40, random_seed=rng, mode=PLAIN)
+            for family in problem["families"]
+        ]
         prb.Simulator(
             "y",
             response,

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import EXECUTORS
 from line_problem import build
 
 import prbayes as prb
+from benchmarks.hostile import EXECUTORS
 
 pytestmark = pytest.mark.exact  # bits of one response, called in other ways
 QUIET: dict[str, Any] = {"progressbar": False}

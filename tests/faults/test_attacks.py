@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacks import ATTACKS, allowed
+
+from benchmarks.attacks import ATTACKS, allowed
 
 
 @pytest.mark.long

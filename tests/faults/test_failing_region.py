@@ -96,13 +96,13 @@ def test_weights_without_any_response_stay_zero() -> None:
 
 @cache
 def complete(metric: Any) -> prb.Optimum:
-    return prb.minimize(model(-np.inf, metric))
+    return prb.minimize(model(-np.inf, metric), starts=0)
 
 
 @pytest.mark.parametrize("metric", METRICS[:3], ids=lambda metric: type(metric).__name__)
 def test_a_small_failing_region_hardly_moves_the_optimum(metric: Any) -> None:
     """No observed value is in the region, where .4 % of the population are."""
-    partial, whole = prb.minimize(model(5.0, metric)), complete(metric)
+    partial, whole = prb.minimize(model(5.0, metric), starts=0), complete(metric)
     for name in ("mu", "sigma"):
         assert abs(partial.point[name] - whole.point[name]) < 0.3 * whole.stderr[name]
 
@@ -135,13 +135,13 @@ def test_standard_errors_of_common_responses_are_those_of_a_truncated_population
     metric: Any,
 ) -> None:
     """Against the Fisher information of a normal population above 6, at 9.2 and 1.8, N = 40."""
-    optimum = prb.minimize(model(6.0, metric, prb.Resimulated(512)))
+    optimum = prb.minimize(model(6.0, metric, prb.Resimulated(512)), starts=0)
     assert optimum.stderr["mu"] == pytest.approx(0.33, rel=0.15)
     assert optimum.stderr["sigma"] == pytest.approx(0.26, rel=0.2)
 
 
 def test_an_allowed_share_is_not_refused_by_the_likelihood() -> None:
-    prb.minimize(model(5.0, prb.LogLikelihood(), prb.Reweighted(64, max_lost=0.2)))
+    prb.minimize(model(5.0, prb.LogLikelihood(), prb.Reweighted(64, max_lost=0.2)), starts=0)
 
 
 # -- observed values where runs fail ---------------------------------------------------------
@@ -188,11 +188,15 @@ def test_observed_values_beside_finite_responses_are_accepted() -> None:
 
 
 def test_the_shift_is_that_of_specimens_far_from_the_data() -> None:
-    optimum = prb.minimize(model(6.0, prb.AreaMetric(), prb.Reweighted(256, max_lost=0.3)))
+    optimum = prb.minimize(
+        model(6.0, prb.AreaMetric(), prb.Reweighted(256, max_lost=0.3)), starts=0
+    )
     stderr = np.sqrt(np.diag(optimum.covariance))
     shift = lost_mass_shift(optimum.evaluator, optimum.theta, np.ones(1), stderr)
-    far = prb.minimize(model(6.0, prb.KullbackLeibler(), failed=1e6))
-    kld = prb.minimize(model(6.0, prb.KullbackLeibler(), prb.Reweighted(256, max_lost=0.3)))
+    far = prb.minimize(model(6.0, prb.KullbackLeibler(), failed=1e6), starts=0)
+    kld = prb.minimize(
+        model(6.0, prb.KullbackLeibler(), prb.Reweighted(256, max_lost=0.3)), starts=0
+    )
     stderr = np.sqrt(np.diag(kld.covariance))
     counted = kld.theta + stderr * lost_mass_shift(kld.evaluator, kld.theta, np.ones(1), stderr)
     np.testing.assert_allclose(counted, far.theta, atol=0.05 * stderr.min())
@@ -202,5 +206,5 @@ def test_the_shift_is_that_of_specimens_far_from_the_data() -> None:
 
 
 def test_a_tiny_lost_share_does_not_matter() -> None:
-    optimum = prb.minimize(model(3.0, prb.KullbackLeibler()))
+    optimum = prb.minimize(model(3.0, prb.KullbackLeibler()), starts=0)
     assert "lost-mass-matters" not in [finding.code for finding in prb.diagnose(optimum).findings]

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import units
-from hostile import EXECUTORS
 from um_server import Real
 
 import prbayes as prb
+from benchmarks.hostile import EXECUTORS
 from prbayes.response.call import CallSettings, Points, Tally, respond
 
 LIMIT = 2.0

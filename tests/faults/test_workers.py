@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import ENDING, EXECUTORS, REASONS, hostile
 
 import prbayes as prb
+from benchmarks.hostile import ENDING, EXECUTORS, REASONS, hostile
 from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacks import go_on, told, writer
 
+from benchmarks.attacks import go_on, told, writer
 from prbayes.response.store import Store
 
 

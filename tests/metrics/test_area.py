@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from metric_samples import draw
 from scipy.stats import binom, norm
 
 import prbayes as prb
@@ -27,10 +27,9 @@ from prbayes.model.evaluator import Evaluator
 
 INF, NAN = np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
-Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
 
 
-def test_stored_values_with_ties_infinities_and_nan_give_the_same_area(draw: Draw) -> None:
+def test_stored_values_with_ties_infinities_and_nan_give_the_same_area() -> None:
     x, w, z, u = draw(0)
     x, z = np.round(x, 1), np.round(z, 1)
     d = AreaMetric().against(z, u)
@@ -69,7 +68,7 @@ def test_many_observed_values_give_the_same_area(digits: int) -> None:
         np.testing.assert_allclose(stored, corrected.of(values, weights), rtol=1e-11)
 
 
-def test_area_of_symbolic_values_and_weights(draw: Draw) -> None:
+def test_area_of_symbolic_values_and_weights() -> None:
     x, w, z, u = draw(8)
     x[3] = INF
     d = AreaMetric().against(z, u)
@@ -91,7 +90,7 @@ def test_failed_specimens_count_below_and_their_infinite_interval_is_left_out() 
     assert AreaMetric()([INF, INF], [1.0, 3.0, 8.0]) == pytest.approx(8 - 4)
 
 
-def test_many_weights_are_summed_to_the_same_digits(draw: Draw) -> None:
+def test_many_weights_are_summed_to_the_same_digits() -> None:
     x, _, z, u = draw(0)
     basis = AreaMetric().against(z, u).basis(np.round(x))
     n_rows = 1 + (1 << 15) // x.size
@@ -142,7 +141,7 @@ def test_the_correction_is_the_integral_of_the_bias_of_an_area(n: int) -> None:
         assert levels[expected.argmin()] == pytest.approx(p, abs=2e-3)
 
 
-def test_a_corrected_area_is_positive_and_the_same_stored_and_symbolic(draw: Draw) -> None:
+def test_a_corrected_area_is_positive_and_the_same_stored_and_symbolic() -> None:
     x, w, z, _ = draw(3)
     z = z[:4]
     x[3] = INF

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from metric_samples import draw, make
 from scipy.optimize import minimize
 from scipy.stats import norm
 
@@ -19,7 +19,6 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 
 INF = np.inf
-Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
 
 
 def by_basis(d: Discrepancy, values: Floats, weights: Floats) -> Floats:
@@ -28,9 +27,7 @@ def by_basis(d: Discrepancy, values: Floats, weights: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_zero_on_itself_and_positive_elsewhere(
-    name: str, metric: Metric, draw: Draw, seed: int
-) -> None:
+def test_zero_on_itself_and_positive_elsewhere(name: str, metric: Metric, seed: int) -> None:
     x, w, z, u = draw(seed)
     d = metric.against(z, u)
     at_itself = d(z[::-1], u[::-1])
@@ -47,9 +44,7 @@ def test_zero_on_itself_and_positive_elsewhere(
 
 @pytest.mark.parametrize("shift", [-3.3, 250.0])
 @pytest.mark.parametrize("a", [0.01, 37.0, -1.0])
-def test_shift_scale_sign_and_order(
-    name: str, make: Any, draw: Draw, shift: float, a: float
-) -> None:
+def test_shift_scale_sign_and_order(name: str, shift: float, a: float) -> None:
     x, w, z, u = draw(2)
     x /= 2  # well inside the grid, whose ends depend on the sign
     i, j = (np.random.default_rng(3).permutation(v.size) for v in (x, z))
@@ -68,7 +63,7 @@ def test_shift_scale_sign_and_order(
     np.testing.assert_allclose(after(a * x[i] + shift, w[i]), expected, rtol=rtol)
 
 
-def test_integer_weights_are_repetitions(metric: Metric, draw: Draw) -> None:
+def test_integer_weights_are_repetitions(metric: Metric) -> None:
     x, _, z, _ = draw(0)
     k, j = np.arange(x.size) % 4, 1 + np.arange(z.size) % 3
     weighted, repeated = metric.against(z, j), metric.against(np.repeat(z, j))
@@ -80,7 +75,7 @@ def test_integer_weights_are_repetitions(metric: Metric, draw: Draw) -> None:
 
 
 def test_other_observed_values_keep_the_metric_and_additive_ones_are_means_over_them(
-    name: str, make: Any, draw: Draw
+    name: str,
 ) -> None:
     x, w, z, u = draw(14)
     d = make(0.3)[name].against(z, u)
@@ -93,7 +88,7 @@ def test_other_observed_values_keep_the_metric_and_additive_ones_are_means_over_
 
 @pytest.mark.parametrize("away", [1e3, -1e3, 1e300, INF])
 def test_disjoint_supports_are_finite_bounded_and_worse(
-    name: str, metric: Metric, draw: Draw, away: float
+    name: str, metric: Metric, away: float
 ) -> None:
     x, w, z, u = draw(9)
     d: Any = metric.against(z, u)
@@ -105,7 +100,7 @@ def test_disjoint_supports_are_finite_bounded_and_worse(
         assert far <= np.log(max(1, d.density.max()) * d.cells.widths.sum() / 1e-9)
 
 
-def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric, draw: Draw) -> None:
+def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric) -> None:
     x, w, z, u = draw(12)
     failed = np.append(z, INF)
     d = metric.against(failed, np.append(0.9 * u, 0.1))

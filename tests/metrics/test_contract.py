@@ -11,6 +11,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from metric_samples import draw
 from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats
@@ -237,7 +238,7 @@ def test_a_function_is_called_with_the_projections() -> None:
     np.testing.assert_allclose(found[:, 0], d(x), rtol=1e-12)
 
 
-def test_it_is_the_value_of_the_function(draw: Callable[..., tuple[Floats, ...]]) -> None:
+def test_it_is_the_value_of_the_function() -> None:
     x, _, z, _ = draw(12)
     plain, weighted = (FunctionMetric(mean_difference, weighted=w) for w in (False, True))
     d = weighted.against(z)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from metric_samples import draw, normal
 from scipy.stats import norm
 
 from prbayes._validate import Floats
@@ -16,8 +16,6 @@ from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 
 INF = np.inf
-Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
-Normal = Callable[..., Floats]
 
 
 def prepared(metric: Metric, observed: Floats, weights: Floats | None = None) -> Any:
@@ -28,9 +26,7 @@ def prepared(metric: Metric, observed: Floats, weights: Floats | None = None) ->
     ("m", "s", "mu", "sd"), [(0, 1, 0, 1.3), (0.5, 1, 0, 1), (-0.8, 0.8, 0.2, 1)]
 )
 @pytest.mark.parametrize(("a", "h"), [(1e-3, 0.4), (70.0, 0.6)])
-def test_normal_densities(
-    normal: Normal, m: float, s: float, mu: float, sd: float, a: float, h: float
-) -> None:
+def test_normal_densities(m: float, s: float, mu: float, sd: float, a: float, h: float) -> None:
     x, z = a * normal(m, s, 100_000), a * normal(mu, sd, 99_000)
     vp, vq, d = a**2 * (s**2 + h**2), a**2 * (sd**2 + h**2), a * (m - mu)
     kde = GaussianKDE(a * h)
@@ -52,7 +48,7 @@ def test_normal_densities(
 
 
 @pytest.mark.parametrize(("seed", "h"), [(0, 0.2), (1, 1.0), (3, 0.2)])
-def test_residual_is_a_squared_maximum_mean_discrepancy(draw: Draw, seed: int, h: float) -> None:
+def test_residual_is_a_squared_maximum_mean_discrepancy(seed: int, h: float) -> None:
     x, w, z, u = draw(seed, 5 + 3 * seed, 9)
     x = np.clip(x, z.min() - h / 2, z.max() + h / 2)  # well inside the grid
     y, v = np.r_[x, z], np.r_[w, -u]
@@ -81,7 +77,7 @@ def test_with_a_histogram_they_are_sums_over_bins() -> None:
 
 @pytest.mark.parametrize(("sd", "power"), [(8e-5, 3), (80.0, -3), (0.3, 0), (0.03, 1)])
 @pytest.mark.parametrize("base", [100.0, 10.0])
-def test_scale_factor(normal: Normal, sd: float, power: int, base: float) -> None:
+def test_scale_factor(sd: float, power: int, base: float) -> None:
     z = normal(5, sd)
     kde = GaussianKDE(sd / 50)
     d, plain = (prepared(ProbabilityResidual(kde, scale_base=c), z) for c in (base, 1))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from metric_samples import draw
 from scipy.stats import norm
 
 from prbayes._validate import Floats
@@ -20,9 +20,7 @@ def prepared(density: Any, observed: Floats, weights: Floats | None = None) -> A
     return LogLikelihood(density=density).against(observed, weights)
 
 
-def test_other_observed_values_are_read_where_they_are(
-    draw: Callable[..., tuple[Floats, Floats, Floats, Floats]],
-) -> None:
+def test_other_observed_values_are_read_where_they_are() -> None:
     x, w, z, u = draw(12)
     d = prepared(GaussianKDE(0.4), z, u)
     other = d.with_observed(np.array([0.25]))

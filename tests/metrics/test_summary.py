@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,12 +13,9 @@ from scipy.special import ndtri
 from scipy.stats import chi2, norm
 
 import prbayes as prb
+from benchmarks import data_sheets
 from prbayes._validate import Floats
 from prbayes.metrics.summary_likelihood import SummaryLikelihood
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-from benchmarks import data_sheets
 
 MU = np.array([0.0, 0.2, -0.3, 0.1])
 SIGMA = np.array([1.0, 1.2, 0.8, 1.5])

@@ -66,8 +66,10 @@ NO_USE: dict[str, Callable[[pm.Model], object]] = {
     "print": lambda model: (str(model), model.str_repr(), model._repr_latex_()),
     "pictures": lambda model: (pm.model_to_graphviz(model), pm.model_to_mermaid(model)),
     "initial point": lambda model: model.initial_point(),
-    "shapes": lambda model: model["y"].shape.eval(),
-    "other variables": lambda model: pm.sample_prior_predictive(3, model=model, var_names=["mu"]),
+    "shapes": lambda model: model["y"].shape.eval(mode=PLAIN),
+    "other variables": lambda model: pm.sample_prior_predictive(
+        3, model=model, var_names=["mu"], compile_kwargs={"mode": PLAIN}
+    ),
     "copies": lambda model: (clone_model(model), copy.copy(model), copy.deepcopy(model)),
     "pickle": lambda model: cloudpickle.loads(cloudpickle.dumps(model)),
     "do": lambda model: pm.do(model, {"mu": 1.0}),

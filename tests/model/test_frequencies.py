@@ -36,8 +36,8 @@ def model(metric: Any, observed: Any = MIDDLES, **given: Any) -> pm.Model:
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: type(metric).__name__)
 def test_a_histogram_is_as_many_specimens_as_it_counts(metric: Any) -> None:
     """The standard error of the mean is sd / sqrt(400) = .1, not that of twenty values."""
-    counted = prb.minimize(model(metric, weights=COUNTS))
-    repeated = prb.minimize(model(metric, np.repeat(MIDDLES, COUNTS)))
+    counted = prb.minimize(model(metric, weights=COUNTS), starts=0)
+    repeated = prb.minimize(model(metric, np.repeat(MIDDLES, COUNTS)), starts=0)
     assert counted.point == repeated.point
     assert counted.stderr == repeated.stderr
     if isinstance(metric, prb.LogLikelihood | prb.KullbackLeibler):
@@ -49,7 +49,7 @@ def test_the_likelihood_of_bins_is_exact(bins: Any) -> None:
     """Rounding has the width of each bin: the likelihood is that of the bins' probabilities."""
     counts, edges = np.histogram(SAMPLE, bins=bins)
     metric = prb.LogLikelihood(rounded=np.diff(edges))
-    optimum = prb.minimize(model(metric, (edges[1:] + edges[:-1]) / 2, weights=counts))
+    optimum = prb.minimize(model(metric, (edges[1:] + edges[:-1]) / 2, weights=counts), starts=0)
     assert optimum.converged
 
     def minus_log_likelihood(theta: Any) -> float:
@@ -76,7 +76,7 @@ def test_a_table_of_counts_of_groups() -> None:
 
 
 def test_relative_weights_are_floats() -> None:
-    optimum = prb.minimize(model(prb.KullbackLeibler(), weights=COUNTS.astype(float)))
+    optimum = prb.minimize(model(prb.KullbackLeibler(), weights=COUNTS.astype(float)), starts=0)
     kish = COUNTS.sum() ** 2 / (COUNTS**2).sum()
     assert optimum.stderr["mu"] == pytest.approx(SAMPLE.std() / np.sqrt(kish), rel=0.1)
 

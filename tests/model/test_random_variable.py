@@ -210,7 +210,7 @@ def test_predictive_draws_of_the_same_specimens_are_reported(
 ) -> None:
     model = two_of_the_same_inputs()
     assert "draws each variable independently" not in caplog.text
-    pm.sample_prior_predictive(3, model=model, random_seed=1)
+    pm.sample_prior_predictive(3, model=model, random_seed=1, compile_kwargs={"mode": PLAIN})
     assert caplog.text.count("z and y have the inputs of the same specimens") == 1
     assert "use prb.predict" in caplog.text
 

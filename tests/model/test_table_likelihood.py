@@ -14,6 +14,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.response import ResponseError
+from prbayes.response.compile import PLAIN
 
 RNG = np.random.default_rng(3)
 E, T = RNG.normal(70, 4, 24), RNG.normal(2, 0.1, 24)
@@ -44,7 +45,7 @@ def emulation_of(model: pm.Model) -> Any:
 
 
 def log_density(model: pm.Model) -> Any:
-    function = model.compile_fn(model.observedlogp, inputs=model.value_vars)
+    function = model.compile_fn(model.observedlogp, inputs=model.value_vars, mode=PLAIN)
     at = model.initial_point()
     if "sd" in model:
         at |= {"sd_log__": 1.4, "mu_t": 2.01, "sd_t_log__": -2.2}
@@ -153,7 +154,7 @@ def test_metrics_refuse_a_population_outside_the_table_and_say_what_to_do() -> N
     with pytest.raises(
         DesignError, match=r"no run has a finite .* add the runs that prb\.propose_runs"
     ):
-        prb.minimize(model, progressbar=False)
+        prb.minimize(model, starts=0, progressbar=False)
     assert (prb.propose_runs(model)["x"] > 3).all()
     with pytest.raises(ValueError, match="got a table of no simulator"):
         prb.propose_runs(model, runs=prb.Runs(x, x**2))
@@ -171,7 +172,7 @@ def test_predictions_of_a_table_are_nan_outside_and_the_error_is_diagnosed() -> 
     with pm.Model() as model:
         dist = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sd", 0.5))
         prb.Simulator("y", runs, dist, observed=data)
-    optimum = prb.minimize(model, progressbar=False)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
     assert "surface through 30 runs, with a cross-validated error" in str(prb.diagnose(optimum))
     predicted = prb.predict(optimum, runs, dist, model=model, progressbar=False)
     of_function = prb.predict(

@@ -1,18 +1,16 @@
-"""Results that all plots are tested with, made once for each worker, and how to read a plot."""
+"""Results that all plots are tested with, made once for each worker."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from matplotlib.figure import Figure
 from scipy import stats
 
 import prbayes as prb
@@ -123,52 +121,6 @@ def pair() -> SimpleNamespace:
 @pytest.fixture(scope="session")
 def comparison(optimum: prb.Optimum, posterior: xr.DataTree) -> xr.Dataset:
     return prb.compare({"optimum": optimum, "draws": posterior}, model=optimum.model)
-
-
-@pytest.fixture(scope="session")
-def read() -> SimpleNamespace:
-    """How to read a figure: its artists, their places, the sides of a band, the legend's texts."""
-
-    def panel(figure: Figure, name: str) -> Any:
-        (axis,) = (axis for axis in figure.axes if axis.get_label() == name)
-        return axis
-
-    def panels(figure: Figure, gid: str) -> list[str]:
-        """Return the names of the panels that have an artist."""
-        axes = [axis for axis in figure.axes if axis.findobj(lambda x: x.get_gid() == gid)]
-        return [str(axis.get_label()) for axis in axes]
-
-    def artist(figure: Figure, gid: str, name: str) -> Any:
-        (drawn,) = panel(figure, name).findobj(lambda x: x.get_gid() == gid)
-        return drawn
-
-    def xy(figure: Figure, gid: str, name: str) -> Array:
-        """Return the places of a line or of markers, shape (2, n)."""
-        drawn = artist(figure, gid, name)
-        if hasattr(drawn, "get_offsets"):
-            return np.array(drawn.get_offsets().T, dtype=float)
-        return np.array(drawn.get_data(), dtype=float)
-
-    def sides(figure: Figure, gid: str, name: str, at: Array) -> Array:
-        """Return the lower and the upper side of a band at some places, shape (2, n)."""
-        x, y = np.asarray(artist(figure, gid, name).get_paths()[0].vertices).T
-        there = [y[np.isclose(x, place, atol=1e-9)] for place in at]
-        return np.array([[v.min() for v in there], [v.max() for v in there]])
-
-    def texts(figure: Figure) -> list[str]:
-        (legend,) = figure.legends
-        return [text.get_text() for text in legend.get_texts()]
-
-    return SimpleNamespace(
-        artist=artist, xy=xy, sides=sides, texts=texts, panel=panel, panels=panels
-    )
-
-
-@pytest.fixture(autouse=True)
-def _close_figures() -> Iterator[None]:
-    """Close the figures of a test, which stay readable."""
-    yield
-    plt.close("all")
 
 
 @pytest.fixture(scope="session")

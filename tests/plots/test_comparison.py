@@ -1,9 +1,9 @@
 """Results side by side: a row for each."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,7 +12,7 @@ import prbayes as prb
 
 
 def test_a_comparison_has_a_row_for_each_result(
-    optimum: prb.Optimum, comparison: xr.Dataset, read: SimpleNamespace, drawn: Callable[..., Any]
+    optimum: prb.Optimum, comparison: xr.Dataset, drawn: Callable[..., Any]
 ) -> None:
     pc = drawn("comparison")
     table = comparison.sel(hyperparameter="sigma")

@@ -1,8 +1,8 @@
 """The trace of an optimiser, in the user's units, and the stages of a sampler, by chain."""
 
-from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,9 +10,7 @@ import xarray as xr
 import prbayes as prb
 
 
-def test_the_trace_is_in_the_users_units(
-    optimum: prb.Optimum, read: SimpleNamespace, drawn: Any
-) -> None:
+def test_the_trace_is_in_the_users_units(optimum: prb.Optimum, drawn: Any) -> None:
     pc = drawn("optimizer")
     trace = optimum.search.trace
     evaluations, theta = trace["evaluations"], trace["theta"]
@@ -24,7 +22,7 @@ def test_the_trace_is_in_the_users_units(
     assert (np.diff(y) <= 0).all()
 
 
-def test_stages_by_chain(read: SimpleNamespace, drawn: Any) -> None:
+def test_stages_by_chain(drawn: Any) -> None:
     pc = drawn("stages")
     np.testing.assert_allclose(read.xy(pc, "chain_0", "accept_rate"), [[1, 2, 3], [0.2, 0.3, 0.4]])
     np.testing.assert_allclose(read.xy(pc, "chain_1", "accept_rate"), [[1, 2], [0.5, 0.6]])

@@ -1,7 +1,6 @@
 """The picture of specimens shows the draws and readings."""
 
-from types import SimpleNamespace
-
+import figure_reader as read
 import numpy as np
 import xarray as xr
 
@@ -25,7 +24,7 @@ def tree(width: int) -> xr.DataTree:
     )
 
 
-def test_specimens_and_readings(read: SimpleNamespace) -> None:
+def test_specimens_and_readings() -> None:
     data = tree(2)
     pc = plot_individuals(data, prob=0.8)
     offsets = read.artist(pc, "mean", "k").get_offsets()
@@ -40,7 +39,7 @@ def test_specimens_and_readings(read: SimpleNamespace) -> None:
     np.testing.assert_allclose(places[:, 1], data["observed_data"]["y"][:, 1])
 
 
-def test_a_curve_has_one_panel(read: SimpleNamespace) -> None:
+def test_a_curve_has_one_panel() -> None:
     data = tree(8)
     pc = plot_individuals(data, prob=0.8)
     assert read.panels(pc, "observed") == ["y"]
@@ -50,7 +49,7 @@ def test_a_curve_has_one_panel(read: SimpleNamespace) -> None:
     np.testing.assert_allclose(y, expected)
 
 
-def test_some_specimens_and_outputs(read: SimpleNamespace) -> None:
+def test_some_specimens_and_outputs() -> None:
     coords = {"specimen": [0, 2], "time": 0.5}
     figure = plot_individuals(tree(2), coords=coords, var_names="y")
     assert [axis.get_label() for axis in figure.axes] == ["y[0.5]"]

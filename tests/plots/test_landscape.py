@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pymc as pm
 import pytest
@@ -20,9 +21,7 @@ from prbayes.plots.landscape import (
 )
 
 
-def test_the_landscape_is_not_turned_over(
-    optimum: prb.Optimum, read: SimpleNamespace, drawn: Callable[..., Any]
-) -> None:
+def test_the_landscape_is_not_turned_over(optimum: prb.Optimum, drawn: Callable[..., Any]) -> None:
     pc = drawn("landscape")
     trace, point = optimum.search.trace["theta"], optimum.point
     np.testing.assert_allclose(read.xy(pc, "path", "landscape"), [trace[:, 0], np.exp(trace[:, 1])])
@@ -48,9 +47,7 @@ def test_the_landscape_is_not_turned_over(
     assert values[0] >= 0.995 * optimum.discrepancy
 
 
-def test_a_curve_over_one_hyperparameter(
-    optimum: prb.Optimum, read: SimpleNamespace, drawn: Callable[..., Any]
-) -> None:
+def test_a_curve_over_one_hyperparameter(optimum: prb.Optimum, drawn: Callable[..., Any]) -> None:
     pc = drawn("curve")
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([np.full(x.size, optimum.theta[0]), np.log(x)])
@@ -60,7 +57,7 @@ def test_a_curve_over_one_hyperparameter(
     assert not read.panels(pc, "evaluated")
 
 
-def test_other_optima_are_marked(read: SimpleNamespace) -> None:
+def test_other_optima_are_marked() -> None:
     optimum = prb.minimize(_one())
     modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
     pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), points=21)
@@ -70,9 +67,7 @@ def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     np.testing.assert_allclose(np.abs(path).max(), largest)
 
 
-def test_a_landscape_that_costs_responses_says_how_many(
-    build: Callable[..., pm.Model], read: SimpleNamespace
-) -> None:
+def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.Model]) -> None:
     model = build(prb.Resimulated(64))
     found = prb.minimize(model)
     with pytest.raises(
@@ -83,9 +78,7 @@ def test_a_landscape_that_costs_responses_says_how_many(
     assert read.panels(prb.plots.plot_landscape(found, points=5, responses=1600), "landscape")
 
 
-def test_the_landscape_of_another_metric(
-    optimum: prb.Optimum, known: SimpleNamespace, read: SimpleNamespace
-) -> None:
+def test_the_landscape_of_another_metric(optimum: prb.Optimum, known: SimpleNamespace) -> None:
     with pm.Model() as other:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
         prb.Simulator(

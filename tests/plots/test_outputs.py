@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pymc as pm
 import pytest
@@ -14,9 +15,7 @@ from prbayes.plots.outputs import _shown_outputs
 from prbayes.response.outputs import Outputs
 
 
-def test_regions_are_the_ellipses_of_a_normal_population(
-    pair: SimpleNamespace, read: SimpleNamespace
-) -> None:
+def test_regions_are_the_ellipses_of_a_normal_population(pair: SimpleNamespace) -> None:
     for share, visual in ((0.5, "after_50"), (0.89, "after_89")):
         x, y = read.xy(pair.drawn(), visual, "second, first")
         points = np.column_stack([x, y])[np.isfinite(x)] - pair.mean
@@ -26,9 +25,7 @@ def test_regions_are_the_ellipses_of_a_normal_population(
         np.testing.assert_allclose(squares, expected, rtol=0.35)
 
 
-def test_specimens_with_both_outputs_names_units_and_correlations(
-    pair: SimpleNamespace, read: SimpleNamespace
-) -> None:
+def test_specimens_with_both_outputs_names_units_and_correlations(pair: SimpleNamespace) -> None:
     pc = pair.drawn()
     points = read.xy(pc, "measured", "second, first")
     is_complete = np.isfinite(pair.observed).all(axis=1)

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -18,7 +19,7 @@ from prbayes.propagation.base import Propagation
 
 
 def test_the_population_is_the_closed_form(
-    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
+    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace
 ) -> None:
     pc = prb.plots.plot_population(posterior, model=optimum.model, n_draws=300, prob=0.8)
     x, y = read.xy(pc, "after", "x")
@@ -52,7 +53,7 @@ def correlated() -> pm.Model:
     return model
 
 
-def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
+def test_a_multivariate_input_has_its_pairs() -> None:
     draws = xr.Dataset(
         {
             "mean": (["chain", "draw", "mean_dim_0"], np.tile([1.0, 2.0, 0.0], (1, 4, 1))),

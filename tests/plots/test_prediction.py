@@ -1,7 +1,6 @@
 """What a calibration has not seen, beside what it predicts."""
 
-from types import SimpleNamespace
-
+import figure_reader as read
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,7 +16,7 @@ PREDICTED = xr.DataArray(
 MEASURED = np.array([-1.0, 0.2, 0.4, 1.5])
 
 
-def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> None:
+def test_steps_and_curve_are_distribution_functions() -> None:
     pc = prb.plots.plot_prediction(MEASURED, PREDICTED)
     x, y = read.xy(pc, "measured", "later")
     for value, below, above in zip(
@@ -30,7 +29,7 @@ def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> No
     np.testing.assert_allclose(y, expected, atol=1e-9)
 
 
-def test_the_band_holds_its_share_of_the_populations(read: SimpleNamespace) -> None:
+def test_the_band_holds_its_share_of_the_populations() -> None:
     pc = prb.plots.plot_prediction(MEASURED, PREDICTED, prob=0.5)
     x, _ = read.xy(pc, "predicted", "later")
     at = x[[100, 128, 150]]
@@ -40,7 +39,7 @@ def test_the_band_holds_its_share_of_the_populations(read: SimpleNamespace) -> N
     np.testing.assert_allclose(high, np.quantile(shares, 0.75, axis=0))
 
 
-def test_what_failed_and_what_is_missing(read: SimpleNamespace) -> None:
+def test_what_failed_and_what_is_missing() -> None:
     predicted = PREDICTED.copy()
     predicted[:, :, :40] = np.inf  # a tenth fails
     predicted[:, :, 40:80] = np.nan
@@ -52,7 +51,7 @@ def test_what_failed_and_what_is_missing(read: SimpleNamespace) -> None:
     assert title == "5 measured values, 1 failed"
 
 
-def test_conditions_and_outputs_have_panels(read: SimpleNamespace) -> None:
+def test_conditions_and_outputs_have_panels() -> None:
     both = xr.concat([PREDICTED, 2 * PREDICTED], "part").transpose("chain", "draw", "sample", ...)
     both = both.assign_coords(part=["shaft", "disk"])
     measured = np.column_stack([MEASURED, 2 * MEASURED])

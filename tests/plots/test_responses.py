@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pymc as pm
 import pytest
@@ -18,7 +19,7 @@ from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 
 
 def test_responses_are_the_closed_forms(
-    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
+    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace
 ) -> None:
     pc = prb.plots.plot_responses(posterior, model=optimum.model, n_draws=300)
     x, y = read.xy(pc, "after", "y")
@@ -43,10 +44,7 @@ def test_responses_are_the_closed_forms(
 
 
 def test_distribution_functions_of_an_optimum(
-    optimum: prb.Optimum,
-    read: SimpleNamespace,
-    pictures: dict[str, Callable[..., Any]],
-    drawn: Callable[..., Any],
+    optimum: prb.Optimum, pictures: dict[str, Callable[..., Any]], drawn: Callable[..., Any]
 ) -> None:
     pc = pictures["ecdf"](before={"mu": 3.0, "sigma": 1.0})
     mu, sigma = optimum.point["mu"], optimum.point["sigma"]
@@ -98,9 +96,7 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
         assert sum(seen) <= 300
 
 
-def test_without_a_sampling_distribution_there_is_no_band(
-    optimum: prb.Optimum, read: SimpleNamespace
-) -> None:
+def test_without_a_sampling_distribution_there_is_no_band(optimum: prb.Optimum) -> None:
     unknown = replace(optimum, covariance=np.full((2, 2), np.nan))
     pc = prb.plots.plot_responses(unknown, before={"mu": 1.0, "sigma": 0.05})
     assert not read.panels(pc, "band")
@@ -120,9 +116,7 @@ def test_a_posterior_beyond_the_design_is_refused(
         prb.plots.plot_responses(far, model=optimum.model)
 
 
-def test_each_output_has_a_panel_with_what_was_measured_of_it(
-    pair: SimpleNamespace, read: SimpleNamespace
-) -> None:
+def test_each_output_has_a_panel_with_what_was_measured_of_it(pair: SimpleNamespace) -> None:
     pc = prb.plots.plot_responses(pair.posterior, model=pair.model)
     for column, mean in (("first", 2.0), ("second", 6.6)):
         x, y = read.xy(pc, "after", f"frame[{column}]")
@@ -234,7 +228,7 @@ def curve(a: Any) -> Any:
     return np.where(y > 13, np.inf, y)
 
 
-def test_a_curve_has_one_panel_from_left_to_right(read: SimpleNamespace) -> None:
+def test_a_curve_has_one_panel_from_left_to_right() -> None:
     observed = curve(np.linspace(0.5, 2.5, 11))
     observed[0, 2] = np.nan
     coords = {"hour": HOURS}
@@ -269,7 +263,7 @@ def test_a_curve_has_one_panel_from_left_to_right(read: SimpleNamespace) -> None
     assert inner == pytest.approx(0.89 * (2**1.6 - 2**1.4), rel=0.1)  # of medians from 1.4 to 1.6
 
 
-def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) -> None:
+def test_many_outputs_with_names_are_in_their_own_spread() -> None:
     names = [f"gauge {i}" for i in range(9)]
     unit = 10.0 ** np.arange(9)
     rng = np.random.default_rng(1)

@@ -1,7 +1,6 @@
 """What moves a decision quantity: a row for each factor."""
 
-from types import SimpleNamespace
-
+import figure_reader as read
 import numpy as np
 import pytest
 import xarray as xr
@@ -23,7 +22,7 @@ def table() -> xr.Dataset:
     return xr.Dataset(data, coords={"factor": factor, "kind": kinds})
 
 
-def test_a_factor_has_a_row_with_two_errors(table: xr.Dataset, read: SimpleNamespace) -> None:
+def test_a_factor_has_a_row_with_two_errors(table: xr.Dataset) -> None:
     pc = prb.plots.plot_sensitivity(table, labels={"mu": "mean"})
     np.testing.assert_allclose(read.xy(pc, "first", "hyperparameter"), [[0.7, 0.2], [1.12, 0.12]])
     segments = [read.artist(pc, f"{x}_error", "hyperparameter") for x in ("first", "total")]

@@ -1,9 +1,9 @@
 """The u-values of a validity test against their envelope."""
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
+import figure_reader as read
 import numpy as np
 import pytest
 
@@ -35,9 +35,7 @@ def shoelace(corners: np.ndarray[Any, Any]) -> float:
 
 
 @pytest.mark.parametrize(("shift", "folded"), [(0.0, False), (1.2, False), (0.0, True)])
-def test_the_shaded_area_is_the_statistic(
-    shift: float, folded: bool, read: SimpleNamespace
-) -> None:
+def test_the_shaded_area_is_the_statistic(shift: float, folded: bool) -> None:
     test = validity(shift, folded)
     pc = prb.plots.plot_validity(test)
     assert shoelace(polygon(read.artist(pc, "area", "u"))) == pytest.approx(
@@ -60,7 +58,7 @@ def test_the_verdict_stands_in_the_title() -> None:
     assert prb.plots.plot_validity(validity(0.0, True)).axes[0].get_xlabel() == "|2u - 1|"
 
 
-def test_the_envelope_holds_the_ecdf_of_a_right_model(read: SimpleNamespace) -> None:
+def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
     for shift, inside in ((0.0, True), (1.2, False)):
         test = validity(shift)
         path = read.artist(prb.plots.plot_validity(test), "envelope", "u").get_paths()[0]
@@ -98,7 +96,6 @@ def of_outputs(folded: bool = False) -> prb.validation.ValidityTest:
 @pytest.mark.parametrize("folded", [False, True])
 def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic(
     folded: bool,
-    read: SimpleNamespace,
 ) -> None:
     test = of_outputs(folded)
     pc = prb.plots.plot_validity(test)

@@ -48,7 +48,7 @@ def node(model: pm.Model) -> Any:
 
 
 def epsilon_of(model: pm.Model, **keywords: Any) -> float:
-    return prb.calibrate_epsilon(prb.minimize(model, **keywords))["y"]
+    return prb.calibrate_epsilon(prb.minimize(model, starts=0, **keywords))["y"]
 
 
 @cache
@@ -96,7 +96,7 @@ def test_a_likelihood_counts_specimens_and_not_observations() -> None:
     model = build(KL, observed=np.repeat(OBSERVED[:10], 3), specimens=np.arange(30) // 3)
     assert node(model).epsilon_value == pytest.approx(0.1)
     assert has_default_epsilon(node(model))
-    assert epsilon_of(model, starts=0) == pytest.approx(0.1)
+    assert epsilon_of(model) == pytest.approx(0.1)
 
 
 # -- the sandwich of the residual
@@ -202,7 +202,7 @@ def square(z: Floats, y: Floats, w: Floats) -> Floats:
 )
 def test_epsilon_by_refits(function: Any, expected: float, rtol: float) -> None:
     model = build(prb.FunctionMetric(function, weighted=True), sd=0.5)
-    np.testing.assert_allclose(epsilon_of(model, starts=0), expected, rtol=rtol)
+    np.testing.assert_allclose(epsilon_of(model), expected, rtol=rtol)
 
 
 def test_problems_without_refits_are_refused() -> None:
@@ -238,7 +238,7 @@ def pair(metric: prb.Metric, labels: Any, n: int = 256) -> pm.Model:
 def test_two_simulators_of_the_same_specimens_count_once(metric: prb.Metric) -> None:
     numbers = np.arange(30)
     alone, twice, apart = (
-        np.array(list(prb.calibrate_epsilon(prb.minimize(pair(metric, labels))).values()))
+        np.array(list(prb.calibrate_epsilon(prb.minimize(pair(metric, labels), starts=0)).values()))
         for labels in ([numbers], [numbers, numbers], [numbers, numbers + 30])
     )
     # A ratio of variances of 200 data sets.

@@ -16,6 +16,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.posterior.importance import ImportanceOptions
+from prbayes.response.compile import PLAIN
 
 X = np.random.default_rng(0).normal(10, 1, 20)
 DIVERGENCE = prb.KullbackLeibler()
@@ -57,7 +58,7 @@ def test_the_groups_are_those_of_other_samplers() -> None:
     assert result.log_likelihood["y"].shape == (2, 2000, len(X))
     assert result.posterior_predictive["y"].shape == (2, 2000, len(X))
     assert set(result.sample_stats.data_vars) == {"lp"}
-    logp = linear_model().compile_logp()
+    logp = linear_model().compile_logp(mode=PLAIN)
     mu, sigma = (result.posterior[name].values[0, :5] for name in ("mu", "sigma"))
     points = [{"mu": m, "sigma_log__": np.log(s)} for m, s in zip(mu, sigma, strict=True)]
     expected = [float(logp(point)) for point in points]

@@ -21,6 +21,7 @@ from prbayes.propagation.ops import (
     stored_discrepancy,
     symbolic_discrepancy,
 )
+from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses
 
@@ -117,7 +118,7 @@ def test_a_batch_is_one_call_of_the_response() -> None:
     op = response_op(calls)
     x, m, xs, ms = pt.dvector(), pt.dvector(), pt.dmatrix(), pt.dmatrix()
     graph = vectorize_graph(op(x, m), {x: xs, m: ms})
-    compiled = pytensor.function([xs, ms], graph)
+    compiled = pytensor.function([xs, ms], graph, mode=PLAIN)
     found = compiled(np.ones((3, 4)), np.arange(3.0)[:, None])
     np.testing.assert_array_equal(found, 1 + np.arange(3.0)[:, None] + np.zeros((3, 4)))
     assert calls == [(3, 4)]
@@ -169,7 +170,8 @@ def test_a_basis_of_projections_has_the_discrepancy_and_gradient_of_the_matrix(n
         graph = stored_discrepancy(joint, basis, weights)
         # Batches of weights share the values.
         batched = vectorize_graph(graph, {weights: many})
-        function = pytensor.function([weights, many], [graph, pt.grad(graph, weights), batched])
+        wanted = [graph, pt.grad(graph, weights), batched]
+        function = pytensor.function([weights, many], wanted, mode=PLAIN)
         features = basis.features(rows)
         results.append([*function(rows[0], rows), joint.outer(*features, xp=np)])
     for matrix, projections in zip(*results, strict=True):

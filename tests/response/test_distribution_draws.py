@@ -54,7 +54,7 @@ def _assert_same_distribution(draws: Any, expected: Any) -> None:
         assert stats.ks_2samp(x, y, method="asymp").pvalue > 1e-5
 
 
-# Scalars are inputs in tests/test_distributions.py too.
+# Scalars are inputs in benchmarks/tests/test_distributions.py too.
 _SLOW = (",", "Hurdle", "ZeroInflated", "Mixture")
 _LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n in CASES}
 

@@ -15,9 +15,9 @@ import numpy as np
 import pymc as pm
 import pytest
 import units
-from hostile import processes
 
 import prbayes as prb
+from benchmarks.hostile import processes
 from prbayes.response import fmu
 from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.executors import Pool

@@ -1,6 +1,5 @@
 """The area test: what it sees, what it does not care for, what it refuses."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,10 @@ from scipy import stats
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
+from benchmarks import power, validity
 from prbayes._stats import envelope
 from prbayes.validation.conditions import area
 from prbayes.validation.nulls import uniform_envelope
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-from benchmarks import power, validity
 
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()

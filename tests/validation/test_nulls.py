@@ -1,7 +1,6 @@
 """Null distributions: replicates of a posterior, an exact population, the calibration's own data."""
 
 import re
-import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,13 +12,10 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
+from benchmarks import area_null
 from prbayes._validate import Floats
 from prbayes.validation.conditions import Case, area, read_case
 from prbayes.validation.nulls import judge_by_replicates, table
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-from benchmarks import area_null
 
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import likelihood_coverage, likelihood_guards, many_inputs, readings_coverage
 from prbayes.model.evaluator import Evaluator
@@ -26,7 +21,7 @@ def test_coverage() -> None:
 @pytest.mark.parametrize("name", ["error estimated", "gross errors, folded", "right-censored"])
 def test_readings(name: str) -> None:
     case = readings_coverage.CASES[name]
-    _model, likelihood = readings_coverage.likelihood_of(case.problem, case.measurement)
+    _model, likelihood = likelihood_coverage.likelihood_of(case.problem, case.measurement)
     row = readings_coverage.data_set(case, likelihood, 0)  # checks its own density first
     assert row["prbayes"]["mean"] == pytest.approx(row["exact"]["mean"], abs=0.1)
 

@@ -27,7 +27,7 @@ import numpy as np
 import xarray as xr
 
 import prbayes
-from prbayes.__main__ import main
+from prbayes.cli import main
 from prbayes.model.fingerprint import Identity
 from prbayes.posterior.kernel import Checkpoint
 from prbayes.response.store import Store, StoreError

@@ -13,11 +13,9 @@ import pytest
 from scipy.special import erfc
 
 import prbayes as prb
+from benchmarks import pages, thermal_challenge
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import pages, thermal_challenge  # noqa: E402
+ROOT = Path(__file__).parents[2]
 
 K, C = 0.06, 3.9e5  # W/(m C), J/(m^3 C)
 FLUX, THICKNESS = 3500.0, 0.019  # W/m^2, m

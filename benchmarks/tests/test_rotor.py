@@ -14,7 +14,7 @@ from scipy.linalg import eig, eigh
 
 
 def _example() -> Any:
-    path = Path(__file__).parents[1] / "examples" / "rotor" / "rotor.py"
+    path = Path(__file__).parents[2] / "examples" / "rotor" / "rotor.py"
     spec = importlib.util.spec_from_file_location("rotor", path)
     assert spec is not None
     assert spec.loader is not None

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import ndtri
 from scipy.stats import norm
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import exact_posteriors as exact
 from benchmarks import reach
@@ -69,7 +65,7 @@ def test_masses_of_two_modes() -> None:
 
 
 def test_two_quadratures_of_a_square_with_a_known_input() -> None:
-    instance = cases._square_and_known(0)
+    instance: Any = cases._square_and_known(0)
     log_l = instance.reference.args[1]
     mu, sigma = np.array([0.9, 0.2]), np.array([0.5, 1.0])
     # Over b, with both roots; midpoints of the distribution function of b.

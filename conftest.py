@@ -1,4 +1,4 @@
-"""What holds for all tests: threads, and responses that differ in their last digits where asked.
+"""What holds for all tests: threads, imports of benchmarks, and perturbed responses where asked.
 
 `PRBAYES_LAST_DIGITS=1 uv run pytest` multiplies every response of the user's by 1 + 1e-12 sin(a
 number of the response and the seed 1): what another processor, or another version of NumPy, may do.
@@ -11,6 +11,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 # A twelfth of the time of a test run went into noting the line on which each variable was made.
 os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0")
+
+# After the installed packages, so that tests of a wheel import the package from there.
+sys.path.append(str(Path(__file__).parent))
 
 _SEED = os.environ.get("PRBAYES_LAST_DIGITS")
 

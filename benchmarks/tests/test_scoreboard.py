@@ -14,8 +14,6 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 from scipy.special import gammaln
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from benchmarks.scoreboard import exact, study, table
 from benchmarks.scoreboard.problem import (
     Input,
@@ -45,7 +43,7 @@ from benchmarks.scoreboard.problems import (
 )
 from benchmarks.scoreboard.score import score, summary
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EVERY = pytest.mark.parametrize("name", sorted(PROBLEMS))
 
 
@@ -141,7 +139,8 @@ def test_the_folded_density_integrates_to_one() -> None:
 @pytest.mark.parametrize("dose", growth.DOSES)
 def test_the_density_of_active_receptors_integrates_to_one(dose: float) -> None:
     share = growth.active_share(np, np.array([0.75, 2.7]), dose)
-    y = np.linspace(*6.5e5 * share, 2001)
+    low, high = 6.5e5 * share
+    y = np.linspace(low, high, 2001)
     log_p = growth.log_density(y, dose, np.array([[6.5e5, 77.0, 1.7, 0.2]]))
     assert np.trapezoid(np.exp(log_p[0]), y) == pytest.approx(1, abs=1e-5)
 

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from benchmarks import record
 from benchmarks.study import Study
 

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.responses import RESPONSES, Response
 
@@ -21,7 +16,8 @@ def response(request: pytest.FixtureRequest) -> Response:
 
 def population(response: Response, n: int = 4096) -> np.ndarray:
     rng = np.random.default_rng(0)
-    return response.mean + response.sd * rng.standard_normal((n, response.d))
+    x: np.ndarray = response.mean + response.sd * rng.standard_normal((n, response.d))
+    return x
 
 
 def test_a_specimen_gives_the_same_outputs_whatever_is_run_with_it(response: Response) -> None:
