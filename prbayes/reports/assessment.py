@@ -10,21 +10,14 @@ import xarray as xr
 
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
+from prbayes._validate import Floats
 from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
-from prbayes.model.parameters import (
-    optimum_elements,
-    readable_variables,
-    single_elements,
-    split_elements,
-    stacked_draws,
-    table_elements,
-    variable_of,
-)
+from prbayes.model.parameters import readable_variables, variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import named
 from prbayes.plots.validity import in_directions
-from prbayes.reports.material import Material, kind_of_decision
+from prbayes.reports.material import Material, Observed, kind_of_decision
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
@@ -38,7 +31,7 @@ from prbayes.reports.numbers import (
     with_zeros,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT, with_unit
+from prbayes.results.compare import estimates_in, estimates_of
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import Comparable, comparables
 
@@ -65,7 +58,7 @@ def verdict(m: Material) -> list[Section]:
     elif m.results:
         title = "Not tested"
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
-    elif m.description is None:
+    elif not m.description["variables"]:
         return []
     if m.results and mark != "bad" and None in m.diagnoses.values():
         text.append("Not all results were diagnosed: that needs the model.")
@@ -125,11 +118,11 @@ def _data(m: Material) -> str:
     data = []
     for name, sheet in m.sheets.items():
         data.append(f"a data sheet of {named(name, m.labels)} ({sheet})")
-    labelled = {s["name"]: s["specimens"].partition(":")[0] for s in m.simulators}
+    labelled = {s["name"]: s["n_specimens"] for s in m.description["simulators"]}
     for name, y in m.observed.items():
-        measured = counted(y.size, "measured value")
-        if y.ndim > 1:
-            n, outputs = y.shape
+        measured = counted(y.values.size, "measured value")
+        if y.values.ndim > 1:
+            n, outputs = y.values.shape
             # Of a group the specimens are not known where they have labels.
             is_labelled = bool(labelled.get(name.partition("[")[0]))
             rows = counted(n, "reading" if is_labelled else "specimen")
@@ -148,28 +141,26 @@ def population_in_units(m: Material) -> list[Section]:
         table = population(result, model=m.model, prob=m.prob)
     except (TypeError, ValueError, NotImplementedError):
         return []
-    words = {"sd": "standard deviation", "50% quantile": "median"}
-    columns: dict[str, dict[str, str]] = {}
-    for name, unit, cells in table.rows():
+    shown = table.to_view()
+    prefix = "correlation with "
+    quantities = [
+        prefix + named(q.removeprefix(prefix), m.labels) if q.startswith(prefix) else q
+        for q in shown.header[1:]
+    ]
+    columns = {}
+    for (name, *_), (name_with_unit, *texts) in zip(table.rows(), shown.rows, strict=False):
         label = named(name, m.labels)
-        texts = {}
-        for quantity in table["quantity"].values.tolist():
-            value, interval = cells.get(quantity, ("", ""))
-            percent = "%" if quantity == "cv" and value else ""
-            text = f"{value}{percent} ({interval})" if interval else f"{value}{percent}"
-            other = quantity.removeprefix("correlation with ")
-            if other != quantity:
-                quantity = f"correlation with {named(other, m.labels)}"
-            texts[words.get(quantity, quantity.replace("cv", "coefficient of variation"))] = text
-        columns[with_unit(label, unit) if label == name else label] = texts
+        columns[name_with_unit if label == name else label] = dict(
+            zip(quantities, texts, strict=True)
+        )
     if len(columns) <= 4:  # a line for each quantity, which fits on a page
-        names = next(iter(columns.values()))
-        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in names]
+        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in quantities]
     else:
         rows = [{"input": x} | texts for x, texts in columns.items()]
     about = (
-        "How the inputs vary from specimen to specimen, with intervals in brackets. 90% of the "
-        "specimens exceed the B-basis value, 99% the A-basis value, with 95% confidence."
+        "How the inputs vary from specimen to specimen, with intervals in brackets: mean, standard "
+        "deviation (sd), coefficient of variation (cv) and quantiles. 90% of the specimens exceed "
+        "the B-basis value, 99% the A-basis value, with 95% confidence."
     )
     return [Section("Population of the inputs", about, rows_table(rows), level=3)]
 
@@ -333,6 +324,7 @@ def answer(m: Material) -> list[Section]:
         return []
     label = next(iter(m.posteriors or m.optima))
     rows = []
+    has_draws = label in m.posteriors
     for name, (value, sd, *ends) in _estimates(m, label).items():
         texts = alike((value, sd, *ends), sd, 2)
         meaning = named(name, m.labels)
@@ -340,8 +332,10 @@ def answer(m: Material) -> list[Section]:
         row["estimate"] = texts[0]
         if np.isinf(sd):  # the data do not identify it
             texts[1] = NOTHING
-        row["standard deviation" if ends else "standard error"] = texts[1]
-        rows.append(row | dict(zip((f"{percentage(m.prob)} from", "to"), texts[2:], strict=False)))
+        row["standard deviation" if has_draws else "standard error"] = texts[1]
+        if has_draws:
+            row |= {f"{percentage(m.prob)} from": texts[2], "to": texts[3]}
+        rows.append(row)
     shown = rows if len(rows) <= 30 else []
     text = ["The estimates are in the appendix."]
     if shown:
@@ -357,26 +351,15 @@ def answer(m: Material) -> list[Section]:
 
 
 def _estimates(m: Material, label: str) -> dict[str, tuple[float, ...]]:
-    """Return estimate and spread of each parameter by a result, and the interval of draws."""
-    estimates: dict[str, tuple[float, ...]] = {}
-    if label in m.posteriors:
-        stacked = stacked_draws(m.posteriors[label]["posterior"])
-        draws = split_elements(stacked)
-        tails = [(1 - m.prob) / 2, (1 + m.prob) / 2]
-        for name in table_elements(stacked):
-            x = draws[name]
-            ends = np.quantile(x, tails).tolist()
-            estimates[name] = float(x.mean()), float(x.std(ddof=1)), *ends
-    else:
-        optimum = m.optima[label]["optimum"].data_vars
-        stderr = m.optima[label]["stderr"].data_vars
-        points, errors = single_elements(optimum), single_elements(stderr)
-        for name in optimum_elements(optimum, stderr):
-            estimates[name] = points[name], errors[name]
-    names = m.hyperparameters
-    variable = {name: variable_of(name, names) for name in estimates}
-    variables = readable_variables(names, set(variable.values()))
-    return {name: pair for name, pair in estimates.items() if variable[name] in variables}
+    """Return estimate, spread and interval of each hyperparameter by a result."""
+    estimates, elements = estimates_of(m.results[label], m.prob)
+    variables = m.description["variables"]
+    names = [v["name"] for v in variables if v["role"] == "hyperparameter"]
+    # Without a description deterministics cannot be told from hyperparameters.
+    names = names or list(map(str, estimates_in(m.results[label]).data_vars))
+    variable = {name: variable_of(name, names) for name in elements}
+    readable = readable_variables(names, set(variable.values()))
+    return {name: estimates[name] for name in elements if variable[name] in readable}
 
 
 # -- evidence --------------------------------------------------------------------------------
@@ -388,33 +371,26 @@ def data(m: Material) -> list[Section]:
         return []
     rows: list[dict[str, Any]] = []
     text = [f"{named(name, m.labels)}: a data sheet, {x}." for name, x in m.sheets.items()]
-    for simulator in m.simulators:
+    for simulator in m.description["simulators"]:
         if simulator["specimens"]:
             text.append(f"{named(simulator['name'], m.labels)}: {simulator['specimens']}.")
     for name, y in m.observed.items():
-        outputs = m.outputs.get(name, SINGLE_OUTPUT)
-        shown = shown_outputs(m, name)
-        if y.ndim > 1 and len(shown) < y.shape[1]:
-            text.append(f"{name}: {len(shown)} of {y.shape[1]} outputs are shown.")
-        for output, j, column in shown:
-            meaning = m.labels.get(name, "")
-            if y.ndim > 1:
-                meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
-            units = outputs.units[j] if outputs.units else ""
-            row = {"measured": name, "meaning": meaning, "output": output, "units": units}
-            rows.append(row | described(column))
+        columns = y.columns()
+        shown = shown_columns(y)
+        if len(shown) < len(columns):
+            text.append(f"{name}: {len(shown)} of {len(columns)} outputs are shown.")
+        for output, unit, values in shown:
+            meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output or name, ""))
+            row = {"measured": name, "meaning": meaning, "output": output, "units": unit}
+            rows.append(row | described(values))
     return [Section("Evidence", text, rows_table(with_zeros(rows)))]
 
 
-def shown_outputs(m: Material, name: str) -> list[tuple[str, int, Any]]:
-    """Return name, place and values of at most twelve outputs, from the first to the last."""
-    y = m.observed[name]
-    if y.ndim == 1:
-        return [("", 0, y)]
-    n = y.shape[1]
-    places = map(round, np.linspace(0, n - 1, min(n, 12)).tolist())
-    names = m.outputs.get(name, SINGLE_OUTPUT).names
-    return [(names[j], j, y[:, j]) for j in places]
+def shown_columns(y: Observed) -> list[tuple[str, str, Floats]]:
+    """Return name, unit and values of at most twelve outputs, from the first to the last."""
+    columns = y.columns()
+    places = np.linspace(0, len(columns) - 1, min(len(columns), 12)).round().astype(int)
+    return [columns[place] for place in places]
 
 
 def agreement(m: Material) -> list[Section]:

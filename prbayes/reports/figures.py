@@ -129,38 +129,37 @@ def requests(m: Material) -> dict[str, Request]:
     # Labels of the model, which has no conditions of a test
     elsewhere = {*m.validation, *constants_of(m.description)}
     of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
-    labels: dict[str, Any] = {"labels": of_model} if of_model else {}
-    prob = {"prob": m.prob} if m.prob != INTERVAL else {}
+    common: dict[str, Any] = {"model": m.model, "labels": of_model}
+    prob = {"prob": m.prob}
 
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
         """Return as keywords the labels of names in a picture without a model."""
         variables = {variable_of(str(name)) for name in names}
         texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": texts} if texts else {}
+        return {"labels": texts}
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
-        requested["population"] = ((result,), {"model": m.model, **labels, **prob})
+        requested["population"] = ((result,), common | prob)
     if m.model is not None and _computes_responses(m.model) and _is_costly(optimum):
         requested["responses"] = "it would recompute responses; call prb.plots.plot_responses"
     elif "population" in requested:
         # Distribution functions: a histogram of a dozen values has boxes above any density
-        of_responses = {"model": m.model, "ecdf": True, "before": False, **labels, **prob}
-        requested["responses"] = ((result,), of_responses)
-        if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
-            requested["outputs"] = ((result,), {"model": m.model, **labels})
+        of_responses = {"ecdf": True, "before": False}
+        requested["responses"] = ((result,), common | prob | of_responses)
+        if any(len(y.columns()) > 1 for y in m.observed.values()):
+            requested["outputs"] = ((result,), common)
     if posterior is not None:
-        shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        shown = {"optimum": optimum, "model": m.model, **shown, **prob}
-        shown["backend"] = "matplotlib"
-        requested["posterior"] = ((posterior,), shown)
+        shown = {} if m.model is not None else labels_of(posterior["posterior"].data_vars)
+        shown |= {"optimum": optimum, "backend": "matplotlib"}
+        requested["posterior"] = ((posterior,), common | prob | shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
     if optimum is not None:
-        requested["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
+        requested["optimizer"] = ((optimum,), {"col_wrap": 2, "labels": of_model})
         if m.model is not None:
-            requested["landscape"] = ((optimum,), {"model": m.model, **labels})
-    if m.comparison is not None and not prob:
+            requested["landscape"] = ((optimum,), common)
+    if m.comparison is not None and m.prob == INTERVAL:
         names = m.comparison["hyperparameter"].values
         requested["comparison"] = ((m.comparison,), labels_of(names))
     if m.tests:
@@ -209,7 +208,7 @@ def pictures_of(m: Material) -> dict[str, list[Section]]:
     drawn["front"] = drawn.pop("prediction", []) or drawn.pop("responses", [])
     graph = None if m.model is None else _graph(m.model)
     if graph is not None:
-        names = ", ".join(variable["name"] for variable in (m.description or {})["variables"])
+        names = ", ".join(variable["name"] for variable in m.description["variables"])
         alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
         caption = "Variables of the model; filled: compared with measured responses."
         drawn["graph"] = [Section("Graph", picture=graph, alt=alt, caption=caption, level=3)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -15,6 +15,7 @@ import xarray as xr
 from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, texts
+from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
@@ -30,10 +31,24 @@ from prbayes.model.fingerprint import from_attributes as identity_of_attributes
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
-from prbayes.results.compare import compare
+from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import comparables
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The measured responses of a simulator."""
+
+    values: Floats  # (N,), or (N, m) of several outputs
+    outputs: Outputs = SINGLE_OUTPUT
+
+    def columns(self) -> list[tuple[str, str, Floats]]:
+        """Return name, unit and values of each output; a single one has no name."""
+        names = self.outputs.names or ("",)
+        units = self.outputs.units or ("",) * len(names)
+        return list(zip(names, units, np.atleast_2d(self.values.T), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,21 +56,20 @@ class Material:
     """Results by label; a single one has its kind as label."""
 
     model: pm.Model | None
-    description: dict[str, Any] | None  # of the model; from a file where there is no model
+    # variables and simulators of the model, or of the model in a file; empty lists if unknown
+    description: dict[str, Any]
     optima: dict[str, xr.DataTree]
-    live_optima: dict[str, Optimum]  # the optima that are not from a file
+    live_optima: dict[str, Optimum]  # optima in memory, which have an evaluator
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
-    observed: dict[str, Floats]  # measured responses by simulator; of several outputs (N, m)
-    outputs: dict[str, Outputs]  # of a run, by simulator
+    observed: dict[str, Observed]  # measured responses by simulator
+    sheets: dict[str, str]  # statistics of data sheets, which are no responses, by simulator
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
-    # Measured and predicted responses of other specimens, by condition
-    validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
-    # Labels of variables, inputs, simulators and outputs, with units
-    labels: Mapping[str, str] = field(default_factory=dict)
-    sheets: Mapping[str, str] = field(default_factory=dict)  # statistics by simulator
+    # measured and predicted responses of other specimens, by condition
+    validation: dict[str, tuple[Any, xr.DataArray]]
+    labels: Mapping[str, str]  # labels of variables, inputs, simulators and outputs, with units
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -76,15 +90,11 @@ class Material:
             if "calibration" in tree.children
         }
 
-    def attrs(self, label: str) -> dict[Any, Any]:
-        """Return the attributes of a result."""
-        return dict(_estimates(self.results[label]).attrs)
-
     @property
     def problems(self) -> list[str]:
         """The problems that a diagnosis found, each once.
 
-        Specimens that are too few for the standard errors of an optimum are none beside draws.
+        If there are draws, too few specimens for the standard errors of an optimum are no problem.
         """
         accepted = {"few-specimens"} if self.posteriors else set()
         texts = [
@@ -117,20 +127,6 @@ class Material:
         ]
         return bool(flags) and all(flags)
 
-    @property
-    def simulators(self) -> list[dict[str, Any]]:
-        """The simulators of the model; none where they are unknown."""
-        return [] if self.description is None else list(self.description["simulators"])
-
-    @property
-    def hyperparameters(self) -> list[str]:
-        """Names of the hyperparameters, without deterministics where they are known as such."""
-        if self.description is not None:
-            variables = self.description["variables"]
-            return [v["name"] for v in variables if v["role"] == "hyperparameter"]
-        first = next(iter(self.results.values()), None)
-        return [] if first is None else list(map(str, _estimates(first).data_vars))
-
 
 def metrics_of(m: Material) -> dict[str, str]:
     """Return the metric by simulator; by result as well, where results differ in it."""
@@ -139,7 +135,7 @@ def metrics_of(m: Material) -> dict[str, str]:
         pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
         by_result[label] = {str(name): str(metric) for name, metric in pairs}
     if not by_result:
-        return {s["name"]: s["metric"] for s in m.simulators}
+        return {s["name"]: s["metric"] for s in m.description["simulators"]}
     first, *rest = by_result.values()
     if all(metrics == first for metrics in rest):
         return first
@@ -150,22 +146,20 @@ def metrics_of(m: Material) -> dict[str, str]:
     }
 
 
-def sheets_of(m: Material) -> dict[str, str]:
-    """Return the statistics of each simulator that has a data sheet in place of specimens."""
-    pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
-    found = {name: pattern.fullmatch(metric) for name, metric in metrics_of(m).items()}
-    return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
-
-
-def constants_of(description: Mapping[str, Any] | None) -> set[str]:
+def constants_of(description: Mapping[str, Any]) -> set[str]:
     """Return the names of inputs that are numbers."""
-    texts = [s["inputs"] for s in (description or {}).get("simulators", ())]
-    return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
+    inputs = [x for s in description["simulators"] for x in s["inputs"]]
+    return {name for name, _, text in inputs if text.startswith("=")}
+
+
+def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
+    """Return the attributes of a posterior or an optimum."""
+    return dict(estimates_in(result).attrs)
 
 
 def date_of(m: Material) -> str:
     """Return the day of the latest result: of an optimum in memory today; nothing if unknown."""
-    days = [str(m.attrs(label).get("created_at", ""))[:10] for label in m.results]
+    days = [str(attributes_of(r).get("created_at", ""))[:10] for r in m.results.values()]
     if m.live_optima:
         days.append(datetime.now(UTC).isoformat()[:10])
     return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
@@ -173,7 +167,7 @@ def date_of(m: Material) -> str:
 
 def versions_of(m: Material) -> dict[str, str]:
     """Return versions by package, as the results have them."""
-    attrs = [pair for label in m.results for pair in m.attrs(label).items()]
+    attrs = [pair for result in m.results.values() for pair in attributes_of(result).items()]
     names = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy", "python")
     versions = {str(key).removesuffix("_version"): str(value) for key, value in attrs}
     return {name: versions[name] for name in names if name in versions}
@@ -217,17 +211,16 @@ def gather(
     _require_prior({label: identities[label] for label in posteriors}, model)
     _require_tested(validation, tests)
 
-    stored = (from_attributes(_estimates(tree).attrs) for tree in results.values())
-    first = next((text for text in stored if text is not None), None)
-    description = first if model is None else describe(model)
+    stored = (from_attributes(attributes_of(tree)) for tree in results.values())
+    known = filter(None, [describe(model)] if model is not None else stored)
+    description = next(known, {"variables": [], "simulators": []})
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
-    observed, outputs = _observed(model, results)
-    if labels and (description is not None or model is not None):
-        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
-        if description is not None:
-            names |= {str(variable["name"]) for variable in description["variables"]}
-            names |= constants_of(description)
+    observed, sheets = _observed(model, results)
+    if labels and description["variables"]:
+        names = {*validation, *sheets, *observed, *constants_of(description)}
+        names = names.union(*(simulator.outputs.names for simulator in observed.values()))
+        names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
@@ -239,7 +232,7 @@ def gather(
         needs_model = not {"optimum", "calibration"} & set(result.children)
         is_possible = own_model is not None or not needs_model
         diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
-    material = Material(
+    return Material(
         model=model,
         description=description,
         optima=optima,
@@ -248,16 +241,12 @@ def gather(
         tests=tests,
         comparison=comparison,
         observed=observed,
-        outputs=outputs,
+        sheets=sheets,
         diagnoses=diagnoses,
         decisions=decisions,
         validation=dict(validation),
         labels=dict(labels or {}),
     )
-    # Statistics of a data sheet are no measured responses
-    sheets = sheets_of(material)
-    sampled = {name: y for name, y in observed.items() if name not in sheets}
-    return replace(material, observed=sampled, sheets=sheets)
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:
@@ -378,34 +367,24 @@ def _require_tested(
 # -- derived results -------------------------------------------------------------------------
 
 
-def _estimates(tree: xr.DataTree) -> xr.DataTree:
-    """Return the group of a result with its estimates."""
-    return tree.children["posterior" if "posterior" in tree else "optimum"]
-
-
 def _observed(
-    model: pm.Model | None, results: dict[str, xr.DataTree]
-) -> tuple[dict[str, Floats], dict[str, Outputs]]:
-    """Return the measured responses, and their columns, by simulator."""
+    model: pm.Model | None, results: Mapping[str, xr.DataTree]
+) -> tuple[dict[str, Observed], dict[str, str]]:
+    """Return the measured responses, and the statistics of data sheets, by simulator."""
+    observed, sheets = {}, {}
     if model is not None:
-        simulators = population_simulators(model)
-        observed = {simulator.name: simulator.observed for simulator in simulators}
-        return observed, {simulator.name: simulator.outputs for simulator in simulators}
-    observed, outputs = {}, {}
-    tree = next((tree for tree in results.values() if "observed_data" in tree), None)
-    for key, values in {} if tree is None else tree["observed_data"].data_vars.items():
-        name = str(key)
-        units = values.attrs.get("units")
-        if values.ndim != 2:
-            observed[name] = np.ravel(values.values)
-            outputs[name] = SINGLE_OUTPUT
-            if isinstance(units, str) and units:
-                outputs[name] = Outputs(units=(units,))
-            continue
-        if units is not None and not isinstance(units, str):  # of each output
-            values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
-        observed[name], outputs[name] = read_observed(name, values)
-    return observed, outputs
+        for simulator in population_simulators(model):
+            observed[simulator.name] = Observed(simulator.observed, simulator.outputs)
+            sheets[simulator.name] = data_sheet(simulator.metric)
+    else:
+        groups = [tree["observed_data"] for tree in results.values() if "observed_data" in tree]
+        for name, array in groups[0].data_vars.items() if groups else ():
+            # A tool other than this package may store arrays with more axes.
+            values = array if array.ndim in (1, 2) else np.ravel(array)
+            observed[str(name)] = Observed(*read_observed(str(name), values.astype(np.float64)))
+            sheets[str(name)] = str(array.attrs.get("data_sheet", ""))
+    sheets = {name: sheet for name, sheet in sheets.items() if sheet}
+    return {name: y for name, y in observed.items() if name not in sheets}, sheets
 
 
 def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import View
+
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
 # Powers of ten that are written out, others have an exponent: the lower end is that of Python's
@@ -204,6 +206,12 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
             if any(value not in (None, "") for value in column)
         }
     )
+
+
+def view_table(shown: View) -> Any:
+    """Return the rows of what a reader sees of a result, as a table."""
+    pandas: Any = import_module("pandas")
+    return pandas.DataFrame(shown.rows, columns=shown.header)
 
 
 def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -16,7 +15,7 @@ from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
-    optimum_elements,
+    element_name,
     readable_elements,
     single_elements,
     split_elements,
@@ -33,7 +32,7 @@ from prbayes.reports.assessment import (
     decision,
     next_steps,
     population_in_units,
-    shown_outputs,
+    shown_columns,
     validation_pairs,
     verdict,
 )
@@ -41,6 +40,8 @@ from prbayes.reports.figures import pictures_of
 from prbayes.reports.material import (
     CALLED,
     Material,
+    Observed,
+    attributes_of,
     kind_of_decision,
     metrics_of,
     versions_of,
@@ -51,14 +52,14 @@ from prbayes.reports.numbers import (
     correlation_table,
     enumerated,
     number,
-    places,
     plus_minus,
     rows_table,
     sample_sd,
     span,
+    view_table,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT
+from prbayes.results.compare import Comparison, estimates_of
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import DIRECTION
 
@@ -82,7 +83,7 @@ def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
 
 def model(m: Material) -> list[Section]:
     """Return the variables of the model, its simulators, and how responses are compared."""
-    if m.description is None:
+    if not m.description["variables"]:
         return []
     variables = [
         {
@@ -102,10 +103,13 @@ def model(m: Material) -> list[Section]:
         {
             "simulator": s["name"],
             "response": s["response"],
-            "inputs": _labelled_inputs(s["inputs"], m.labels),
-            "runs": _runs(s["propagation"]),
+            "inputs": ", ".join(
+                f"{m.labels.get(name, name + unit)} {text}".strip()
+                for name, unit, text in s["inputs"]
+            ),
+            "runs": s["runs"],
         }
-        for s in m.simulators
+        for s in m.description["simulators"]
     ]
     if simulators:
         about = "A simulator computes the response of a specimen from its inputs."
@@ -113,29 +117,9 @@ def model(m: Material) -> list[Section]:
     return sections
 
 
-def _labelled_inputs(text: str, labels: Mapping[str, str]) -> str:
-    """Return the inputs of a simulator with the labels of their names, in place of units."""
-
-    def labelled_name(found: re.Match[str]) -> str:
-        comma, name, unit = found.groups(default="")
-        return comma + labels.get(name, name + unit)
-
-    return re.sub(r"(^|, )(\w+)( \(.*?\))?(?= [=~] )", labelled_name, text)
-
-
-def _runs(propagation: str) -> str:
-    """Return in words how the population of inputs becomes one of responses."""
-    size = re.match(r"(Reweighted|Resimulated|Fresh)\(n=(\d+)", propagation)
-    if size is None:
-        return propagation.partition("(")[0]
-    if size[1] == "Reweighted":
-        return f"{size[2]} runs, once; weighted for each population"
-    return f"{size[2]} runs for each population"
-
-
 def comparison_of_responses(m: Material) -> list[Section]:
     """Return how measured and simulated responses are compared."""
-    if not (m.calibrations or m.simulators):
+    if not (m.calibrations or m.description["simulators"]):
         return []
     labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
     about = (
@@ -264,9 +248,8 @@ def optima(m: Material) -> list[Section]:
     """Return a section for each optimum."""
     sections = []
     for label, tree in m.optima.items():
-        names = readable_elements(
-            optimum_elements(tree["optimum"].data_vars, tree["stderr"].data_vars)
-        )
+        estimates, elements = estimates_of(tree)
+        names = readable_elements(elements)
         attrs = tree["optimum"].attrs
         ended = "converged" if attrs.get("converged") else "did not converge"
         evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
@@ -289,11 +272,10 @@ def optima(m: Material) -> list[Section]:
             else "Standard errors are those of the estimator over repeated sets of as many "
             "specimens."
         )
-        point = single_elements(tree["optimum"].data_vars)
-        stderr = single_elements(tree["stderr"].data_vars)
         rows = []
         for name in names:
-            estimate, error = alike((point[name], stderr[name]), stderr[name])
+            value, stderr, *_ = estimates[name]
+            estimate, error = alike((value, stderr), stderr)
             rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
         title = _titled("Optimum", label, m.optima)
         sections.append(Section(title, text, rows_table(rows), level=3))
@@ -345,7 +327,7 @@ def posteriors(m: Material) -> list[Section]:
         values = split_elements(draws)
         names = readable_elements(table_elements(draws))
         title = _titled("Posterior", label, m.posteriors)
-        table = rows_table(_posterior_rows(tree, list(values), names, m.prob))
+        table = rows_table(_posterior_rows(tree, names, m.prob))
         sections.append(Section(title, text, table, level=3))
         varying = [name for name in names if np.ptp(values[name]) > 0]
         if 2 <= len(varying) <= 8:  # more do not fit on a page
@@ -356,24 +338,21 @@ def posteriors(m: Material) -> list[Section]:
     return sections
 
 
-def _posterior_rows(
-    tree: xr.DataTree, elements: list[str], names: Sequence[str], prob: float
-) -> list[dict[str, Any]]:
+def _posterior_rows(tree: xr.DataTree, names: Sequence[str], prob: float) -> list[dict[str, Any]]:
+    """Return estimates and diagnostics of the draws of each variable."""
     arviz: Any = import_module("arviz")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
-        table = arviz.summary(tree, kind="all", ci_kind="eti", ci_prob=prob, round_to="none")
-    bounds = [key for key in table.columns if key.startswith("eti")]
+        table = arviz.summary(tree, kind="diagnostics", round_to="none")
+    estimates, _ = estimates_of(tree, prob)
     rows = []
     # ArviZ has the same elements in the same order, with names of its own.
-    for name, (_, values) in zip(elements, table.iterrows(), strict=True):
+    for (name, values), (_, checks) in zip(estimates.items(), table.iterrows(), strict=True):
         if name not in names:
             continue
-        in_units = [values[k] for k in ("mean", "sd", *bounds)]
-        mean, sd, lower, upper = alike(in_units, float(values["sd"]))
+        mean, sd, lower, upper = alike(values, values[1])
         bulk, tail, rhat, mcse = (
-            float(values[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
+            float(checks[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
         )
-        decimals = places(mcse, 2)
         rows.append(
             {
                 "variable": name,
@@ -384,7 +363,7 @@ def _posterior_rows(
                 "ESS, bulk": f"{bulk:.0f}" if math.isfinite(bulk) else NOTHING,
                 "ESS, tail": f"{tail:.0f}" if math.isfinite(tail) else NOTHING,
                 "R-hat": NOTHING if math.isnan(rhat) else f"{rhat:.3f}",
-                "error of mean": number(mcse) if decimals is None else f"{mcse:.{decimals}f}",
+                "error of mean": alike([mcse], mcse, 2)[0],
             }
         )
     return rows
@@ -394,44 +373,17 @@ def comparison(m: Material) -> list[Section]:
     """Return the results side by side."""
     if m.comparison is None:
         return []
-    table = m.comparison
-    labels = table["result"].values.tolist()
-    rows = []
-    for name in table["hyperparameter"].values.tolist():
-        for label in labels:
-            cell = table.sel(hyperparameter=name, result=label)
-            values = [float(cell[key]) for key in ("estimate", "sd", "lower", "upper")]
-            estimate, sd, lower, upper = alike(values, values[1])
-            shift = float(cell["shift"])
-            rows.append(
-                {
-                    "hyperparameter": name,
-                    "result": label,
-                    "estimate": estimate,
-                    "sd": sd,
-                    # The comparison has intervals of this probability alone
-                    f"{INTERVAL:.0%} from": lower if m.prob == INTERVAL else "",
-                    "to": upper if m.prob == INTERVAL else "",
-                    "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
-                }
-            )
-    about = (
-        f"The shift is the distance from the estimate of {labels[0]}, "
-        "in standard deviations of the result in the row."
-    )
-    sections = [Section("Comparison of results", about, rows_table(rows), level=3)]
-    scores = [
-        {"under the metric": str(key)} | dict(zip(labels, values.values.tolist(), strict=True))
-        for key, values in table.data_vars.items()
-        if values.dims == ("result",) and key not in ("n_responses", "seconds")
+    table = m.comparison  # of a file, if it was read from one
+    shown = Comparison(table.data_vars, coords=table.coords, attrs=table.attrs).to_view()
+    text = [
+        f"The shift is the distance from the estimate of {table['result'].values[0]}, in standard "
+        "deviations of the result in the row.",
+        *shown.sentences,
     ]
-    if scores:
-        about = (
-            "Discrepancy of the population at each estimate, under each metric, "
-            "whichever metric it was calibrated with."
-        )
-        sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
-    return sections
+    columns = view_table(shown)
+    if m.prob != INTERVAL:  # all intervals of a report have the same probability
+        columns = columns.drop(columns=f"{INTERVAL:.0%} interval")
+    return [Section("Comparison of results", text, columns, level=3)]
 
 
 # -- appendix: diagnostics -------------------------------------------------------------------
@@ -601,27 +553,26 @@ def measured_values(m: Material) -> list[Section]:
     about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
     values = [about]
     for name, y in m.observed.items():
-        if y.ndim > 1 and y.shape[1] > 1:
-            sections.append(_correlations(name, m))
-        if y.size > 300:
-            values.append(f"{name}: {y.size} values, which are too many to print.")
+        columns = y.columns()
+        if len(columns) > 1:
+            sections.append(_correlations(name, y))
+        if y.values.size > 300:
+            values.append(f"{name}: {y.values.size} values, which are too many to print.")
             continue
-        outputs = m.outputs.get(name, SINGLE_OUTPUT)
-        names = [name] if y.ndim == 1 else [f"{name}[{output}]" for output in outputs.names]
-        for element, column in zip(names, np.atleast_2d(y.T), strict=True):
+        for output, _, column in columns:
             texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
+            element = element_name(name, [output] if output else [])
             values.append(f"{element}: {', '.join(texts)}.")
     return [*sections, Section("Measured values", values, level=3)]
 
 
-def _correlations(name: str, m: Material) -> Section:
+def _correlations(name: str, y: Observed) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
     pandas: Any = import_module("pandas")
-    columns = shown_outputs(m, name)
-    y = np.column_stack([column for *_, column in columns])
-    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
+    columns = {output: np.where(np.isfinite(x), x, np.nan) for output, _, x in shown_columns(y)}
+    r = pandas.DataFrame(columns).corr(min_periods=3).values
     about = "Each of the specimens that have both outputs, without those that failed."
-    table = correlation_table([output for output, *_ in columns], r, 3)
+    table = correlation_table(list(columns), r, 3)
     return Section(f"Correlations of {name}", about, table, level=3)
 
 
@@ -630,8 +581,8 @@ def origin(m: Material) -> list[Section]:
     if not m.results:
         return []
     costs: list[tuple[str, str, Mapping[Any, Any], str]] = []
-    for label in m.results:
-        attrs = m.attrs(label)
+    for label, result in m.results.items():
+        attrs = attributes_of(result)
         by = str(attrs.get("sampler", "minimize" if label in m.optima else ""))
         costs.append((label, by, attrs, "n_responses"))
     for condition, (_, predicted) in m.validation.items():
@@ -650,7 +601,7 @@ def origin(m: Material) -> list[Section]:
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
     text = ["Responses are runs for one specimen; those of a common design are counted in each."]
     text += [f"{name}: {metric}." for name, metric in metrics_of(m).items()]
-    text += [f"{s['name']}: {s['propagation']}." for s in m.simulators]
+    text += [f"{s['name']}: {s['propagation']}." for s in m.description["simulators"]]
     packages = ", ".join(f"{name} {version}" for name, version in versions_of(m).items())
     text += [f"Computed with {packages}."] if packages else []
     return [Section("Cost and origin", text, rows_table(rows), level=3)]

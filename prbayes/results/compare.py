@@ -22,7 +22,6 @@ from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.multivariate import Joint
-from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.locking import locked
@@ -133,8 +132,9 @@ def compare(
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates have those of the model.
     naming = optima[0].model if model is None and optima else model
-    read = [_estimates(label, result, naming) for label, result in results.items()]
-    columns, shown, costs = zip(*read, strict=True)
+    trees = [_tree_of(label, result) for label, result in results.items()]
+    read = [estimates_of(tree, model=naming) for tree in trees]
+    columns, shown = zip(*read, strict=True)
     in_all = set.intersection(*map(set, columns))
     shared = [name for name in columns[0] if name in in_all]
     left_out = [name for column in columns for name in column if name not in in_all]
@@ -145,7 +145,7 @@ def compare(
     if model is not None:
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         shared = [name for name in shared if variable_of(name, variables) in variables]
-    in_table = set.intersection(*shown)
+    in_table = set.intersection(*map(set, shown))
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
         got = {label: list(column) for label, column in zip(results, columns, strict=True)}
@@ -164,8 +164,9 @@ def compare(
     dims = ["result", "hyperparameter"]
     data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_ESTIMATE)}
     data["shift"] = (dims, shift)
-    for i, key in enumerate(COSTS):
-        data[key] = ("result", [cost[i] for cost in costs])
+    for key in COSTS:
+        costs = [float(estimates_in(tree).attrs.get(key, np.nan)) for tree in trees]
+        data[key] = ("result", costs)
     if model is not None and (simulators(model) or specimen_likelihoods(model)):
         # The designs of a model cover its own optimum.
         is_covered = any(optimum.model is model for optimum in optima)
@@ -200,50 +201,58 @@ class Comparison(Table):
             for label in self["result"].values:
                 row = self.sel(hyperparameter=name, result=label)
                 estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
-                rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}"])
+                shift = f"{float(row['shift']) + 0.0:.2f}"  # without the sign of -0.0
+                rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}", shift])
         sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
         for key, scores in self.data_vars.items():
             if scores.dims == ("result",) and key not in COSTS:
                 items = scores.to_series().items()
                 listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
                 sentences.append(f"Discrepancy by {key}: {listed}.")
-        header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval"]
+        header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval", "shift in sd"]
         return View("Comparison", header, rows, sentences)
 
 
-def _estimates(
-    label: str, result: Any, naming: pm.Model | None
-) -> tuple[dict[str, tuple[float, ...]], set[str], list[float]]:
-    """Return estimate, sd and interval of each element, elements that a table shows, and costs."""
-    groups = result.children if isinstance(result, xr.DataTree) else {}
-    estimates: dict[str, tuple[float, ...]] = {}
-    if "posterior" in groups:
-        attrs = result["posterior"].attrs
-        draws = stacked_draws(result["posterior"], model=naming)
-        tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
-        for element, x in split_elements(draws).items():
-            estimates[element] = (x.mean(), x.std(ddof=1), *np.quantile(x, tails))
-        shown = table_elements(draws)
-    else:
-        if isinstance(result, Optimum):
-            attrs = {"n_responses": result.n_responses, "seconds": result.search.seconds}
-            point = labelled(result.evaluator, result.point, {}).data_vars
-            stderr = labelled(result.evaluator, result.stderr, {}).data_vars
-        elif "optimum" in groups:
-            attrs = result["optimum"].attrs
-            point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
-        else:
-            raise TypeError(
-                f"compare: results: {label}: got {type(result).__name__}, "
-                "expected an Optimum or a DataTree with a posterior group"
-            )
-        z = ndtri((1 + INTERVAL) / 2)
-        errors = single_elements(stderr)
-        for element, value in single_elements(point).items():
-            sd = errors[element]
-            estimates[element] = (value, sd, value - z * sd, value + z * sd)
-        shown = optimum_elements(point, stderr)
-    return estimates, set(shown), [float(attrs.get(key, np.nan)) for key in COSTS]
+def _tree_of(label: str, result: Any) -> xr.DataTree:
+    """Return a result as in a file, or raise if it has no estimates."""
+    tree = result.to_datatree() if isinstance(result, Optimum) else result
+    if not isinstance(tree, xr.DataTree) or not {"posterior", "optimum"} & set(tree.children):
+        raise TypeError(
+            f"compare: results: {label}: got {type(result).__name__}, "
+            "expected an Optimum or a DataTree with a posterior group"
+        )
+    return tree
+
+
+def estimates_in(result: xr.DataTree) -> xr.DataTree:
+    """Return the group of a result with its estimates."""
+    return result.children["posterior" if "posterior" in result else "optimum"]
+
+
+def estimates_of(
+    result: xr.DataTree, prob: float = INTERVAL, model: pm.Model | None = None
+) -> tuple[dict[str, tuple[float, ...]], list[str]]:
+    """Return estimate, sd and interval of each element, and the elements that a table shows.
+
+    The interval of an optimum is normal, that of draws has equal tails. Draws without coordinates
+    take those of the model.
+    """
+    levels = (1 - prob) / 2, (1 + prob) / 2
+    if "posterior" in result:
+        draws = stacked_draws(result["posterior"], model=model)
+        estimates = {
+            name: (x.mean(), x.std(ddof=1), *np.quantile(x, levels))
+            for name, x in split_elements(draws).items()
+        }
+        return estimates, table_elements(draws)
+    point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
+    errors = single_elements(stderr)
+    z = ndtri(levels)
+    estimates = {
+        name: (value, errors[name], *(value + z * errors[name]))
+        for name, value in single_elements(point).items()
+    }
+    return estimates, optimum_elements(point, stderr)
 
 
 def _scores(
