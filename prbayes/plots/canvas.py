@@ -104,6 +104,11 @@ def ink() -> str:
     return str(mpl.rcParams["text.color"])
 
 
+def fill(axis: Axes, x: Any, low: Any, high: Any = 0.0, **look: Any) -> None:
+    """Fill the area between two curves, in pale blue by default."""
+    axis.fill_between(x, low, high, **{"color": BLUE, "alpha": 0.25, "linewidth": 0} | look)
+
+
 def finish(figure: Figure) -> Figure:
     """Draw one legend below all panels, with as many columns as fit and rows of equal length."""
     handles: dict[str, Any] = {}

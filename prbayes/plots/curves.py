@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -63,17 +65,12 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
 
 
 def bounded_density(draws: Floats, grid: Floats) -> Floats:
-    """Return the density of draws, (n,), mirrored at both ends, on a grid; NaN if equal."""
-    weights = np.full(draws.size, 1 / draws.size)
-    bandwidth = silverman(draws, weights)
-    if not bandwidth > 0:
+    """Return ArviZ's kernel density of draws, (n,), on a grid; NaN if all draws are equal."""
+    if not np.ptp(draws) > 0:
         return np.full(grid.shape, np.nan)
-    # Mirrored draws have weights of their own: the area within the range is one.
-    low = float(draws.min())
-    high = float(draws.max())
-    mirrored = np.concatenate([draws, 2 * low - draws, 2 * high - draws])
-    density = densities(mirrored, np.tile(weights, 3), grid, bandwidth)
-    return np.where((grid >= low) & (grid <= high), density, 0.0)
+    stats: Any = import_module("arviz_stats")  # heavy, and only needed for pictures
+    x, density, _ = stats.base.array_stats.kde(draws)
+    return np.interp(grid, x, density, left=0.0, right=0.0)
 
 
 def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:

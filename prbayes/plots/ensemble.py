@@ -17,7 +17,7 @@ from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
-from prbayes.plots.canvas import BLUE
+from prbayes.plots.canvas import BLUE, fill
 from prbayes.plots.curves import pointwise_band
 from prbayes.propagation.base import DesignError
 from prbayes.response.inputs import model_on_context
@@ -175,9 +175,7 @@ def draw_calibrated(
         sides = pointwise_band(spread, prob)
         top = max(top, float(sides[1].max()))
         text = f"{percentage(prob)} band of the {ensemble.spread}"
-        axis.fill_between(
-            grid, *sides, color=BLUE, alpha=alpha, linewidth=0, label=text, gid="band"
-        )
+        fill(axis, grid, *sides, alpha=alpha, label=text, gid="band")
     text = f"{name}: {ensemble.label}"
     axis.plot(grid, middle, color=BLUE, linewidth=2.2, label=text, gid="after")
     return top

@@ -11,11 +11,12 @@ import xarray as xr
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
-from prbayes.model.parameters import element_name
+from prbayes.model.parameters import split_elements, stacked_draws
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
     check_options,
+    fill,
     finish,
     ink,
     named,
@@ -147,9 +148,7 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
     values = replicates.values.reshape(-1, x.size)
     low, median, high = np.nanquantile(values, [tail, 0.5, 1 - tail], axis=0)
     text = f"{percentage(prob)} of replicates"
-    axis.fill_between(
-        x, low, high, color=GREY, alpha=0.25, linewidth=0, label=text, gid="replicates"
-    )
+    fill(axis, x, low, high, color=GREY, label=text, gid="replicates")
     axis.plot(x, median, color=GREY, label="their median", gid="median")
     places = np.broadcast_to(x, y.shape)
     axis.scatter(places, y, 12, color=ink(), label="measured", gid="observed", zorder=3)
@@ -157,14 +156,12 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
 
 def _elements(data: xr.Dataset) -> dict[str, Floats]:
     """Return values of each element by name, (P, n); P = 1 without draws."""
-    elements = {}
-    for name, array in data.items():
-        values = array.values
-        values = values.reshape(-1, *values.shape[2:]) if "chain" in array.dims else values[None]
-        axes = [array[dim].values for dim in array.dims[array.ndim - values.ndim + 2 :]]
-        for index in np.ndindex(values.shape[2:]):
-            labels = [axis[i] for axis, i in zip(axes, index, strict=True)]
-            elements[element_name(str(name), labels)] = values[:, :, *index]
+    draws = data if "chain" in data.dims else data.expand_dims(("chain", "draw"))
+    elements: dict[str, Floats] = {}
+    for name, values in stacked_draws(draws).items():
+        columns = values.values.reshape(*values.shape[:2], -1)
+        names = split_elements({name: values[0]})
+        elements |= zip(names, np.moveaxis(columns, -1, 0), strict=True)
     return elements
 
 

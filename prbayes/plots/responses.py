@@ -17,11 +17,11 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
-    BLUE,
     GREY,
     VERMILION,
     Limits,
     check_options,
+    fill,
     finish,
     ink,
     named,
@@ -221,8 +221,8 @@ class _Drawing:
         else:
             density = measured_density(observed, weights, grid)
             top = float(density.max())
-            look: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
-            axis.fill_between(grid, density, **look, label="measured, smoothed", gid="measured")
+            text = "measured, smoothed"
+            fill(axis, grid, density, color=GREY, alpha=0.3, label=text, gid="measured")
             finite = observed[np.isfinite(observed)]
             axis.scatter(finite, 0 * finite, 60, label="measured", **marks)
         initial = np.zeros(1)
@@ -281,8 +281,7 @@ class _Drawing:
         lines = np.clip(lines, low - room, high + room)
         lower, upper = (middle_of(lines[:, i], self.ensemble) for i in (0, 2))
         text = f"{INTERVAL:.0%} of the calibrated population"
-        look: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
-        axis.fill_between(x, lower, upper, **look, label=text, gid="population")
+        fill(axis, x, lower, upper, label=text, gid="population")
         line = _joined(x, measured)
         axis.plot(*line, color=GREY, linewidth=0.5, label="measured", gid="measured")
         if earlier is not None:

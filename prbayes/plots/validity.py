@@ -15,6 +15,7 @@ from prbayes.plots.canvas import (
     PALE,
     VERMILION,
     check_options,
+    fill,
     finish,
     ink,
     panels,
@@ -95,8 +96,8 @@ def plot_validity(
         else:
             values = np.abs(2 * test.u_values - 1) if test.folded else test.u_values
             ecdf = _ecdf([values])
-            axis.fill_between(*_envelope(test), color=PALE, alpha=0.4, linewidth=0, gid="envelope")
-            axis.fill_between(*_between(*ecdf), color=color, alpha=0.4, linewidth=0, gid="area")
+            fill(axis, *_envelope(test), color=PALE, alpha=0.4, gid="envelope")
+            fill(axis, *_between(*ecdf), color=color, alpha=0.4, gid="area")
             axis.plot(*ecdf, color=color, gid="ecdf")
             x = "u-value"
             y = f"share of {values.size} values"
