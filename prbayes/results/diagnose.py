@@ -459,21 +459,15 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
     variables = posterior.to_dataset()
     if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
-    modes: tuple[Finding, ...] = ()
-    if by_specimen:
-        columns = {}
-        for name, values in variables.data_vars.items():
-            table = values.transpose("chain", "draw", ...).values
-            flat = table.reshape(*table.shape[:2], -1)
-            for j in range(flat.shape[-1]):
-                element = f"{name}[{j}]" if values.ndim > 2 else str(name)
-                columns[element] = flat[..., j]
-        modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
+    elements = split_elements(stacked_draws(variables))
+    sizes = posterior.sizes["chain"], posterior.sizes["draw"]
+    draws = np.stack([x.reshape(sizes) for x in elements.values()], axis=-1)
+    modes = separate_modes(draws, list(elements)) if by_specimen else ()
     findings = list(modes)
     # Chains in different modes have a large R-hat; ArviZ gives NaN for shorter chains.
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
-    findings += [*_repeated_draws(variables), *_particles_stuck(tree)]
+    findings += [*_repeated_draws(draws), *_particles_stuck(tree)]
     return Checked(tuple(findings))
 
 
@@ -515,24 +509,23 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     return {name: elements[name] for name in table_elements(stacked_draws(posterior))}
 
 
-def _repeated_draws(draws: xr.Dataset) -> list[Finding]:
-    """Report chains with hardly any different draws."""
+def _repeated_draws(draws: Floats) -> list[Finding]:
+    """Report chains with hardly any different draws, (chains, draws, d)."""
+    n_draws = draws.shape[1]
     counts = []
-    for chain in range(draws.sizes["chain"]):
-        columns = split_elements(draws.isel(chain=chain).transpose("draw", ...).data_vars)
-        table = np.stack(list(columns.values()), axis=1)
+    for table in draws:
         size = np.abs(table).max(axis=0, initial=0.0)
         # Equal up to thousands of times rounding, far below the width of any posterior.
         digits = np.round(table / np.where(size > 0, size, 1.0) / 1e-12)
         counts.append(len(np.unique(digits, axis=0)))
     # A standard deviation from 50 draws has an error of a tenth.
-    expected = min(50, draws.sizes["draw"] // 2)
+    expected = min(50, n_draws // 2)
     few = [str(chain) for chain, count in enumerate(counts) if count < expected]
     if not few:
         return []
     chains = "chains" if len(few) > 1 else "chain"
     text = (
-        f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
+        f"Of {n_draws} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
         f"expected at least {expected}: few particles, or one, survived, and the width of the "
         "draws is meaningless. Pass more draws, priors nearer to the data, or a larger epsilon."
     )

@@ -15,6 +15,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
+from scipy.special import softmax
 
 from prbayes._finding import Finding, counted
 from prbayes._validate import Floats
@@ -291,20 +292,11 @@ def scored_specimens(
             weights[rows] = np.broadcast_to(log_p, (1, size))[0].reshape(log_a[rows].shape)
         # Points that fill up an array have no weight and any score.
         z = np.where(np.isfinite(z), z, 0.0)
-        result.append((z, _normalised(weights + log_a)))
+        log_weights = np.where(np.isfinite(weights + log_a), weights + log_a, -np.inf)
+        with np.errstate(invalid="ignore"):  # rows of zero weights alone
+            relative = softmax(log_weights, axis=1)
+        result.append((z, np.where(np.isfinite(relative), relative, 1 / log_a.shape[1])))
     return result
-
-
-def _normalised(log_weights: Floats) -> Floats:
-    """Return weights of sum one by row, equal ones where all are zero."""
-    log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
-    largest = log_weights.max(axis=1, keepdims=True)
-    largest = np.where(np.isfinite(largest), largest, 0.0)
-    weights = np.exp(log_weights - largest)
-    total = weights.sum(axis=1, keepdims=True)
-    has_weight = total > 0
-    relative = weights / np.where(has_weight, total, 1.0)
-    return np.where(has_weight, relative, 1 / weights.shape[1])
 
 
 # -- draws -----------------------------------------------------------------------------------
