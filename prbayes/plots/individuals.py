@@ -155,7 +155,7 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
 
 
 def _elements(data: xr.Dataset) -> dict[str, Floats]:
-    """Return values of each element by name, (P, n); P = 1 without draws."""
+    """Return values by the names of elements, (P, n): P draws, or one of data, of n specimens."""
     draws = data if "chain" in data.dims else data.expand_dims(("chain", "draw"))
     elements: dict[str, Floats] = {}
     for name, values in stacked_draws(draws).items():

@@ -14,12 +14,13 @@ from prbayes._validate import share
 from prbayes.plots.canvas import (
     BLUE,
     check_options,
+    counted_title,
     fill,
     finish,
     ink,
-    named,
     panels,
     refuse_labels,
+    with_label,
 )
 from prbayes.plots.curves import (
     GRID_POINTS,
@@ -29,7 +30,6 @@ from prbayes.plots.curves import (
     staircase,
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select
-from prbayes.response.outputs import with_unit
 from prbayes.validation.conditions import comparables
 
 if TYPE_CHECKING:
@@ -118,9 +118,7 @@ def plot_prediction(
         axis.plot(grid, middle, color=BLUE, linewidth=2.2, label="predicted", gid="predicted")
         steps = staircase(measured, np.full(measured.size, 1 / measured.size), *limits)
         axis.plot(*steps, color=ink(), linewidth=1.4, label="measured", gid="measured")
-        failed = np.count_nonzero(np.isinf(measured))
-        title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
-        label = named(name, labels)
-        label = with_unit(label, pair.unit) if label == name else label
+        title = counted_title(measured.size, "measured values", failed=np.isinf(measured).sum())
+        label = with_label(name, pair.unit, labels)
         axis.set(xlabel=label, ylabel="share of specimens", title=title)
     return finish(figure)

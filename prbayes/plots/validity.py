@@ -75,14 +75,14 @@ def plot_validity(
             f"plot_validity: got {got}, expected a ValidityTest from prb.area_test, or several by "
             "name"
         )
-    # The panel of a single test has a name too
+    # The panel of a single test needs a name as its label.
     names = [name or "u" for name in by_name]
     figure, axes = panels(names, size=(4.6, 4.8), pc_kwargs=pc_kwargs)
     for (name, test), axis in zip(by_name.items(), axes.values(), strict=True):
         color = VERMILION if test.rejected else BLUE
         directions = in_directions(test)
         if directions:
-            # Conditions of one output are one line of their own
+            # All conditions with a single output make one more line.
             single = test.u_values[~_is_of_direction(test)]
             lines = [single, *directions] if single.size else directions
             thin: dict[str, Any] = {"color": color, "linewidth": 0.8}
@@ -139,7 +139,7 @@ def _ecdf(samples: Sequence[Floats]) -> Floats:
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     """Return places, and the lower and upper side of the area between an ECDF and the identity."""
-    # Where a step crosses the identity there is a corner too: between two corners of one height
+    # A step that crosses the identity gets a corner there, so that the sides of the area meet.
     crosses = (x[:-1] < y[:-1]) & (x[1:] > y[:-1])
     at = np.flatnonzero(crosses)
     height = y[at]

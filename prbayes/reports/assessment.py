@@ -15,7 +15,7 @@ from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import readable_variables, variable_of
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots.canvas import named
+from prbayes.plots.canvas import named, with_label
 from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material, Observed, kind_of_decision
 from prbayes.reports.numbers import (
@@ -23,17 +23,16 @@ from prbayes.reports.numbers import (
     alike,
     described,
     enumerated,
+    finite_sd,
     in_percent,
     number,
     plus_minus,
     rows_table,
-    sample_sd,
     with_zeros,
 )
 from prbayes.reports.section import Section
 from prbayes.results.compare import estimates_in, estimates_of
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.conditions import Comparable, comparables
 
 # -- page one --------------------------------------------------------------------------------
 
@@ -73,7 +72,7 @@ def verdict(m: Material) -> list[Section]:
 
 
 def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
-    """Return a requirement with its answer; of a model that may not be used it has none."""
+    """Return a requirement and, if the model may be used, its answer."""
     allowed = f"allowed: at most {percentage(table.attrs['requirement'])}"
     if not m.is_usable:
         reason = "the model is rejected" if m.rejected else "solve the problems first"
@@ -90,9 +89,9 @@ def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
 
 
 def _expected(table: xr.Dataset, prob: float) -> str:
-    """Return a probability with its interval, as shares of specimens.
+    """Return a sentence on a probability and its interval, as shares of specimens.
 
-    The interval is called by its probability if that is another than ``prob``.
+    The sentence names the probability of the interval unless it is ``prob``.
     """
     floor = min(1e-5, table.attrs.get("requirement", 1.0) / 10)
     bounds = dict.fromkeys(in_percent(p, floor) for p in np.ravel(table["probability"].values))
@@ -106,7 +105,7 @@ def _tested(m: Material) -> str:
     """Return the number of tested specimens, with their conditions where these have names."""
     labels = {label for test in m.tests.values() for label in test.specimens.tolist()}
     conditions = dict.fromkeys(name for test in m.tests.values() for name in test.of_conditions)
-    # A single condition may only have the name of a function.
+    # The name of a single condition may be that of a function, which readers do not know.
     is_named = len(conditions) > 1 or set(conditions) <= {*m.validation, *m.labels}
     shown = [named(condition, m.labels) for condition in conditions]
     where = f" ({enumerated(shown)})" if is_named and len(shown) <= 4 else ""
@@ -123,7 +122,7 @@ def _data(m: Material) -> str:
         measured = counted(y.values.size, "measured value")
         if y.values.ndim > 1:
             n, outputs = y.values.shape
-            # Of a group the specimens are not known where they have labels.
+            # If specimens have labels, it is unknown how many of them a group has.
             is_labelled = bool(labelled.get(name.partition("[")[0]))
             rows = counted(n, "reading" if is_labelled else "specimen")
             measured = f"{labelled.get(name) or rows} with {counted(outputs, 'output')}"
@@ -132,7 +131,7 @@ def _data(m: Material) -> str:
 
 
 def population_in_units(m: Material) -> list[Section]:
-    """Return moments, quantiles and tolerance bounds of the inputs, by the first result."""
+    """Return moments, quantiles and tolerance bounds of the inputs, from the first result."""
     results: list[Optimum | xr.DataTree] = [*m.posteriors.values(), *m.live_optima.values()]
     result = results[0] if results else None
     if m.model is None or result is None or m.rejected or not population_simulators(m.model):
@@ -148,12 +147,9 @@ def population_in_units(m: Material) -> list[Section]:
         for q in shown.header[1:]
     ]
     columns = {}
-    for (name, *_), (name_with_unit, *texts) in zip(table.rows(), shown.rows, strict=False):
-        label = named(name, m.labels)
-        columns[name_with_unit if label == name else label] = dict(
-            zip(quantities, texts, strict=True)
-        )
-    if len(columns) <= 4:  # a line for each quantity, which fits on a page
+    for (name, unit, _), (_, *texts) in zip(table.rows(), shown.rows, strict=False):
+        columns[with_label(name, unit, m.labels)] = dict(zip(quantities, texts, strict=True))
+    if len(columns) <= 4:  # With a line for each quantity the table fits on a page.
         rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in quantities]
     else:
         rows = [{"input": x} | texts for x, texts in columns.items()]
@@ -202,7 +198,7 @@ def _risk(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
     interval = f"{number(float(table.lower), 2)} to {number(float(table.upper), 2)}"
     return [
         {
-            # The answer first: the end of a wide table is off a phone's screen
+            # The answer is the first column, as the end of a wide table is off a phone's screen.
             "requirement is": answer,
             "probability": number(float(value), 2),
             f"{percentage(table.attrs['prob'])} interval": interval,
@@ -233,7 +229,7 @@ def _indices(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
 
 
 def _plan(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
-    """Return the rows of a plan, the present first."""
+    """Return the rows of a plan, with the present standard deviations first."""
     names = [str(name) for name in table.name.values]
 
     def row(text: str, sd: xr.DataArray) -> dict[str, Any]:
@@ -289,7 +285,7 @@ def next_steps(m: Material) -> list[Section]:
             "values lie beside the predicted ones or scatter more; then correct the simulation, "
             "let another input vary, or calibrate an error of the model."
         )
-    # In directions of several outputs the test of the scatter is a part of the statistic.
+    # For several outputs the statistic contains a test of the scatter.
     elif not any(test.folded or in_directions(test) for test in m.tests.values()):
         steps.append("Test the scatter as well, each of the two tests at half the level.")
     if not m.posteriors:
@@ -330,7 +326,7 @@ def answer(m: Material) -> list[Section]:
         meaning = named(name, m.labels)
         row = {"parameter": name, "meaning": "" if meaning == name else meaning}
         row["estimate"] = texts[0]
-        if np.isinf(sd):  # the data do not identify it
+        if np.isinf(sd):  # The data do not identify the parameter.
             texts[1] = NOTHING
         row["standard deviation" if has_draws else "standard error"] = texts[1]
         if has_draws:
@@ -396,12 +392,12 @@ def shown_columns(y: Observed) -> list[tuple[str, str, Floats]]:
 def agreement(m: Material) -> list[Section]:
     """Return the tests of the calibrated model in words, and their data."""
     rows = []
-    for _, pair in validation_pairs(m):
+    pairs = [pair for tested in m.validation.values() for pair in tested.pairs]
+    for pair in pairs:
         predicted = pair.predicted[~np.isnan(pair.predicted)]
         levels = [0.5, (1 - m.prob) / 2, (1 + m.prob) / 2]
         quantiles = np.quantile(predicted, levels, method="inverted_cdf").tolist()
-        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-        median, lower, upper = alike(quantiles, sd)
+        median, lower, upper = alike(quantiles, finite_sd(pair.measured))
         name = {"condition": named(pair.name, m.labels)}
         interval = {f"{percentage(m.prob)} from": lower, "to": upper}
         rows.append(name | described(pair.measured) | {"predicted median": median} | interval)
@@ -413,7 +409,7 @@ def agreement(m: Material) -> list[Section]:
         text.append(f"Together the tests reject a right model in up to {alpha} of cases.")
     text += [
         f"{row['condition']}: specimens failed, and no predicted one does: the model excludes them."
-        for row, (_, pair) in zip(rows, validation_pairs(m), strict=True)
+        for row, pair in zip(rows, pairs, strict=True)
         if row["failed"] and not np.isposinf(pair.predicted).any()
     ]
     if rows:
@@ -440,12 +436,3 @@ def _in_words(label: str, test: ValidityTest, m: Material) -> str:
         f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right model, {p} of such "
         f"tests differ at least as much; at {percentage(test.alpha)} or less the model is rejected."
     )
-
-
-def validation_pairs(m: Material) -> list[tuple[str, Comparable]]:
-    """Return each condition with measured and predicted values of one output."""
-    return [
-        (condition, pair)
-        for condition, (measured, predicted) in m.validation.items()
-        for pair in comparables({condition: measured}, {condition: predicted}, "Report: validation")
-    ]

@@ -14,7 +14,7 @@ import xarray as xr
 
 from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, texts
+from prbayes._validate import Floats, called, texts, wrong_type
 from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
@@ -34,7 +34,7 @@ from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.conditions import comparables
+from prbayes.validation.conditions import Comparable, comparables
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,20 @@ class Observed:
 
 
 @dataclass(frozen=True, eq=False)
+class Validation:
+    """Responses of specimens under a condition that were not used in the calibration."""
+
+    measured: Any
+    predicted: xr.DataArray
+    pairs: list[Comparable]  # measured and predicted values of each output
+
+
+@dataclass(frozen=True, eq=False)
 class Material:
-    """Results by label; a single one has its kind as label."""
+    """Results by label; a single result has its kind as label."""
 
     model: pm.Model | None
-    # variables and simulators of the model, or of the model in a file; empty lists if unknown
+    # variables and simulators of the model, which a file describes too; empty lists if unknown
     description: dict[str, Any]
     optima: dict[str, xr.DataTree]
     live_optima: dict[str, Optimum]  # optima in memory, which have an evaluator
@@ -67,8 +76,7 @@ class Material:
     sheets: dict[str, str]  # statistics of data sheets, which are no responses, by simulator
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
-    # measured and predicted responses of other specimens, by condition
-    validation: dict[str, tuple[Any, xr.DataArray]]
+    validation: dict[str, Validation]  # responses of other specimens by condition
     labels: Mapping[str, str]  # labels of variables, inputs, simulators and outputs, with units
 
     @property
@@ -129,7 +137,7 @@ class Material:
 
 
 def metrics_of(m: Material) -> dict[str, str]:
-    """Return the metric by simulator; by result as well, where results differ in it."""
+    """Return the metric of each simulator, for each result if results have different metrics."""
     by_result = {}
     for label, table in m.calibrations.items():
         pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
@@ -158,7 +166,7 @@ def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
 
 
 def date_of(m: Material) -> str:
-    """Return the day of the latest result: of an optimum in memory today; nothing if unknown."""
+    """Return the day of the latest result, which is today for an optimum in memory."""
     days = [str(attributes_of(r).get("created_at", ""))[:10] for r in m.results.values()]
     if m.live_optima:
         days.append(datetime.now(UTC).isoformat()[:10])
@@ -166,7 +174,7 @@ def date_of(m: Material) -> str:
 
 
 def versions_of(m: Material) -> dict[str, str]:
-    """Return versions by package, as the results have them."""
+    """Return the versions of packages that the results were computed with."""
     attrs = [pair for result in m.results.values() for pair in attributes_of(result).items()]
     names = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy", "python")
     versions = {str(key).removesuffix("_version"): str(value) for key, value in attrs}
@@ -188,8 +196,8 @@ def gather(
     posteriors = _by_label(posterior, "posterior")
     tests = _by_label(validity, "validity")
     decisions = _by_label(decision, "decision")
-    validation = {} if validation is None else validation
-    _require_kinds(model, optima, posteriors, tests, comparison, decisions, validation, labels)
+    _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
+    validations = _validations({} if validation is None else validation)
     live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
     optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
@@ -204,21 +212,21 @@ def gather(
     identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
-    for label, (_, predicted) in validation.items():
-        identities[f"validation, {label}"] = identity_of_attributes(predicted.attrs)
+    for label, data in validations.items():
+        identities[f"validation, {label}"] = identity_of_attributes(data.predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
-    _require_tested(validation, tests)
+    _require_tested(validations, tests)
 
     stored = (from_attributes(attributes_of(tree)) for tree in results.values())
-    known = filter(None, [describe(model)] if model is not None else stored)
-    description = next(known, {"variables": [], "simulators": []})
+    known = filter(None, stored if model is None else [describe(model)])
+    description: dict[str, Any] = next(known, {"variables": [], "simulators": []})
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)
     if labels and description["variables"]:
-        names = {*validation, *sheets, *observed, *constants_of(description)}
+        names = {*validations, *sheets, *observed, *constants_of(description)}
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
         names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
@@ -244,7 +252,7 @@ def gather(
         sheets=sheets,
         diagnoses=diagnoses,
         decisions=decisions,
-        validation=dict(validation),
+        validation=validations,
         labels=dict(labels or {}),
     )
 
@@ -267,34 +275,20 @@ def _require_kinds(
     tests: dict[str, Any],
     comparison: Any,
     decisions: dict[str, Any],
-    validation: Any,
     labels: Any,
 ) -> None:
     """Raise if an argument is of another kind."""
     for table in decisions.values():
         if kind_of_decision(table) is None:
-            raise TypeError(
-                f"Report: decision: got {type(table).__name__}, expected the Dataset of "
-                "prb.exceedance, prb.sensitivity or prb.plan, or several by name"
+            expected = (
+                "the Dataset of prb.exceedance, prb.sensitivity or prb.plan, or several by name"
             )
+            raise wrong_type(table, "Report: decision", expected)
     if model is not None and not isinstance(model, pm.Model):
-        raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
+        raise wrong_type(model, "Report: model", "a pm.Model")
     is_comparison = isinstance(comparison, xr.Dataset) and "estimate" in comparison
     if comparison is not None and not is_comparison:
-        raise TypeError(
-            f"Report: comparison: got {type(comparison).__name__}, expected the Dataset of "
-            "prb.compare"
-        )
-    expected = (
-        "expected by condition the measured responses and their prediction, such as "
-        '{"80 000 cycles": (lengths, prb.predict(...))}'
-    )
-    if not isinstance(validation, Mapping):
-        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
-    for condition, pair in validation.items():
-        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
-            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
-        comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
+        raise wrong_type(comparison, "Report: comparison", "the Dataset of prb.compare")
     if labels is not None:
         texts(labels, "Report: labels")
     names = sorted(set(optima) & set(posteriors))
@@ -304,20 +298,33 @@ def _require_kinds(
         )
     for label, test in tests.items():
         if not isinstance(test, ValidityTest):
-            raise TypeError(
-                f"Report: {label}: got {type(test).__name__}, expected a ValidityTest from "
-                "prb.area_test"
-            )
+            raise wrong_type(test, f"Report: {label}", "a ValidityTest from prb.area_test")
     for label, tree in posteriors.items():
         _require_group(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
 
 
+def _validations(validation: Any) -> dict[str, Validation]:
+    """Return the responses of a test by condition, or raise if an argument is no such pair."""
+    expected = (
+        "expected by condition the measured responses and their prediction, such as "
+        '{"80 000 cycles": (lengths, prb.predict(...))}'
+    )
+    if not isinstance(validation, Mapping):
+        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
+    validations = {}
+    for condition, pair in validation.items():
+        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
+            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
+        measured, predicted = pair
+        pairs = comparables({condition: measured}, {condition: predicted}, "Report: validation")
+        validations[condition] = Validation(measured, predicted, pairs)
+    return validations
+
+
 def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
-        raise TypeError(
-            f"Report: {label}: got {type(tree).__name__}, "
-            f"expected a DataTree with the group {group}, from {origin}"
-        )
+        expected = f"a DataTree with the group {group}, from {origin}"
+        raise wrong_type(tree, f"Report: {label}", expected)
     variables = tree[group].data_vars.items()
     lacking = [str(name) for name, values in variables if not set(dims) <= set(values.dims)]
     if lacking:
@@ -328,7 +335,7 @@ def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], ori
 
 
 def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
-    """Raise if no posterior is under the prior of the model, which the report prints."""
+    """Raise if all posteriors have other priors than the model, whose priors the report prints."""
     if model is None or not population_simulators(model):
         return
     expected = identity_of(model)
@@ -339,17 +346,17 @@ def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | 
 
 
 def _require_tested(
-    validation: Mapping[str, tuple[Any, xr.DataArray]], tests: Mapping[str, ValidityTest]
+    validation: Mapping[str, Validation], tests: Mapping[str, ValidityTest]
 ) -> None:
-    """Raise if validation data are not those of a test, where there are tests."""
+    """Raise if there are tests, and validation data are not those of a test."""
     tested: list[Floats] = []
     for test in tests.values():
         tested.append(test.u_values)
         tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]
-    for condition, (measured, predicted) in validation.items():
-        u = u_values({condition: measured}, {condition: predicted})
-        # Up to rounding and ties, in their order: rounded data change half of the values by far
-        # less than .02; other data are .3 apart on average.
+    for condition, data in validation.items():
+        u = u_values({condition: data.measured}, {condition: data.predicted})
+        # The data of the test may have been rounded, which changes half of the u-values by far less
+        # than .02. The u-values of other data are .3 apart on average.
         distances = [
             np.median(np.abs(values - tested_u))
             for values in (u, np.abs(2 * u - 1))
@@ -388,7 +395,7 @@ def _observed(
 
 
 def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
-    """Return the model for the diagnosis of a saved result; None if its metric or prior differs."""
+    """Return the model for diagnosing a saved result, or None if metric or priors differ."""
     identity = identity_in(result)
     if model is None or identity is None:
         return model
@@ -398,14 +405,14 @@ def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
 # -- schema of results in files --------------------------------------------------------------
 
 
-# Variables that identify a table of a decision, and the function that returns it.
+# variables that identify a table of a decision, and functions that return the tables
 _TABLES = {
     "risk": {"probability", "by_draw", "error"},
     "sensitivity": {"first", "total", "derivative"},
     "plan": {"sd", "now"},
 }
 CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
-# Variables and attributes that a report reads.
+# variables and attributes that a report reads
 _OF_DECISION = {
     "risk": ("lower", "upper", "limit", "below", "prob"),
     "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
@@ -419,7 +426,7 @@ _OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
 
 
 def kind_of_decision(table: Any) -> str | None:
-    """Return the kind of a table of a decision; None for anything else."""
+    """Return the kind of a table of a decision, or None if it is no such table."""
     if isinstance(table, xr.Dataset):
         for kind, variables in _TABLES.items():
             if variables <= set(table.data_vars):
@@ -428,7 +435,7 @@ def kind_of_decision(table: Any) -> str | None:
 
 
 def complaints(tree: xr.DataTree) -> Iterator[str]:
-    """Yield errors of a posterior, an optimum, a test of validity or a table: got, expected."""
+    """Yield what is wrong with the contents of a file: posterior, optimum, test or decision."""
     groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
     if "posterior" in groups or "optimum" in groups:
         yield from _of_estimates(groups)
@@ -457,7 +464,7 @@ def complaints(tree: xr.DataTree) -> Iterator[str]:
 
 
 def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    """Yield errors of a posterior, or else of an optimum."""
+    """Yield what is wrong with a posterior or an optimum."""
     kind = "posterior" if "posterior" in groups else "optimum"
     variables = groups[kind].data_vars
     yield from _not_numbers(kind, variables)

@@ -33,7 +33,6 @@ from prbayes.reports.assessment import (
     next_steps,
     population_in_units,
     shown_columns,
-    validation_pairs,
     verdict,
 )
 from prbayes.reports.figures import pictures_of
@@ -51,10 +50,10 @@ from prbayes.reports.numbers import (
     alike,
     correlation_table,
     enumerated,
+    finite_sd,
     number,
     plus_minus,
     rows_table,
-    sample_sd,
     span,
     view_table,
 )
@@ -65,7 +64,7 @@ from prbayes.validation.conditions import DIRECTION
 
 
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
-    """Return the sections that the material allows, with or without pictures."""
+    """Return the sections for which there are results, with or without pictures."""
     drawn = pictures_of(m) if pictures else {}
     sections: list[Section] = []
     for title, parts in _CHAPTERS.items():
@@ -146,7 +145,7 @@ def comparison_of_responses(m: Material) -> list[Section]:
 
 def diagnostics(m: Material) -> list[Section]:
     """Return the problems of the results in sentences, and remarks."""
-    problems: dict[str, list[str]] = {}  # labels of the results by sentence
+    problems: dict[str, list[str]] = {}  # labels of results by sentence
     remarks: dict[str, list[str]] = {}
     for label, diagnosis in m.diagnoses.items():
         if diagnosis is None:
@@ -179,7 +178,7 @@ def _with_labels(sentences: Mapping[str, list[str]]) -> list[str]:
 
 
 def failures(m: Material) -> list[Section]:
-    """Return the failed responses with the reasons, a page of them."""
+    """Return the failed responses with the reasons, at most a page."""
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
     for tree in m.results.values():
         if "failures" in tree.children:
@@ -201,47 +200,31 @@ def failures(m: Material) -> list[Section]:
 
 
 def metric(m: Material) -> list[Section]:
-    """Return the discrepancies and epsilons of the results."""
-    rows = [
-        row
-        for label, calibration in m.calibrations.items()
-        for row in _discrepancies(label, calibration)
-    ]
+    """Return the discrepancies and epsilons of the results, or their log-likelihoods."""
+    rows: list[dict[str, Any]] = []
+    for label, calibration in m.calibrations.items():
+        sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
+        means = calibration["discrepancy"].mean(sample_dims, skipna=False)
+        for name, mean in zip(calibration["simulator"].values, means.values, strict=True):
+            values = calibration.sel(simulator=name)
+            row = {"result": label, "simulator": str(name)}
+            if "n_runs" in values:
+                row["runs"] = str(int(values["n_runs"]))
+            keys = {"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"}
+            known = {text: float(values[key]) for key, text in keys.items() if key in values}
+            if m.is_by_specimen:
+                rows.append(row | {"log-likelihood": -float(mean)})
+            else:
+                rows.append(row | {"discrepancy": float(mean)} | known)
     if not rows:
         return []
     if m.is_by_specimen:
-        for row in rows:
-            row["log-likelihood"] = -row["discrepancy"]
-        keys = ("result", "simulator", "log-likelihood", "runs")
-        table = rows_table([{key: row[key] for key in keys} for row in rows])
         about = "Runs are those of the emulator. Of a posterior the mean over its draws is shown."
-        return [Section("Log-likelihood", about, table, level=3)]
+        return [Section("Log-likelihood", about, rows_table(rows), level=3)]
     about = "Of a posterior the mean discrepancy over its draws is shown."
-    if any(row["epsilon"] is not None for row in rows):
+    if any("epsilon" in row for row in rows):
         about += " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
     return [Section("Metric and epsilon", about, rows_table(rows), level=3)]
-
-
-def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
-    """Return a row for each simulator of a result."""
-    sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
-    mean = calibration["discrepancy"].mean(sample_dims, skipna=False)
-    rows: list[dict[str, Any]] = []
-    for name in calibration["simulator"].values.tolist():
-        values = calibration.sel(simulator=name)
-        keys = ("discrepancy_error", "epsilon")
-        error, epsilon = (float(values[key]) if key in values else None for key in keys)
-        rows.append(
-            {
-                "result": label,
-                "simulator": name,
-                "discrepancy": float(mean.sel(simulator=name)),
-                "Monte Carlo error": error,
-                "epsilon": epsilon,
-                "runs": str(int(values["n_runs"])) if "n_runs" in values else None,
-            }
-        )
-    return rows
 
 
 def optima(m: Material) -> list[Section]:
@@ -287,7 +270,7 @@ def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
 
 
 def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
-    """Return a sentence on another optimum, by scalars alone if its elements are many."""
+    """Return a sentence on another optimum; of many elements it names scalar variables alone."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
     if len(shown) > 8:
@@ -309,10 +292,10 @@ def posteriors(m: Material) -> list[Section]:
         chains = counted(int(posterior.sizes["chain"]), "chain")
         by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
         text = [f"{chains} of {posterior.sizes['draw']} draws{by}. Intervals have equal tails."]
-        # The width of the draws of `sample_smc`
+        # With a metric the width of the draws depends on the sampler's adjustment.
         adjustment = str(posterior.attrs.get("adjustment", ""))
         if m.is_by_specimen or m.sheets or not adjustment:
-            pass  # of data sheets the likelihood is exact
+            pass  # The likelihood is exact, and other samplers have no adjustment.
         elif adjustment == "estimate":
             text.append(
                 "The posterior is that given the metric's own estimate: prior times density of the "
@@ -330,7 +313,7 @@ def posteriors(m: Material) -> list[Section]:
         table = rows_table(_posterior_rows(tree, names, m.prob))
         sections.append(Section(title, text, table, level=3))
         varying = [name for name in names if np.ptp(values[name]) > 0]
-        if 2 <= len(varying) <= 8:  # more do not fit on a page
+        if 2 <= len(varying) <= 8:  # A larger table does not fit on a page.
             r = np.corrcoef([values[name] for name in varying])
             about = "Correlations of the draws: the data hardly distinguish a pair near 1 or -1."
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
@@ -373,7 +356,7 @@ def comparison(m: Material) -> list[Section]:
     """Return the results side by side."""
     if m.comparison is None:
         return []
-    table = m.comparison  # of a file, if it was read from one
+    table = m.comparison  # A comparison from a file is a plain dataset.
     shown = Comparison(table.data_vars, coords=table.coords, attrs=table.attrs).to_view()
     text = [
         f"The shift is the distance from the estimate of {table['result'].values[0]}, in standard "
@@ -381,7 +364,7 @@ def comparison(m: Material) -> list[Section]:
         *shown.sentences,
     ]
     columns = view_table(shown)
-    if m.prob != INTERVAL:  # all intervals of a report have the same probability
+    if m.prob != INTERVAL:  # All intervals of a report have the same probability.
         columns = columns.drop(columns=f"{INTERVAL:.0%} interval")
     return [Section("Comparison of results", text, columns, level=3)]
 
@@ -423,7 +406,7 @@ def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
     """Return the statistics of `sample_smc`; nothing of other samplers."""
     if "sample_stats" not in tree or "stage" not in tree["sample_stats"].dims:
         return []
-    # Chains have different numbers of stages: NaN from the end of a chain on.
+    # Chains have different numbers of stages; their rows are filled up with NaN.
     stats = tree["sample_stats"].to_dataset()
     stages = (~np.isnan(stats["beta"].values)).sum(axis=1)
     last = (np.arange(stages.size), stages - 1)
@@ -479,7 +462,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
     if directions and not test.folded:
         values = "u and |2u - 1|"
     digits = p_digits(test.p_value, test.alpha)
-    # The verdict first: the end of a wide table is off a phone's screen.
+    # The verdict is the first column, as the end of a wide table is off a phone's screen.
     return {
         "verdict": "rejected" if test.rejected else "not rejected",
         "values": test.u_values.size,
@@ -494,7 +477,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
 
 
 def specimens(m: Material) -> list[Section]:
-    """Return the measured values and u-values of each specimen of the test, a page of them."""
+    """Return measured values and u-values of the specimens of the test, at most a page."""
     rows = _measured_rows(m)
     if not rows:
         return []
@@ -510,21 +493,21 @@ def specimens(m: Material) -> list[Section]:
 def _measured_rows(m: Material) -> list[dict[str, Any]]:
     """Return a row for each specimen and output of the validation data."""
     rows = []
-    for condition, pair in validation_pairs(m):
-        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-        values = alike(pair.measured.tolist(), sd)
-        us = u_values(pair.measured, pair.predicted).tolist()
-        name = named(pair.name, m.labels)
-        labels = _specimen_labels(condition, len(m.validation[condition][0]), m)
-        rows += [
-            {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
-            for label, value, u in zip(labels, values, us, strict=True)
-        ]
+    for condition, tested in m.validation.items():
+        labels = _specimen_labels(condition, len(tested.measured), m)
+        for pair in tested.pairs:
+            values = alike(pair.measured.tolist(), finite_sd(pair.measured))
+            us = u_values(pair.measured, pair.predicted).tolist()
+            name = named(pair.name, m.labels)
+            rows += [
+                {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
+                for label, value, u in zip(labels, values, us, strict=True)
+            ]
     return rows
 
 
 def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
-    """Return the labels of a condition's n specimens in a test of them, or their numbers."""
+    """Return the labels of a condition's n specimens from the test of them, or else numbers."""
     for test in m.tests.values():
         is_single = len(test.of_conditions) == 1 and len(m.validation) == 1
         for name in test.of_conditions:
@@ -536,7 +519,7 @@ def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
 
 
 def _specimen_label(label: str, condition: str) -> str:
-    """Return a label; the number from one on of a specimen that the test counts from zero."""
+    """Return a label; tests count specimens without labels from zero, and a report from one."""
     index = label.removeprefix(f"{condition}, ")
     return str(int(index) + 1) if index != label and index.isdigit() else label
 
@@ -549,7 +532,7 @@ def measured_values(m: Material) -> list[Section]:
     if not m.observed:
         return []
     sections = []
-    # At most half a page
+    # The values of a simulator fill half a page at most.
     about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
     values = [about]
     for name, y in m.observed.items():
@@ -560,7 +543,7 @@ def measured_values(m: Material) -> list[Section]:
             values.append(f"{name}: {y.values.size} values, which are too many to print.")
             continue
         for output, _, column in columns:
-            texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
+            texts = alike(column.tolist(), finite_sd(column), 4)
             element = element_name(name, [output] if output else [])
             values.append(f"{element}: {', '.join(texts)}.")
     return [*sections, Section("Measured values", values, level=3)]
@@ -585,9 +568,9 @@ def origin(m: Material) -> list[Section]:
         attrs = attributes_of(result)
         by = str(attrs.get("sampler", "minimize" if label in m.optima else ""))
         costs.append((label, by, attrs, "n_responses"))
-    for condition, (_, predicted) in m.validation.items():
+    for condition, tested in m.validation.items():
         label = f"prediction, {named(condition, m.labels)}"
-        costs.append((label, "predict", predicted.attrs, "responses"))
+        costs.append((label, "predict", tested.predicted.attrs, "responses"))
     for label, table in m.decisions.items():
         costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
     rows = []
@@ -595,7 +578,7 @@ def origin(m: Material) -> list[Section]:
         row: dict[str, Any] = {"result": label, "by": by}
         row["responses"] = str(int(record[responses])) if responses in record else None
         seconds = record.get("seconds")
-        if seconds is not None:  # to a tenth below ten
+        if seconds is not None:  # Below ten a tenth matters.
             seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
         seed = record.get("random_seed")
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
@@ -610,8 +593,8 @@ def origin(m: Material) -> list[Section]:
 # -- order -----------------------------------------------------------------------------------
 
 
-# Chapters with their parts in order: a function of the material, or the name of a picture. The
-# first chapter is page one, and has the verdict as its title.
+# parts of each chapter in their order: functions of the material, and names of pictures; the first
+# chapter is page one, whose title is the verdict
 _CHAPTERS: dict[str, tuple[Any, ...]] = {
     "Verdict": (verdict, "front", population_in_units),
     "Decision": (decision, "sensitivity", next_steps),

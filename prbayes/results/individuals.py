@@ -21,7 +21,7 @@ from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
 
-# Inputs whose shrinkage is that of their logarithms.
+# distribution of inputs whose shrinkage is that of their logarithms
 _LOG_NORMAL = type(pm.LogNormal.rv_op)
 
 
@@ -173,7 +173,8 @@ class Individuals(Tree):
         for name, index, values in zip(
             table["input"], indices, table[numbers].to_numpy(), strict=True
         ):
-            labels = [str(i) for i in index if i == i]  # NaN of a dimension that it has not
+            # NaN marks a dimension that the input lacks.
+            labels = [str(i) for i in index if i == i]
             mean, sd, lower, upper = (f"{x:.4g}" for x in values)
             rows.append([element_name(name, labels), mean, sd, f"{lower} to {upper}"])
         sentences = [
@@ -194,7 +195,7 @@ def _columns(likelihood: SpecimenLikelihood) -> list[Floats]:
 def _population(
     likelihood: SpecimenLikelihood, points: dict[str, Floats], rng: np.random.Generator
 ) -> list[Floats]:
-    """Return 256 specimens of each group and population, (P, n, *event), by input."""
+    """Return 256 specimens of each group from each population, by input, (P, n, *event)."""
     parts = []
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(points, group, rows)
@@ -206,7 +207,7 @@ def _population(
 def _array(
     name: str, values: Floats, coords: dict[str, Any], outputs: Outputs | None = None
 ) -> xr.DataArray:
-    """Return draws, (P, n, *event), with the dimensions chain, draw, specimen, and of the event."""
+    """Label draws, (P, n, *event), by chain, draw, specimen, and outputs or elements."""
     event = values.shape[2:]
     event_dims = [f"{name}_dim_{i}" for i in range(len(event))]
     if outputs is not None and outputs.labels and event:

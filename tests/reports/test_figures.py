@@ -122,7 +122,7 @@ def test_a_report_computes_responses_only_if_they_are_cheap(
     optimum = prb.minimize(model)
     optimum = replace(optimum, search=replace(optimum.search, seconds=seconds))
     before = count, optimum.evaluator.n_responses
-    monkeypatch.setattr("prbayes.results.diagnose._seconds_of_test", lambda _: 31.0)
+    monkeypatch.setattr("prbayes.results.diagnose.seconds_of", lambda *_: 31.0)
     made = prb.Report("x", model=model, optimum=optimum)
     assert (count, optimum.evaluator.n_responses) == before
     assert ("responses" in calls) == (seconds < 1)
