@@ -127,12 +127,7 @@ def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tup
     values = observed[order]
     finite = np.isfinite(values)
     heights = cumulated(weights, order)[np.append(True, finite)]
-    return steps(values[finite], heights, low, high)
-
-
-def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
-    """Return the corners of a step function at sorted values; the first height is before them."""
-    x = np.concatenate([[low], np.repeat(values, 2), [high]])
+    x = np.concatenate([[low], np.repeat(values[finite], 2), [high]])
     return x, np.repeat(heights, 2)
 
 

@@ -165,15 +165,8 @@ def plot_outputs(
         points = _finite_pairs(x, y, *calibrated)
         _draw_regions(axis, "after", points, legend, color=BLUE)
         measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
-        axis.scatter(
-            measured[0][:, 0],
-            measured[0][:, 1],
-            14,
-            color=ink(),
-            label="measured",
-            gid="measured",
-            zorder=3,
-        )
+        look: dict[str, Any] = {"color": ink(), "zorder": 3}
+        axis.scatter(*measured[0].T, 14, label="measured", gid="measured", **look)
         correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
         title = "rank correlation\nmeasured {}, calibrated {}".format(*correlations)
         axis.set(title=title, xlim=limits[j], ylim=limits[i + 1])

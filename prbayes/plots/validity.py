@@ -20,7 +20,7 @@ from prbayes.plots.canvas import (
     ink,
     panels,
 )
-from prbayes.plots.curves import steps, with_gaps
+from prbayes.plots.curves import staircase, with_gaps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 
@@ -130,11 +130,9 @@ def _is_of_direction(test: ValidityTest) -> NDArray[np.bool_]:
 
 def _ecdf(samples: Sequence[Floats]) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
-    curves = []
-    for values in samples:
-        heights = np.arange(values.size + 1) / values.size
-        curves.append(np.column_stack(steps(np.sort(values), heights, 0.0, 1.0)))
-    return with_gaps(curves)
+    weights = [np.full(values.shape, 1 / values.size) for values in samples]
+    pairs = zip(samples, weights, strict=True)
+    return with_gaps([np.column_stack(staircase(u, w, 0.0, 1.0)) for u, w in pairs])
 
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:

@@ -220,8 +220,8 @@ def gather(
     _require_tested(validations, tests)
 
     stored = (from_attributes(attributes_of(tree)) for tree in results.values())
-    known = filter(None, stored if model is None else [describe(model)])
-    description: dict[str, Any] = next(known, {"variables": [], "simulators": []})
+    descriptions = filter(None, stored if model is None else [describe(model)])
+    description: dict[str, Any] = next(descriptions, {"variables": [], "simulators": []})
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)

@@ -211,11 +211,11 @@ def metric(m: Material) -> list[Section]:
             if "n_runs" in values:
                 row["runs"] = str(int(values["n_runs"]))
             keys = {"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"}
-            known = {text: float(values[key]) for key, text in keys.items() if key in values}
+            numbers = {text: float(values[key]) for key, text in keys.items() if key in values}
             if m.is_by_specimen:
                 rows.append(row | {"log-likelihood": -float(mean)})
             else:
-                rows.append(row | {"discrepancy": float(mean)} | known)
+                rows.append(row | {"discrepancy": float(mean)} | numbers)
     if not rows:
         return []
     if m.is_by_specimen:

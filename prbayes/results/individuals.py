@@ -153,12 +153,9 @@ class Individuals(Tree):
         tables = []
         for name, draws in self["posterior"].data_vars.items():
             over = ("chain", "draw")
-            quantiles = draws.quantile([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], over)
             columns = {"mean": draws.mean(over), "sd": draws.std(over)}
-            columns |= {
-                key: quantiles.isel(quantile=i, drop=True)
-                for i, key in enumerate(("lower", "upper"))
-            }
+            for key, level in (("lower", (1 - INTERVAL) / 2), ("upper", (1 + INTERVAL) / 2)):
+                columns[key] = draws.quantile(level, over).drop_vars("quantile")
             table = xr.Dataset(columns).to_dataframe().reset_index()
             table.insert(0, "input", str(name))
             tables.append(table)
