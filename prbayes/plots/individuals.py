@@ -87,23 +87,20 @@ def plot_individuals(
     """
     check_options(labels, pc_kwargs)
     share(prob, "prob")
-    groups = individuals.children if isinstance(individuals, xr.DataTree) else {}
-    draws = groups["posterior"].to_dataset() if "posterior" in groups else xr.Dataset()
+    trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
+    groups = {name: tree.to_dataset() for name, tree in trees.items()}
+    draws = groups.get("posterior", xr.Dataset())
     has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
     if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
         raise TypeError(
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
-    parts = [groups[name].to_dataset() for name in groups]
-    dims = {dim for part in parts for dim in part.dims} - {"chain", "draw"}
-    observed, replicates = (
-        subset(individuals[name].to_dataset(), coords, dims)
-        for name in ("observed_data", "posterior_predictive")
-    )
-    constant = individuals["constant_data"].to_dataset() if "constant_data" in groups else draws
-    conditions = {} if constant is draws else subset(constant, coords, dims).data_vars
-    inputs = _elements(subset(draws, coords, dims))
+    dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
+    groups = {name: subset(group, coords, dims) for name, group in groups.items()}
+    observed, replicates = groups["observed_data"], groups["posterior_predictive"]
+    conditions = groups.get("constant_data", xr.Dataset()).data_vars
+    inputs = _elements(groups["posterior"])
     curves = [str(name) for name, y in observed.data_vars.items() if y[0].size > 6]
     readings = _elements(observed.drop_vars(curves))
     replicated = _elements(replicates.drop_vars(curves))
@@ -159,7 +156,8 @@ def _elements(data: xr.Dataset) -> dict[str, Floats]:
     draws = data if "chain" in data.dims else data.expand_dims(("chain", "draw"))
     elements: dict[str, Floats] = {}
     for name, values in stacked_draws(draws).items():
-        columns = values.values.reshape(*values.shape[:2], -1)
+        n_draws, n = values.shape[:2]
+        columns = values.values.reshape(n_draws, n, -1)
         names = split_elements({name: values[0]})
         elements |= zip(names, np.moveaxis(columns, -1, 0), strict=True)
     return elements

@@ -223,12 +223,13 @@ def _draw_marks(axis: Axes, path: Any, optimum: Floats, local_optima: Floats) ->
     """Mark points of the path, the optimum and other optima, shape (2, m) each."""
     if path is not None:
         text = "path of the optimiser"
-        axis.scatter(*path, 14, color=ink(), label=text, gid="evaluated", zorder=2)
+        axis.scatter(path[0], path[1], 14, color=ink(), label=text, gid="evaluated", zorder=2)
     look: dict[str, Any] = {"color": VERMILION, "zorder": 3}
-    axis.scatter(*optimum, 90, marker="D", label="optimum", gid="optimum", **look)
+    axis.scatter(optimum[0], optimum[1], 90, marker="D", label="optimum", gid="optimum", **look)
     if local_optima.size:
         text = "other optima"
-        axis.scatter(*local_optima, 70, marker="x", label=text, gid="local_optima", **look)
+        x, y = local_optima
+        axis.scatter(x, y, 70, marker="x", label=text, gid="local_optima", **look)
 
 
 # -- the objective and its values on a grid --------------------------------------------------

@@ -166,7 +166,8 @@ def plot_outputs(
         _draw_regions(axis, "after", points, legend, color=BLUE)
         measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
         look: dict[str, Any] = {"color": ink(), "zorder": 3}
-        axis.scatter(*measured[0].T, 14, label="measured", gid="measured", **look)
+        first, second = measured[0].T
+        axis.scatter(first, second, 14, label="measured", gid="measured", **look)
         correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
         title = "rank correlation\nmeasured {}, calibrated {}".format(*correlations)
         axis.set(title=title, xlim=limits[j], ylim=limits[i + 1])

@@ -130,9 +130,11 @@ def _is_of_direction(test: ValidityTest) -> NDArray[np.bool_]:
 
 def _ecdf(samples: Sequence[Floats]) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
-    weights = [np.full(values.shape, 1 / values.size) for values in samples]
-    pairs = zip(samples, weights, strict=True)
-    return with_gaps([np.column_stack(staircase(u, w, 0.0, 1.0)) for u, w in pairs])
+    curves = []
+    for values in samples:
+        weights = np.full(values.shape, 1 / values.size)
+        curves.append(np.column_stack(staircase(values, weights, 0.0, 1.0)))
+    return with_gaps(curves)
 
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:

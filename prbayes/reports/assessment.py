@@ -147,8 +147,9 @@ def population_in_units(m: Material) -> list[Section]:
         for q in shown.header[1:]
     ]
     columns = {}
-    for (name, unit, _), (_, *texts) in zip(table.rows(), shown.rows, strict=False):
-        columns[with_label(name, unit, m.labels)] = dict(zip(quantities, texts, strict=True))
+    for (name, unit, _), (_, *texts) in zip(table.rows(), shown.rows, strict=True):
+        label = with_label(name, unit, m.labels)
+        columns[label] = dict(zip(quantities, texts, strict=True))
     if len(columns) <= 4:  # With a line for each quantity the table fits on a page.
         rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in quantities]
     else:

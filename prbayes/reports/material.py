@@ -385,11 +385,13 @@ def _observed(
             sheets[simulator.name] = data_sheet(simulator.metric)
     else:
         groups = [tree["observed_data"] for tree in results.values() if "observed_data" in tree]
-        for name, array in groups[0].data_vars.items() if groups else ():
+        for key, array in groups[0].data_vars.items() if groups else ():
+            name = str(key)
             # A tool other than this package may store arrays with more axes.
             values = array if array.ndim in (1, 2) else np.ravel(array)
-            observed[str(name)] = Observed(*read_observed(str(name), values.astype(np.float64)))
-            sheets[str(name)] = str(array.attrs.get("data_sheet", ""))
+            y, outputs = read_observed(name, values.astype(np.float64))
+            observed[name] = Observed(y, outputs)
+            sheets[name] = str(array.attrs.get("data_sheet", ""))
     sheets = {name: sheet for name, sheet in sheets.items() if sheet}
     return {name: y for name, y in observed.items() if name not in sheets}, sheets
 

@@ -265,7 +265,8 @@ def thetas_at(evaluator: Evaluator, elements: Mapping[str, Floats]) -> Floats:
     for name in (str(rv.name) for rv in evaluator.model.free_RVs):
         shape = initial[name].shape[1:]
         labels = coordinates(evaluator.model, name)
-        columns = [np.broadcast_to(elements[x], n) for x in element_names(name, shape, labels)]
+        names = element_names(name, shape, labels)
+        columns = [np.broadcast_to(elements[element], n) for element in names]
         values.append(np.stack(columns, axis=-1).reshape(n, *shape))
     return hyperparameters.thetas_of(values)
 

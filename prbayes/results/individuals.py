@@ -110,7 +110,10 @@ def individuals(
         inputs, gross_error = draw_inputs(with_more_points(likelihood), rng, points)
         function = likelihood.measurements[0].responses.function
         input_names = aleatory_names(likelihood.inputs, function)
-        conditions = dict(zip(likelihood.inputs.conditions, _columns(likelihood), strict=True))
+        columns = likelihood.stacked.conditions  # values of the specimens, (S, C), or None
+        conditions = {}
+        if columns is not None:
+            conditions = dict(zip(likelihood.inputs.conditions, columns.T, strict=True))
         population = _population(likelihood, points, rng)
         for position, (name, values) in enumerate(zip(input_names, inputs, strict=True)):
             if position in conditions:
@@ -181,12 +184,6 @@ class Individuals(Tree):
         ]
         header = ["", "mean", "sd", f"{INTERVAL:.0%} interval"]
         return View("Inputs of the measured specimens", header, rows, sentences)
-
-
-def _columns(likelihood: SpecimenLikelihood) -> list[Floats]:
-    """Return the values of the specimens of each condition that is an input, (S,)."""
-    conditions = likelihood.stacked.conditions
-    return [] if conditions is None else list(conditions.T)
 
 
 def _population(

@@ -290,10 +290,12 @@ def scored_specimens(
             weights[rows] = np.broadcast_to(log_p, (1, size))[0].reshape(log_a[rows].shape)
         # Points that fill up the arrays have no weight. Their scores are arbitrary.
         z = np.where(np.isfinite(z), z, 0.0)
-        log_weights = np.where(np.isfinite(weights + log_a), weights + log_a, -np.inf)
+        log_weights = weights + log_a
+        log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
         with np.errstate(invalid="ignore"):  # A row may have no weight at all.
             relative = softmax(log_weights, axis=1)
-        result.append((z, np.where(np.isfinite(relative), relative, 1 / log_a.shape[1])))
+        equal = 1 / log_a.shape[1]
+        result.append((z, np.where(np.isfinite(relative), relative, equal)))
     return result
 
 

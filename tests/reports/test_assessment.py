@@ -14,6 +14,7 @@ from prbayes._finding import Finding, as_json
 from prbayes.reports.assessment import agreement, answer, next_steps
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
+from prbayes.reports.sections import comparison
 from prbayes.validation.conditions import DIRECTION
 
 
@@ -225,6 +226,8 @@ def test_many_parameters_are_in_the_appendix() -> None:
     (section,) = answer(gather(posterior=draws(**many)))
     assert section.text == ("The estimates are in the appendix.",)
     assert section.table is None
+    (section,) = comparison(gather(posterior={"a": draws(**many), "b": draws(**many)}))
+    assert len(section.table) == 2 * 31, "all rows, where a notebook shows a page"
 
 
 def test_an_unidentified_parameter_has_no_standard_error(calibrated: Any) -> None:
