@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import inspect
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import xarray as xr
@@ -46,21 +46,24 @@ class View:
     rows: Sequence[Sequence[str]] = ()
     sentences: Sequence[str] = ()
 
-    def __post_init__(self) -> None:
-        more = len(self.rows) - 40  # of a page
-        if more > 0:
-            object.__setattr__(self, "rows", self.rows[:40])
-            text = f"{more} more rows are in .to_dataframe()."
-            object.__setattr__(self, "sentences", (text, *self.sentences))
+    @property
+    def first_page(self) -> View:
+        """The first 40 rows, and how many more there are."""
+        more = len(self.rows) - 40
+        if more <= 0:
+            return self
+        text = f"{more} more rows are in .to_dataframe()."
+        return replace(self, rows=self.rows[:40], sentences=(text, *self.sentences))
 
     def __str__(self) -> str:
-        table = [row for row in (self.header, *self.rows) if row]
+        page = self.first_page
+        table = [row for row in (page.header, *page.rows) if row]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
             "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
             for row in table
         ]
-        return "\n  ".join([self.heading, *lines, *self.sentences])
+        return "\n  ".join([page.heading, *lines, *page.sentences])
 
 
 def percentage(share: float) -> str:
@@ -76,7 +79,8 @@ def p_digits(p: float, alpha: float) -> int:
 
 def html_of(shown: View) -> str:
     """Return the HTML of what a reader sees."""
-    return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
+    page = shown.first_page
+    return view(page.heading, header=page.header, rows=page.rows, sentences=page.sentences)
 
 
 class Shown:

@@ -44,6 +44,11 @@ def called(value: object) -> str:
     return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
 
 
+def wrong_type(value: object, name: str, expected: str) -> TypeError:
+    """Return the error for an argument of another type."""
+    return TypeError(f"{name}: got {type(value).__name__}, expected {expected}")
+
+
 # -- arrays ----------------------------------------------------------------------------------
 
 

@@ -49,9 +49,9 @@ from prbayes.results.predict import (
     known_scatter,
     model_of,
     named_response,
-    populations_of,
     refuse_unsupported,
     serving,
+    thetas_of,
 )
 
 # Number of populations for checks and error estimates, whose quantiles then have an error of a few
@@ -89,11 +89,8 @@ class Populations:
             thetas = _sobol_thetas(result, n_draws, caller)
             evaluator = result.evaluator if model is result.model else Evaluator.of(model)
             return cls(result, evaluator, thetas, result.theta, caller, False, calling)
-        points, _ = populations_of(result, model, n_draws, caller)
         evaluator = Evaluator.of(model)
-        thetas = evaluator.hyperparameters.thetas_of(
-            [points[str(rv.name)] for rv in model.free_RVs]
-        )
+        thetas = thetas_of(result, evaluator, n_draws, caller)
         center = np.median(thetas, axis=0)
         return cls(result, evaluator, thetas, center, caller, True, calling)
 

@@ -63,6 +63,14 @@ class SummaryLikelihood(Metric):
         return SummaryDiscrepancy(self, observed, weights, summary, knots, counts)
 
 
+def data_sheet(metric: Metric) -> str:
+    """Return the statistics that a metric compares as text; empty if it compares specimens."""
+    if not isinstance(metric, SummaryLikelihood):
+        return ""
+    statistics = vars(metric.summary).items()
+    return ", ".join(f"{name} = {x!r}" for name, x in statistics if x is not None)
+
+
 @dataclass(frozen=True, eq=False)
 class SummaryDiscrepancy(Discrepancy):
     """Minus log-likelihood over n; features are moments of strata and densities, in units of sd.

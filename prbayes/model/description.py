@@ -18,6 +18,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
+from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
@@ -29,7 +30,7 @@ from prbayes.response.outputs import Outputs
 
 # Fields of the description of a variable, and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
-_SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points", "specimens")
+_SIMULATOR = ("name", "response", "metric", "propagation", "n_points", "specimens")
 
 _CONSTANT = "<constant>"  # PyMC's text for an array
 
@@ -40,8 +41,9 @@ def describe(model: pm.Model) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs,
-        metric, propagation, the number of its points, and specimens.
+        ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs
+        (name, unit, and distribution or value of each), metric, propagation, the number of its
+        points, specimens and their number, and runs.
     """
     named = {*model.basic_RVs, *model.deterministics}
     by_metric = nodes(model)
@@ -54,11 +56,16 @@ def describe(model: pm.Model) -> dict[str, Any]:
             described.append((rv, "observed", _distribution(rv, named)))
     simulators = []
     for node in by_metric.values():
+        runs = type(node.propagation).__name__  # of a user's own class, which may have no n
+        if hasattr(node.propagation, "n"):
+            use = ", once; weighted" if node.bound.stored else ""
+            runs = f"{node.propagation.n} runs{use} for each population"
         propagation = without_addresses(node.propagation)
-        simulators.append(_simulator(node, named, propagation, node.bound.n_points))
+        simulators.append(_simulator(node, named, propagation, node.bound.n_points, runs))
     for rv, measurement in measurements_of(model).items():
         n_runs = len(prepared(likelihoods[rv]).emulation.z)
-        simulators.append(_simulator(measurement, named, f"emulator of {n_runs} runs", n_runs))
+        runs = f"emulator of {n_runs} runs"
+        simulators.append(_simulator(measurement, named, runs, n_runs, runs))
     return {
         "variables": [
             {"name": str(variable.name), "role": role, "distribution": text}
@@ -69,38 +76,49 @@ def describe(model: pm.Model) -> dict[str, Any]:
 
 
 def _simulator(
-    simulator: SimulatorWithData, named: Set[Any], propagation: str, n_points: int
-) -> dict[str, str]:
+    simulator: SimulatorWithData,
+    named: Set[Any],
+    propagation: str,
+    n_points: int,
+    runs: str,
+) -> dict[str, Any]:
     """Return the description of a simulator."""
-    inputs = []
+    inputs = []  # [name, unit, distribution or value] of each; without a name a text alone
     names = argument_names(simulator.inputs, simulator.responses.function)
     for name, argument in zip(names, simulator.inputs.arguments, strict=True):
         if isinstance(argument, int):  # the place of an aleatory input
             x = simulator.inputs.aleatory[argument]
             is_known = argument in simulator.inputs.conditions
             unit = f" ({unit_of(x)})" if unit_of(x) else ""
-            text = _distribution(x, named)
-            inputs.append(f"condition {x.name}" if is_known else f"{name}{unit} ~ {text}")
+            inputs.append(
+                ["", "", f"condition {x.name}"]
+                if is_known
+                else [name, unit, f"~ {_distribution(x, named)}"]
+            )
         elif isinstance(argument, Variable):
-            inputs.append(str(argument.name or f"an expression of {_parents(argument, named)}"))
+            text = argument.name or f"an expression of {_parents(argument, named)}"
+            inputs.append(["", "", str(text)])
         else:
             value = np.asarray(argument)
             number = f"{value.item():.6g}" if value.size == 1 else ""
-            inputs.append(f"{name} = {number or f'an array of shape {value.shape}'}")
-    specimens = ""
+            inputs.append([name, "", f"= {number or f'an array of shape {value.shape}'}"])
+    specimens, n_specimens = "", ""
     if simulator.specimens is not None:
         labels = list(dict.fromkeys(map(str, simulator.specimens.tolist())))
-        specimens = f"{len(labels)} specimens: {', '.join(labels[:40])}"  # three lines of a report
+        n_specimens = f"{len(labels)} specimens"
+        specimens = f"{n_specimens}: {', '.join(labels[:40])}"  # three lines of a report
         if len(labels) > 40:
             specimens += f", and {len(labels) - 40} more"
     return {
         "name": simulator.name,
         "response": response_name(simulator.responses.function),
-        "inputs": ", ".join(inputs),
+        "inputs": inputs,
         "metric": without_addresses(simulator.metric),
         "propagation": propagation,
         "n_points": str(n_points),
         "specimens": specimens,
+        "n_specimens": n_specimens,
+        "runs": runs,
     }
 
 
@@ -131,10 +149,23 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         stored = json.loads(attrs["model"])
         return {
             "variables": [{key: str(v[key]) for key in _VARIABLE} for v in stored["variables"]],
-            "simulators": [{key: str(s[key]) for key in _SIMULATOR} for s in stored["simulators"]],
+            "simulators": [_stored_simulator(s) for s in stored["simulators"]],
         }
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
+
+
+def _stored_simulator(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the description of a simulator in a file; 1.0.0rc1 stored inputs as one text."""
+    texts = {key: str(stored[key]) for key in _SIMULATOR}
+    inputs = stored["inputs"]
+    rows = [["", "", inputs]] if isinstance(inputs, str) else inputs
+    return {
+        **texts,
+        "inputs": [[str(name), str(unit), str(text)] for name, unit, text in rows],
+        "n_specimens": str(stored.get("n_specimens", "")),
+        "runs": str(stored.get("runs", stored["propagation"])),
+    }
 
 
 def as_pymc_writes(rv: Any, named: Set[Any]) -> str:
@@ -258,7 +289,11 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {simulator.name: simulator.observed for simulator in with_data(evaluator)}
-    return labelled_responses(evaluator, observed)
+    data = labelled_responses(evaluator, observed)
+    for simulator in with_data(evaluator):
+        if sheet := data_sheet(simulator.metric):
+            data[simulator.name].attrs["data_sheet"] = sheet
+    return data
 
 
 def labelled_responses(

@@ -16,6 +16,7 @@ from prbayes._validate import Floats, called, positive_integer, texts
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
+from prbayes.response.outputs import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,18 +60,19 @@ def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: boo
 def layout(
     n: int, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
 ) -> tuple[int, dict[str, Any]]:
-    """Return the columns of n panels, and options of a figure with this size for each of them."""
-    # Three panels a row; four make a square.
+    """Return the number of columns of n panels of a size, and the options of their figure."""
+    # A row has three panels, but four panels make a square.
     columns = min(n, pc_kwargs.get("col_wrap", 2 if n == 4 else 3))
     figsize = pc_kwargs.get("figsize") or (size[0] * columns, size[1] * -(-n // columns))
-    options = {"figsize": figsize, "layout": "constrained"}  # which makes room for the legend
+    # The constrained layout makes room for the legend.
+    options = {"figsize": figsize, "layout": "constrained"}
     return columns, options | pc_kwargs.get("figure_kwargs", {})
 
 
 def panels(
     names: Sequence[str], *, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
 ) -> tuple[Figure, dict[str, Axes]]:
-    """Return a figure of pyplot, and panels of a size in inches that have their name as label."""
+    """Return a figure of pyplot, and its panels by name; a panel has the name as its label."""
     from matplotlib import pyplot as plt  # heavy, and only needed for pictures
 
     columns, options = layout(len(names), size, pc_kwargs)
@@ -102,6 +104,20 @@ def ink() -> str:
     import matplotlib as mpl
 
     return str(mpl.rcParams["text.color"])
+
+
+def fill(
+    axis: Axes,
+    x: Any,
+    low: Any,
+    high: Any = 0.0,
+    *,
+    color: str = BLUE,
+    alpha: float = 0.25,
+    **texts: Any,
+) -> None:
+    """Fill the area between two curves, in pale blue by default."""
+    axis.fill_between(x, low, high, color=color, alpha=alpha, linewidth=0, **texts)
 
 
 def finish(figure: Figure) -> Figure:
@@ -145,7 +161,8 @@ def scale_by_decades(target: Any, values: Floats) -> None:
         return
     from matplotlib.ticker import LogLocator, NullLocator
 
-    # At most seven powers of ten; 1, 2, 5 within two decades.
+    # The axis has at most seven powers of ten, so that the labels do not overlap. Within two
+    # decades it has ticks at 1, 2 and 5.
     factors = (1.0, 2.0, 5.0) if finite.max() < 100 * finite.min() else (1.0,)
     target.set_yscale("log")
     target.yaxis.set_major_locator(LogLocator(subs=factors, numticks=6))
@@ -162,7 +179,7 @@ STATISTIC_LABELS = {
     "n_steps": "steps per stage",
     "log_marginal_likelihood": "log marginal likelihood",
 }
-# Any other metric is called by its class.
+# labels of metrics; a metric that is not listed has the name of its class
 METRIC_LABELS = {
     "AreaMetric": "area metric",
     "KullbackLeibler": "Kullback-Leibler divergence",
@@ -180,6 +197,11 @@ def metric_label(representation: str) -> str:
     return METRIC_LABELS.get(name, name)
 
 
+def counted_title(n: int, noun: str, **counts: Any) -> str:
+    """Return a title such as '25 measured values, 1 failed', without counts of zero."""
+    return f"{n} {noun}" + "".join(f", {m} {name}" for name, m in counts.items() if m)
+
+
 def named(name: str, labels: Mapping[str, str] | None) -> str:
     """Return an element's label, or its variable's with the index, or else its name."""
     labels = labels or {}
@@ -189,10 +211,16 @@ def named(name: str, labels: Mapping[str, str] | None) -> str:
     return labels.get(variable, variable) + name.removeprefix(variable)
 
 
+def with_label(name: str, unit: str, labels: Mapping[str, str] | None) -> str:
+    """Return the label that the user gave, or else the name with its unit."""
+    label = named(name, labels)
+    return with_unit(label, unit) if label == name else label
+
+
 def refuse_labels(
     labels: Mapping[str, str] | None, shown: Iterable[str], *, evaluator: Evaluator | None = None
 ) -> None:
-    """Raise for labels of unknown names; without an evaluator only if no label is shown."""
+    """Raise if a label has an unknown name; without an evaluator only if no label is shown."""
     if not labels:
         return
     names = list(dict.fromkeys(shown))

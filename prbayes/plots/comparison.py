@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._display import percentage
-from prbayes._validate import flag
+from prbayes._validate import flag, wrong_type
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -87,8 +87,7 @@ def plot_comparison(
     flag(scores, "scores")
     variables = {"estimate", "lower", "upper"}
     if not isinstance(comparison, xr.Dataset) or not variables <= set(comparison.data_vars):
-        got = type(comparison).__name__
-        raise TypeError(f"plot_comparison: got {got}, expected the Dataset of prb.compare")
+        raise wrong_type(comparison, "plot_comparison", "the Dataset of prb.compare")
     comparison = subset(comparison, coords)
     if scores:
         names = [
@@ -108,7 +107,7 @@ def plot_comparison(
     refuse_labels(labels, [*names, *results])
     texts = [named(result, labels) for result in results]
     n = len(results)
-    rows = np.arange(n - 1.0, -1.0, -1.0)  # the first on top
+    rows = np.arange(n - 1.0, -1.0, -1.0)  # heights of the rows; the first result is on top
     limits = (-0.6, n - 0.4)
 
     figure, axes = panels(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
@@ -121,7 +120,7 @@ def plot_comparison(
             row = comparison.sel(hyperparameter=name)
             lower, upper, estimate = row.lower.values, row.upper.values, row.estimate.values
             values = np.concatenate([lower, upper, estimate])
-            if n > 1:  # a line through the first result, for comparison
+            if n > 1:  # The line shows how far the other estimates are from the first.
                 text = f"estimate of {texts[0]}"
                 axis.axvline(estimate[0], color=GREY, linestyle=":", label=text, gid="first")
             text = f"{percentage(comparison.attrs.get('interval', 0.89))} interval"
@@ -133,7 +132,7 @@ def plot_comparison(
             )
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-        margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # for markers
+        margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # room for markers
         xlim = float(low - margin), float(high + margin)
         label = named(name, METRIC_LABELS | dict(labels or {}))
         axis.set(xlabel=label, xlim=xlim, ylim=limits)

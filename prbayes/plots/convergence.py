@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from prbayes._validate import wrong_type
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
@@ -101,7 +102,8 @@ def plot_optimizer(
     figure, axes = panels(names, size=(4.6, 3.4), pc_kwargs=pc_kwargs)
     evaluations = optimum.search.trace["evaluations"].astype(np.float64)
 
-    # The objective, recomputed with the final design and scales where that costs no response
+    # Designs and scales change during the search. The objective is recomputed with the final ones
+    # if that costs no response, so that all values can be compared.
     is_free = not optimum.evaluator.responses_per_theta
     values = optimum.search.trace["discrepancy"]
     if is_free:
@@ -110,7 +112,7 @@ def plot_optimizer(
     x, values = evaluations[finite], values[finite]
     axis = axes["discrepancy"]
     axis.scatter(x, values, 16, color=GREY, label="evaluated", gid="evaluated")
-    # Values of different scales cannot be compared
+    # Values with different scales cannot be compared: then there is no lowest one.
     if is_free or len(optimum.scales) == 1:
         lowest = np.minimum.accumulate(values)
         axis.plot(x, lowest, color=BLUE, label="lowest so far", gid="lowest")
@@ -184,12 +186,10 @@ def plot_stages(
     """
     check_options(labels, pc_kwargs)
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
-        raise TypeError(
-            f"plot_stages: posterior: got {type(posterior).__name__}, expected the DataTree of "
-            "prb.sample_smc, with sample_stats"
-        )
+        expected = "the DataTree of prb.sample_smc, with sample_stats"
+        raise wrong_type(posterior, "plot_stages: posterior", expected)
     stages = posterior["sample_stats"].to_dataset()
-    # NaN is unknown, or after the last stage of a chain
+    # NaN marks an unknown value, or a stage after the last one of a chain.
     statistics = {
         str(name): values.transpose("chain", "stage").astype(np.float64)
         for name, values in subset(stages, coords).data_vars.items()
@@ -201,7 +201,7 @@ def plot_stages(
             "prb.sample_smc"
         )
     refuse_labels(labels, statistics)
-    # Those of one stage only come last
+    # Statistics with a value in the last stage alone are the last panels.
     is_once = {name: values.count("stage").values.max() <= 1 for name, values in statistics.items()}
     names = sorted(statistics, key=lambda name: is_once[name])
     names = select_variables(names, var_names, filter_vars)
@@ -214,14 +214,15 @@ def plot_stages(
             at = np.flatnonzero(np.isfinite(row))
             if is_once[name]:
                 axis.scatter([c + 1.0], row[at][-1:], 45, **look)
-            else:  # chains differ in colour and in style; five times four before they repeat
+            else:
+                # Five colours and four styles distinguish twenty chains.
                 style = ("-", "--", ":", "-.")[c % 4]
                 axis.plot(at + 1.0, row[at], style, label=f"chain {chain}", **look)
         ticks = chains if is_once[name] else [str(stage + 1) for stage in range(rows.shape[1])]
-        step = -(-len(ticks) // 10)  # at most ten
+        step = -(-len(ticks) // 10)  # More than ten labels would overlap.
         axis.set_xticks(np.arange(1, len(ticks) + 1, step), ticks[::step])
         y = named(name, STATISTIC_LABELS | dict(labels or {}))
         axis.set(xlabel="chain" if is_once[name] else "stage", ylabel=y)
-        if name == "beta":  # starts at a small value and grows by orders of magnitude
+        if name == "beta":  # Beta grows by orders of magnitude.
             scale_by_decades(axis, rows)
     return finish(figure)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -11,12 +13,12 @@ from prbayes._stats import cumulated, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE, silverman
 
-# Points of a curve: a step is a pixel or two of a panel.
+# number of points of a curve; a step is one or two pixels of a panel
 GRID_POINTS = 257
 
 
 def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Yield the finite values with weight of each sample, (P, n), and weights of sum 1."""
+    """Yield finite values with positive weight, and weights of sum one, of each sample, (P, n)."""
     rows = np.broadcast_to(values, weights.shape)
     for row, w in zip(rows, weights, strict=True):
         used = np.isfinite(row) & (w > 0)
@@ -25,7 +27,10 @@ def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, F
 
 
 def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    """Return densities, (P, g), of weighted samples, (P, n), by the median bandwidth of 40."""
+    """Return kernel densities, (P, g), of weighted samples, (P, n), with one bandwidth.
+
+    It is the median of Silverman's bandwidths of the first 40 samples.
+    """
     samples = _finite_samples(values[:40], weights[:40])
     bandwidths = [silverman(row, w) for row, w in samples]
     bandwidth = float(np.median(bandwidths)) if bandwidths else 0.0
@@ -46,8 +51,8 @@ def measured_density(observed: Floats, weights: Floats, grid: Floats) -> Floats:
 
 def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
     """Return kernel densities, (..., g), of samples, (..., n); the area is the finite share."""
-    # Densities at the centres of the kernel's cells. A bandwidth below half of the grid's step
-    # would not be visible.
+    # The kernel gives densities at the centres of its cells. The bandwidth is at least half of the
+    # grid's step, because a narrower peak would not be visible.
     ends = grid[[0, -1]]
     kernel = GaussianKDE(max(bandwidth, 2e-3 * float(np.ptp(ends))))
     cells = kernel.cells(ends, np.array([0.5, 0.5]))
@@ -55,7 +60,7 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
     rows = np.broadcast_to(values, weights.shape)
     heights = cells.density(rows, weights)[..., : centers.size]
 
-    # Linear interpolation
+    # Interpolate linearly between the centres.
     at = np.clip(np.searchsorted(centers, grid) - 1, 0, centers.size - 2)
     fraction = (grid - centers[at]) / np.diff(centers)[at]
     between = heights[..., at] * (1 - fraction) + heights[..., at + 1] * fraction
@@ -63,17 +68,12 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
 
 
 def bounded_density(draws: Floats, grid: Floats) -> Floats:
-    """Return the density of draws, (n,), mirrored at both ends, on a grid; NaN if equal."""
-    weights = np.full(draws.size, 1 / draws.size)
-    bandwidth = silverman(draws, weights)
-    if not bandwidth > 0:
+    """Return ArviZ's kernel density of draws, (n,), on a grid; NaN if all draws are equal."""
+    if not np.ptp(draws) > 0:
         return np.full(grid.shape, np.nan)
-    # Mirrored draws have weights of their own: the area within the range is one.
-    low = float(draws.min())
-    high = float(draws.max())
-    mirrored = np.concatenate([draws, 2 * low - draws, 2 * high - draws])
-    density = densities(mirrored, np.tile(weights, 3), grid, bandwidth)
-    return np.where((grid >= low) & (grid <= high), density, 0.0)
+    stats: Any = import_module("arviz_stats")  # heavy, and only needed for pictures
+    x, density, _ = stats.base.array_stats.kde(draws)
+    return np.asarray(np.interp(grid, x, density, left=0.0, right=0.0))
 
 
 def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:
@@ -88,7 +88,10 @@ def central_levels(prob: float) -> tuple[float, float]:
 
 
 def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:
-    """Return the range between quantiles at both tails that a tenth of samples, (P, n), exceed."""
+    """Return a range that contains all but the tails of nine tenths of samples, (P, n).
+
+    A tail has the probability ``tail`` at either end.
+    """
     samples = list(_finite_samples(values, weights))
     low = np.quantile([quantile(row, w, tail) for row, w in samples], 0.1)
     high = np.quantile([quantile(row, w, 1 - tail) for row, w in samples], 0.9)
@@ -101,7 +104,10 @@ def axis_range(
     earlier: tuple[float, float] | None,
     margin: float = 0.03,
 ) -> tuple[float, float]:
-    """Return the range of data, calibrated and earlier population; the last adds at most half."""
+    """Return the range of an axis for the data, the calibrated and the earlier population.
+
+    The earlier population widens the range of the others by at most half at either end.
+    """
     finite = observed[np.isfinite(observed)]
     low = min(calibrated[0], float(finite.min(initial=np.inf)))
     high = max(calibrated[1], float(finite.max(initial=-np.inf)))
@@ -121,12 +127,7 @@ def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tup
     values = observed[order]
     finite = np.isfinite(values)
     heights = cumulated(weights, order)[np.append(True, finite)]
-    return steps(values[finite], heights, low, high)
-
-
-def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
-    """Return the corners of a step function at sorted values; the first height is before them."""
-    x = np.concatenate([[low], np.repeat(values, 2), [high]])
+    x = np.concatenate([[low], np.repeat(values[finite], 2), [high]])
     return x, np.repeat(heights, 2)
 
 
@@ -154,21 +155,23 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     unit = np.where(spread > 0, spread, 1.0)
     scaled = deviations / unit
     variances, vectors = np.linalg.eigh(scaled.T @ (w[:, None] * scaled))
-    # Points on a line have a region too, thinner than its outline.
+    # Points on a line have no second axis. A short one gives them a region that is thinner than
+    # its outline.
     least = max(float(variances[-1]), 1e-300) * 1e-3**2
     axes = unit[:, None] * vectors * np.sqrt(np.maximum(variances, least))
     x, y = np.linalg.solve(axes, (points - center).T)
 
     # A Gaussian kernel along the principal axes, by Scott's rule for the effective sample size.
-    # Cells on a plane of 4.2 standard deviations: 2e-4 of a normal population are beyond. A cell is
-    # a fifth of the narrowest kernel for which the plane matters.
+    # The cells cover 4.2 standard deviations, which contain all but 2e-4 of a normal population. A
+    # cell is a fifth of the narrowest kernel whose width is visible.
     edges = np.linspace(-4.2, 4.2, 161)
     masses, *_ = np.histogram2d(x, y, bins=[edges, edges], weights=w)
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)
     density = gaussian_filter(masses, bandwidth / (edges[1] - edges[0]), mode="constant")
 
-    # The density above which a probability lies, and the lines of this height; without the kernel's
-    # inflation of the spread the regions of a normal population are its ellipses.
+    # A region is where the density exceeds the level above which the probability lies. The kernel
+    # inflates the spread. The outlines are deflated by as much, so that the regions of a normal
+    # population are its ellipses.
     descending = np.sort(density.ravel())[::-1]
     last = np.count_nonzero(descending) - 1
     middles = (edges[:-1] + edges[1:]) / 2
@@ -183,7 +186,7 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
 
 
 def with_gaps(lines: Sequence[Floats]) -> Floats:
-    """Return lines, (k, 2) each, as one with NaN between them: (2, k)."""
+    """Join lines, (k, 2) each, into one, (2, k), with NaN between them."""
     gap = np.full((1, 2), np.nan)
     parts = [part for line in lines for part in (line, gap)]
     return np.concatenate(parts[:-1]).T if parts else np.empty((2, 0))

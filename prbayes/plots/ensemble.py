@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from prbayes._display import percentage
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Floats, positive_integer
+from prbayes._validate import AT_ONCE, Floats, positive_integer, wrong_type
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
-from prbayes.plots.canvas import BLUE
+from prbayes.plots.canvas import BLUE, fill
 from prbayes.plots.curves import pointwise_band
 from prbayes.propagation.base import DesignError
 from prbayes.response.inputs import model_on_context
-from prbayes.results.predict import populations_of
+from prbayes.results.predict import thetas_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Populations of a result."""
+    """The calibrated population of a result, and populations that show its uncertainty."""
 
     evaluator: Evaluator
     center: Floats  # (0 or 1, d): the optimum; a posterior has none
-    # (P, d): draws of the posterior, or from the optimum's sampling distribution; none where that
-    # is unknown.
+    # (P, d): draws of the posterior, or of the optimum's sampling distribution; empty if that is
+    # unknown
     thetas: Floats
-    label: str  # of the curve in the middle
+    label: str  # name of the curve in the middle of the band
     spread: str  # name of the distribution that the band shows
 
     @property
@@ -58,7 +58,10 @@ def read_result(
     *,
     free: bool = False,
 ) -> Ensemble:
-    """Return at most ``n_draws`` populations of a result; ``free`` ones cost no response."""
+    """Return at most ``n_draws`` populations of a result.
+
+    With ``free`` the picture computes no response, and stored responses need not support them.
+    """
     if isinstance(result, Optimum) and (model is None or model is result.model):
         evaluator = result.evaluator
     else:
@@ -69,12 +72,10 @@ def read_result(
     if n_draws is not None:
         positive_integer(n_draws, "n_draws")
     else:
-        # The sides of a band are quantiles: with 200 curves the standard error of the probability
-        # beyond one side of an 89% band is 1.6%, with 40 it is 3.6%.
+        # The sides of a band are quantiles. The standard error of the probability beyond one side
+        # of an 89% band is 1.6% with 200 curves, and 3.6% with 40.
         n_draws = max(8, min(40, AT_ONCE // cost)) if cost else 200
-    points, _ = populations_of(result, evaluator.model, n_draws, caller)
-    values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
-    thetas = evaluator.hyperparameters.thetas_of(values)
+    thetas = thetas_of(result, evaluator, n_draws, caller)
     if isinstance(result, Optimum):
         around = thetas[:0]
         if np.isfinite(result.covariance).all():
@@ -135,10 +136,8 @@ def read_before(
             raise type(error)(f"before: {error.args[0]}") from None
         name = "as given"
     elif before not in (None, True):
-        raise TypeError(
-            f"before: got {type(before).__name__}, expected a dict with a value for each "
-            "hyperparameter, None or False"
-        )
+        expected = "a dict with a value for each hyperparameter, None or False"
+        raise wrong_type(before, "before", expected)
     else:
         name = "prior's initial point"
         if isinstance(result, Optimum) and not result.search.n_screened:
@@ -175,9 +174,7 @@ def draw_calibrated(
         sides = pointwise_band(spread, prob)
         top = max(top, float(sides[1].max()))
         text = f"{percentage(prob)} band of the {ensemble.spread}"
-        axis.fill_between(
-            grid, *sides, color=BLUE, alpha=alpha, linewidth=0, label=text, gid="band"
-        )
+        fill(axis, grid, *sides, alpha=alpha, label=text, gid="band")
     text = f"{name}: {ensemble.label}"
     axis.plot(grid, middle, color=BLUE, linewidth=2.2, label=text, gid="after")
     return top

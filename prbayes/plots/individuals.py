@@ -11,11 +11,12 @@ import xarray as xr
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
-from prbayes.model.parameters import element_name
+from prbayes.model.parameters import split_elements, stacked_draws
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
     check_options,
+    fill,
     finish,
     ink,
     named,
@@ -86,23 +87,20 @@ def plot_individuals(
     """
     check_options(labels, pc_kwargs)
     share(prob, "prob")
-    groups = individuals.children if isinstance(individuals, xr.DataTree) else {}
-    draws = groups["posterior"].to_dataset() if "posterior" in groups else xr.Dataset()
+    trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
+    groups = {name: tree.to_dataset() for name, tree in trees.items()}
+    draws = groups.get("posterior", xr.Dataset())
     has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
     if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
         raise TypeError(
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
-    parts = [groups[name].to_dataset() for name in groups]
-    dims = {dim for part in parts for dim in part.dims} - {"chain", "draw"}
-    observed, replicates = (
-        subset(individuals[name].to_dataset(), coords, dims)
-        for name in ("observed_data", "posterior_predictive")
-    )
-    constant = individuals["constant_data"].to_dataset() if "constant_data" in groups else draws
-    conditions = {} if constant is draws else subset(constant, coords, dims).data_vars
-    inputs = _elements(subset(draws, coords, dims))
+    dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
+    groups = {name: subset(group, coords, dims) for name, group in groups.items()}
+    observed, replicates = groups["observed_data"], groups["posterior_predictive"]
+    conditions = groups.get("constant_data", xr.Dataset()).data_vars
+    inputs = _elements(groups["posterior"])
     curves = [str(name) for name, y in observed.data_vars.items() if y[0].size > 6]
     readings = _elements(observed.drop_vars(curves))
     replicated = _elements(replicates.drop_vars(curves))
@@ -147,24 +145,21 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
     values = replicates.values.reshape(-1, x.size)
     low, median, high = np.nanquantile(values, [tail, 0.5, 1 - tail], axis=0)
     text = f"{percentage(prob)} of replicates"
-    axis.fill_between(
-        x, low, high, color=GREY, alpha=0.25, linewidth=0, label=text, gid="replicates"
-    )
+    fill(axis, x, low, high, color=GREY, label=text, gid="replicates")
     axis.plot(x, median, color=GREY, label="their median", gid="median")
     places = np.broadcast_to(x, y.shape)
     axis.scatter(places, y, 12, color=ink(), label="measured", gid="observed", zorder=3)
 
 
 def _elements(data: xr.Dataset) -> dict[str, Floats]:
-    """Return values of each element by name, (P, n); P = 1 without draws."""
-    elements = {}
-    for name, array in data.items():
-        values = array.values
-        values = values.reshape(-1, *values.shape[2:]) if "chain" in array.dims else values[None]
-        axes = [array[dim].values for dim in array.dims[array.ndim - values.ndim + 2 :]]
-        for index in np.ndindex(values.shape[2:]):
-            labels = [axis[i] for axis, i in zip(axes, index, strict=True)]
-            elements[element_name(str(name), labels)] = values[:, :, *index]
+    """Return values by the names of elements, (P, n): P draws, or one of data, of n specimens."""
+    draws = data if "chain" in data.dims else data.expand_dims(("chain", "draw"))
+    elements: dict[str, Floats] = {}
+    for name, values in stacked_draws(draws).items():
+        n_draws, n = values.shape[:2]
+        columns = values.values.reshape(n_draws, n, -1)
+        names = split_elements({name: values[0]})
+        elements |= zip(names, np.moveaxis(columns, -1, 0), strict=True)
     return elements
 
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, positive_integer
+from prbayes._validate import Floats, positive_integer, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.model.parameters import optimum_elements, single_elements, split_elements, variable_of
+from prbayes.model.parameters import optimum_elements, single_elements, split_elements
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import (
     BLUE,
@@ -30,6 +30,7 @@ from prbayes.plots.canvas import (
 )
 from prbayes.plots.ensemble import supported
 from prbayes.plots.selection import Coords, FilterVars, VarNames, elements_of, select
+from prbayes.results.compare import thetas_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,9 +116,11 @@ def plot_landscape(
     names = names[:2]
     refuse_labels(labels, hyperparameters, evaluator=evaluator)
     if points is None:
-        points = 161 if len(names) == 1 else 41  # contours look smooth, in about a second
+        # Curve and contours look smooth, and take about a second.
+        points = 161 if len(names) == 1 else 41
     else:
-        points = positive_integer(points, "points", minimum=5)  # fewer show no bowl
+        # Fewer points would not show where the objective is lowest.
+        points = positive_integer(points, "points", minimum=5)
     n_points = points ** len(names)
     cost = n_points * evaluator.responses_per_theta
     if cost > responses:
@@ -167,7 +170,8 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
 
 def _draw_plane(axis: Axes, surface: Landscape, objective: str) -> None:
     """Draw the objective over two hyperparameters, with the path and a colour bar."""
-    # Even levels of the root are evenly spaced around an optimum where heights are a parabola.
+    # Around an optimum the objective is a parabola. Even steps of its root give contours at even
+    # distances.
     finite = surface.heights[np.isfinite(surface.heights)]
     low = float(finite.min())
     high = float(np.quantile(finite, 0.9))
@@ -195,13 +199,16 @@ def distinct_texts(values: Floats) -> list[str]:
 
 
 def _draw_curve(axis: Axes, surface: Landscape, *, alone: bool) -> None:
-    """Draw the objective over one hyperparameter, ``alone`` with path and other optima."""
+    """Draw the objective over one hyperparameter.
+
+    The path and other optima are points of the curve only if there is no other hyperparameter.
+    """
     finite = np.isfinite(surface.heights)
     x = surface.axes[0][finite]
     heights = surface.heights[finite]
 
     def on_curve(places: Floats) -> Floats:
-        """Return the places, (m, 1), that the curve covers, with its heights: (2, m)."""
+        """Return the places, (m, 1), that the curve covers, and its heights there, (2, m)."""
         at = places[:, 0]
         at = at[(at >= x[0]) & (at <= x[-1])]
         return np.stack([at, np.interp(at, x, heights)])
@@ -220,15 +227,9 @@ def _draw_marks(axis: Axes, path: Any, optimum: Floats, local_optima: Floats) ->
     look: dict[str, Any] = {"color": VERMILION, "zorder": 3}
     axis.scatter(optimum[0], optimum[1], 90, marker="D", label="optimum", gid="optimum", **look)
     if local_optima.size:
-        axis.scatter(
-            local_optima[0],
-            local_optima[1],
-            70,
-            marker="x",
-            label="other optima",
-            gid="local_optima",
-            **look,
-        )
+        text = "other optima"
+        x, y = local_optima
+        axis.scatter(x, y, 70, marker="x", label=text, gid="local_optima", **look)
 
 
 # -- the objective and its values on a grid --------------------------------------------------
@@ -237,10 +238,7 @@ def _draw_marks(axis: Axes, path: Any, optimum: Floats, local_optima: Floats) ->
 def check_optimum(optimum: Any, caller: str) -> None:
     """Raise if it is no optimum, or one without a trace."""
     if not isinstance(optimum, Optimum):
-        raise TypeError(
-            f"{caller}: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() "
-            "first"
-        )
+        raise wrong_type(optimum, caller, "an Optimum; call prb.minimize() first")
     if not len(optimum.search.trace.get("theta", ())):
         raise ValueError(
             f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it"
@@ -277,7 +275,7 @@ def select_free(
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
 ) -> list[str]:
-    """Return names of these elements, all by default, without constants as zeros of a factor."""
+    """Return the names of free elements, all by default, without constant zeros of a factor."""
     point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}
     values = labelled(optimum.evaluator, point, {}).data_vars
     elements = elements_of({name: value.expand_dims("row") for name, value in values.items()})
@@ -289,11 +287,11 @@ def select_free(
 class Landscape:
     """The objective over a grid in the user's own units."""
 
-    axes: list[Floats]  # (n,): one for each hyperparameter
-    # (n,) or (n, n): the first hyperparameter along the first axis; NaN where stored responses do
-    # not support a population or the priors exclude it.
+    axes: list[Floats]  # grid of each hyperparameter, (n,)
+    # objective on the grid, (n,) or (n, n), with the first hyperparameter along the first axis; NaN
+    # where stored responses do not support a population or the priors exclude it
     heights: Floats
-    path: Floats  # (m, 1 or 2): points of the optimiser
+    path: Floats  # points of the optimiser, (m, 1 or 2)
     local_optima: Floats  # (m, 1 or 2)
     optimum: Floats  # (1, 1 or 2)
 
@@ -309,19 +307,22 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
 
     axes = []
     for name in names:
-        # The path beyond the prior's bulk, ten draws at each end, does not widen the axis.
+        # The optimiser may have started far out. Its path widens the axis to the central 98% of the
+        # prior at most.
         bulk = np.quantile(prior[name], (0.01, 0.99))
         marked = np.append(np.clip(path[name], *bulk), modes[name])
-        # Four standard errors: the normal approximation has a probability of 6e-5 beyond.
+        # Beyond four standard errors the normal approximation has a probability of 6e-5. If the
+        # error is unknown, the axis is as wide as the prior.
         reach = 4 * errors[name]
-        if not 0 < reach < np.inf:  # unknown: an axis as wide as the prior
+        if not 0 < reach < np.inf:
             reach = float(bulk[1] - bulk[0]) / 2
         first, last = center[name][0] - reach, center[name][0] + reach
-        # All marked points are within, by about the size of a marker.
+        # All marked points are inside the axis, with room for their markers.
         margin = 0.04 * (max(last, marked.max()) - min(first, marked.min()))
         ends = []
         for end in (min(first, marked.min() - margin), max(last, marked.max() + margin)):
-            # Within the support of the priors, short of its end by less than a 32nd.
+            # The objective exists within the support of the priors alone. The axis ends at the last
+            # of 32 steps that is inside.
             steps = np.linspace(center[name][0], end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
             ok = np.isfinite(thetas).all(axis=1)
@@ -342,12 +343,5 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
 
 def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
-    hyperparameters = evaluator.hyperparameters
-    columns: dict[str, list[Floats]] = {}
-    names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
-        columns.setdefault(variable_of(name, names), []).append(column)
-    shapes = hyperparameters.constrained(hyperparameters.initial[None])
-    values = [np.column_stack(columns[x]).reshape(-1, *shapes[x].shape[1:]) for x in names]
     with np.errstate(all="ignore"):
-        return hyperparameters.thetas_of(values)
+        return thetas_at(evaluator, elements)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Most outputs of one picture: the pairs of more are too small to be read.
+# largest number of outputs in a picture, because panels of more pairs are too small to be read
 _MOST = 7
 
 
@@ -131,13 +131,13 @@ def plot_outputs(
     earlier = _mixture(evaluator, start, k) if len(start) else None
     limits = []
     for output in columns:
-        # A normal population's region of 89% contains all but 1.8% of one output.
+        # The 89% region of a normal population in the plane contains all but 1.8% of each output.
         widest = None if earlier is None else _range(output, earlier, tail=0.02)
         observed, _ = output.measured()
         range_ = axis_range(observed, _range(output, calibrated, tail=0.01), widest, margin=0.04)
         limits.append(range_)
 
-    # A triangle of pairs: one column less than outputs, and one row
+    # The pairs make a triangle with one row and one column less than there are outputs.
     size = len(columns) - 1
     texts = [column.node.outputs.names[column.column or 0] for column in columns]
     names = {
@@ -165,21 +165,15 @@ def plot_outputs(
         points = _finite_pairs(x, y, *calibrated)
         _draw_regions(axis, "after", points, legend, color=BLUE)
         measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
-        axis.scatter(
-            measured[0][:, 0],
-            measured[0][:, 1],
-            14,
-            color=ink(),
-            label="measured",
-            gid="measured",
-            zorder=3,
-        )
+        look: dict[str, Any] = {"color": ink(), "zorder": 3}
+        first, second = measured[0].T
+        axis.scatter(first, second, 14, label="measured", gid="measured", **look)
         correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
         title = "rank correlation\nmeasured {}, calibrated {}".format(*correlations)
         axis.set(title=title, xlim=limits[j], ylim=limits[i + 1])
         axis.set_xticks(*round_ticks(*limits[j]))
         axis.set_yticks(*round_ticks(*limits[i + 1]))
-        if i == size - 1:  # names on the left and below all panels
+        if i == size - 1:  # Names stand below the last row and beside the first column alone.
             axis.set_xlabel(x.text(labels))
         if j == 0:
             axis.set_ylabel(y.text(labels))
@@ -192,7 +186,7 @@ def _shown_outputs(
     filter_vars: FilterVars | None,
     coords: Coords | None,
 ) -> tuple[int, list[Output]]:
-    """Return the index of the simulator, and its outputs in the picture."""
+    """Return the index of the simulator that the picture shows, and the outputs it shows."""
     nodes = evaluator.simulators
     alone = len(nodes) == 1
     several = {
@@ -210,7 +204,8 @@ def _shown_outputs(
     )
     names = select(elements, var_names, filter_vars, coords)
     selected = {k: sum(name in outputs for name in names) for k, outputs in several.items()}
-    # The first simulator, but one of which only some outputs are selected comes before.
+    # Take the first simulator of which only some outputs are selected, because its outputs were
+    # asked for, or else the first one.
     first = [k for k, n in selected.items() if 0 < n < len(several[k])]
     k = (first or [k for k, n in selected.items() if n])[0]
     rest = [name for name in names if name not in several[k]]
@@ -221,14 +216,14 @@ def _shown_outputs(
         )
     columns = [several[k][name] for name in names if name in several[k]]
     if len(columns) == len(several[k]):
-        varying = []  # by more than rounding
+        varying = []  # outputs whose measured values differ by more than rounding
         for output in columns:
             observed, _ = output.measured()
             finite = observed[np.isfinite(observed)]
             if np.ptp(finite) > 1e-9 * np.abs(finite).max():
                 varying.append(output)
         columns = varying if len(varying) > 1 else columns
-        if len(columns) > 5:  # of many outputs, such as a curve, four from the first to the last
+        if len(columns) > 5:  # Pairs of four outputs, from the first to the last, are legible.
             columns = [columns[round(place)] for place in np.linspace(0, len(columns) - 1, 4)]
     if not 2 <= len(columns) <= _MOST:
         raise ValueError(
@@ -241,8 +236,8 @@ def _shown_outputs(
 def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> tuple[Floats, Floats]:
     """Return specimens of the k-th simulator's mixture of populations: (n, m), weights (n,)."""
     values, weights = evaluator.populations(thetas, k)
-    if evaluator.simulators[k].reweighted is not None:  # all populations have the same points
-        values = values[0]
+    if evaluator.simulators[k].reweighted is not None:
+        values = values[0]  # All populations have the same points.
         weights = weights.mean(axis=0)
     else:
         values = values.reshape(-1, values.shape[-1])
@@ -289,7 +284,7 @@ def rank_correlation(points: Floats, weights: Floats) -> float:
         return np.nan
     ranks = []
     for column in points.T:
-        # The weight below each value, and half of that of equal ones
+        # The rank of a value is the weight below it, and half the weight of equal values.
         _, place = np.unique(column, return_inverse=True)
         mass = np.bincount(place, weights)
         ranks.append((np.cumsum(mass) - mass / 2)[place])

@@ -18,14 +18,13 @@ from prbayes.model.locking import locked
 from prbayes.model.margins import Margin, margins
 from prbayes.model.parameters import variable_of
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots.canvas import BLUE, check_options, finish, named, panels, refuse_labels
+from prbayes.plots.canvas import BLUE, check_options, finish, panels, refuse_labels, with_label
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
 from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,28 +116,22 @@ def plot_population(
         grid, curves = densities[margin.name]
         draw_calibrated(axis, grid, curves, ensemble, prob)
         y = "probability" if margin.discrete else "density"
-        axis.set(xlabel=_text(margin, labels), ylabel=y)
+        axis.set(xlabel=with_label(margin.name, margin.unit, labels), ylabel=y)
     for name, (first, second) in pairs.items():
         correlation = _draw_pair(axes[name], ensemble, first, second, prob)
-        title = f"correlation {correlation:.2f}"
-        axes[name].set(xlabel=_text(first, labels), ylabel=_text(second, labels), title=title)
+        x, y = (with_label(margin.name, margin.unit, labels) for margin in (first, second))
+        axes[name].set(xlabel=x, ylabel=y, title=f"correlation {correlation:.2f}")
     return finish(figure)
 
 
 def _coordinates(evaluator: Evaluator, margin: Margin) -> dict[str, Any]:
-    """Return the group of a margin, and its place in a multivariate input, by dimension."""
+    """Return the coordinates of a margin: its group, and its index in a multivariate input."""
     variable = variable_of(margin.name)
     places: dict[str, Any] = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
     groups = evaluator.simulators[margin.node].inputs.groups
     if groups is not None and margin.group:
         places[groups.dim] = groups.labels[groups.names.index(margin.group)]
     return places
-
-
-def _text(margin: Margin, labels: Mapping[str, str] | None) -> str:
-    """Return the label that was given, or the name with the unit."""
-    label = named(margin.name, labels)
-    return with_unit(label, margin.unit) if label == margin.name else label
 
 
 def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
@@ -154,7 +147,7 @@ def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
 
 def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float) -> float:
     """Draw outlines of regions of the calibrated population; return the correlation within it."""
-    # 200 000 specimens in all make a smooth line.
+    # With 200 000 specimens in all the line is smooth.
     n = max(2, 200_000 // len(ensemble.mixture))
     draws = _draws(ensemble.evaluator, x.node, ensemble.mixture, n, seed=0)
     points = np.column_stack([_values(draws, margin).ravel() for margin in (x, y)])
@@ -181,7 +174,7 @@ def margin_densities(
     several groups have one grid.
     """
     nodes = sorted({margin.node for margin in shown})
-    # The range of each axis, from specimens of some populations
+    # Specimens of 40 populations show the range of each axis.
     ranges: dict[Any, tuple[float, float]] = {}
     thinned = thetas[:: max(1, len(thetas) // 40)]
     few = {k: _draws(evaluator, k, thinned, 400, seed=0) for k in nodes}
@@ -191,7 +184,8 @@ def margin_densities(
         low, high = ranges.get(margin.axis, (first, last))
         ranges[margin.axis] = min(low, first), max(high, last)
 
-    many: dict[int, Any] = {}  # specimens of all populations, drawn only where they are needed
+    # Specimens of all populations, by simulator. They are drawn for kernel densities alone.
+    many: dict[int, Any] = {}
     densities = {}
     for margin in shown:
         k = margin.node
@@ -225,7 +219,7 @@ def _values(draws: Any, margin: Margin) -> Floats:
 
 
 def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) -> Floats | None:
-    """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
+    """Return the densities of a margin, (P, g); None if PyMC has no density of one element."""
     if inputs.nested or inputs.covariates:
         return None
     symbols = inputs.placeholders()
@@ -236,14 +230,15 @@ def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) 
         mean, covariance = dist.owner.op.dist_params(dist.owner)
         (i,) = margin.index
         logp = pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)
-    else:  # all elements at the same value
+    else:
+        # All elements have the same value, because the density of each is evaluated by itself.
         columns = pt.shape_padright(x, dist.type.ndim)
         try:
             logp = pm.logp(dist, columns + pt.zeros_like(dist), warn_rvs=False)
         except NotImplementedError:
             return None
         if logp.type.ndim != 1 + dist.type.ndim:
-            return None  # a density of all elements together
+            return None  # The density is one of all elements together.
         logp = logp[(slice(None), *margin.index)]
     function = compile_batched(symbols, [pt.exp(logp)], extra=[x])
     (density,) = function(*parents, grid.astype(x.dtype))

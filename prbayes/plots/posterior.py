@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, share
+from prbayes._validate import Floats, share, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
@@ -39,7 +39,7 @@ from prbayes.plots.selection import Coords, FilterVars, VarNames, elements_of, s
 if TYPE_CHECKING:
     from arviz_plots.plot_collection import PlotCollection
 
-# Colour, and ArviZ's codes of line style and marker, of each distribution.
+# colour, and ArviZ's codes of line style and marker, of each distribution
 _LOOKS = {
     "posterior": (BLUE, "C0", "C0"),
     "optimum": (VERMILION, "C1", "C4"),
@@ -121,15 +121,9 @@ def plot_posterior(
     """
     check_options(labels, pc_kwargs, by_arviz=True)
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
-        raise TypeError(
-            f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
-            "posterior group"
-        )
+        raise wrong_type(posterior, "plot_posterior", "a DataTree with a posterior group")
     if optimum is not None and not isinstance(optimum, Optimum):
-        raise TypeError(
-            f"plot_posterior: optimum: got {type(optimum).__name__}, expected an Optimum from "
-            "prb.minimize"
-        )
+        raise wrong_type(optimum, "plot_posterior: optimum", "an Optimum from prb.minimize")
     identities = {"posterior": identity_in(posterior), "optimum": identity_in(optimum)}
     require_together(identities, "plot_posterior")
     if model is not None:
@@ -141,7 +135,7 @@ def plot_posterior(
         )
     evaluator = None if model is None else Evaluator.of(model)
 
-    # Elements of the variables that posterior, optimum and model share
+    # The picture shows elements that posterior, optimum and model have in common.
     stacked = stacked_draws(posterior["posterior"])
     draws = split_elements(stacked)
     shared = {name for name in table_elements(stacked) if np.ptp(draws[name]) > 0}
@@ -152,7 +146,7 @@ def plot_posterior(
         shared &= set(best)
     prior: dict[str, Floats] = {}
     if evaluator is not None:
-        # 4000 draws give a normal density's peak within 2%.
+        # With 4000 draws the peak of a normal density has an error of 2%.
         thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
         values = evaluator.hyperparameters.constrained(thetas)
         prior = split_elements(labelled(evaluator, values, {"draw": len(thetas)}).data_vars)
@@ -165,13 +159,14 @@ def plot_posterior(
     elements = elements_of(stacked)
     available = {name: elements[name] for name in draws if name in shared}
     names = select(available, var_names, filter_vars, coords)
-    if var_names is None:  # those that a reader wants
+    if var_names is None:
+        # A reader wants standard deviations and correlations, and no packed Cholesky factor.
         names = list(readable_elements(names))
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     summaries = {}
     for name in names:
         estimate = (best[name], errors.get(name, np.nan)) if name in best else None
-        # Names are paths in a tree, with slashes between levels.
+        # ArviZ stores names as paths of a tree, in which a slash would be another level.
         key = name.replace("/", "\u2215")
         summaries[key] = _summary(draws[name], prior.get(name), estimate, prob)
     texts = {name.replace("/", "\u2215"): named(name, labels) for name in names}
@@ -181,36 +176,29 @@ def plot_posterior(
 def _summary(
     draws: Floats, prior: Floats | None, estimate: tuple[float, float] | None, prob: float
 ) -> xr.Dataset:
-    """Return densities, intervals, points, and places of bars, by distribution."""
-    low = float(draws.min())
-    high = float(draws.max())
-    best, error = estimate or (0.0, np.nan)
-    has_error = 0 < error < np.inf
-    if estimate is not None:
-        reach = 3 * error if has_error else 0.0
-        low = min(low, best - reach)
-        high = max(high, best + reach)
-    grid = np.linspace(low, high, 301)
-    density = bounded_density(draws, grid)
+    """Return what ArviZ draws of posterior, optimum and prior: densities, intervals and points."""
+    best, error = estimate or (np.nan, np.nan)
+    # All numbers of the normal distribution are NaN if the standard error is unknown.
+    normal = norm(best, error if 0 < error < np.inf else np.nan)
     levels = central_levels(prob)
-    nothing = np.full(2, np.nan)
-    # By distribution: draws, density, ends of the interval, point, and place of both below zero,
-    # far enough apart that the diamond of one does not touch the dot of the other.
+    reach = 3 * normal.std()
+    shown = [draws.min(), draws.max(), best, best - reach, best + reach]
+    grid = np.linspace(np.nanmin(shown), np.nanmax(shown), 301)
+    density = bounded_density(draws, grid)
+    # A row has draws, density, ends of the interval, point, and the height of interval and point
+    # below zero. The heights are far enough apart that the markers do not touch.
     rows: dict[str, tuple[Any, ...]] = {
         "posterior": (draws, density, np.quantile(draws, levels), draws.mean(), -0.07)
     }
     if estimate is not None:
-        normal = norm(best, error if has_error else 1.0)
-        curve = normal.pdf(grid) if has_error else np.full(grid.shape, np.nan)
-        ends = normal.ppf(levels) if has_error else nothing
-        rows["optimum"] = (np.array([best]), curve, ends, best, -0.17)
+        rows["optimum"] = (np.array([best]), normal.pdf(grid), normal.ppf(levels), best, -0.17)
     if prior is not None:
-        rows["prior"] = (prior, bounded_density(prior, grid), nothing, np.nan, 0.0)
+        rows["prior"] = (prior, bounded_density(prior, grid), np.full(2, np.nan), np.nan, 0.0)
     samples, curves, ends, points, places = zip(*rows.values(), strict=True)
     size = max(map(len, samples))
     padded = [np.append(x, np.full(size - len(x), np.nan)) for x in samples]
     along = "distribution"
-    # ArviZ leaves out a line without numbers.
+    # ArviZ does not draw a line of NaN.
     lines = [[np.where(np.isnan(curve), np.nan, grid), curve] for curve in curves]
     return xr.Dataset(
         {
@@ -241,7 +229,8 @@ def _draw(
     columns, options = layout(len(summaries), (4.6, 3.6), pc_kwargs)
     if backend != "matplotlib":
         options.pop("layout")
-        if "figsize" not in pc_kwargs.get("figure_kwargs", {}):  # in dots, 100 per inch
+        if "figsize" not in pc_kwargs.get("figure_kwargs", {}):
+            # The other libraries measure in dots, 100 per inch.
             width, height = options["figsize"]
             options |= {"figsize": (100 * width, 100 * height), "figsize_units": "dots"}
     rest = {key: value for key, value in pc_kwargs.items() if key != "figsize"}

@@ -11,7 +11,17 @@ import xarray as xr
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import share
-from prbayes.plots.canvas import BLUE, check_options, finish, ink, named, panels, refuse_labels
+from prbayes.plots.canvas import (
+    BLUE,
+    check_options,
+    counted_title,
+    fill,
+    finish,
+    ink,
+    panels,
+    refuse_labels,
+    with_label,
+)
 from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
@@ -20,7 +30,6 @@ from prbayes.plots.curves import (
     staircase,
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select
-from prbayes.response.outputs import with_unit
 from prbayes.validation.conditions import comparables
 
 if TYPE_CHECKING:
@@ -101,19 +110,15 @@ def plot_prediction(
         limits = axis_range(measured, central_range(pair.predicted, weights, tail=0.005), None)
         grid = np.linspace(*limits, GRID_POINTS)
         curves = distribution_function(pair.predicted, weights, grid)
-        look: dict[str, Any] = {"color": BLUE, "linewidth": 2.2}
         if len(curves) > 1:
             sides = pointwise_band(curves, prob)
             text = f"{percentage(prob)} of the populations"
-            axis.fill_between(
-                grid, *sides, color=BLUE, alpha=0.25, linewidth=0, label=text, gid="band"
-            )
-        axis.plot(grid, curves.mean(axis=0), **look, label="predicted", gid="predicted")
+            fill(axis, grid, *sides, label=text, gid="band")
+        middle = curves.mean(axis=0)
+        axis.plot(grid, middle, color=BLUE, linewidth=2.2, label="predicted", gid="predicted")
         steps = staircase(measured, np.full(measured.size, 1 / measured.size), *limits)
         axis.plot(*steps, color=ink(), linewidth=1.4, label="measured", gid="measured")
-        failed = np.count_nonzero(np.isinf(measured))
-        title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
-        label = named(name, labels)
-        label = with_unit(label, pair.unit) if label == name else label
+        title = counted_title(measured.size, "measured values", failed=np.isinf(measured).sum())
+        label = with_label(name, pair.unit, labels)
         axis.set(xlabel=label, ylabel="share of specimens", title=title)
     return finish(figure)

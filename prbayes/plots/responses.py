@@ -17,11 +17,12 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
-    BLUE,
     GREY,
     VERMILION,
     Limits,
     check_options,
+    counted_title,
+    fill,
     finish,
     ink,
     named,
@@ -153,7 +154,7 @@ def plot_responses(
     has_lines = any(output.is_in_lines for output in shown)
     size = (7.2, 4.8) if has_lines else (5.4, 4.2)
     figure, axes = panels(names, size=size, pc_kwargs=pc_kwargs)
-    limits: dict[str, Limits] = {}  # by axis: panels of groups have one
+    limits: dict[str, Limits] = {}  # ranges of axes by name; panels of groups share an axis
     contents = []
     for k, node in enumerate(evaluator.simulators):
         columns = [output for output in shown if output.node is node]
@@ -166,7 +167,7 @@ def plot_responses(
             first = None if earlier is None else (output.of(earlier[0]), earlier[1])
             contents.append((output, sample, first))
             if sample[0].ndim == 2:
-                # More of the population before is beyond the axis
+                # The population before the calibration may be far away. More of it is left out.
                 widest = None if first is None else central_range(*first, tail=0.05)
                 observed, _ = output.measured()
                 low, high = axis_range(observed, central_range(*sample, tail=0.005), widest)
@@ -190,7 +191,7 @@ class _Drawing:
 
     axis: Axes
     ensemble: Ensemble
-    start: str  # name of the population before
+    start: str  # name of the population before the calibration
     prob: float
     text: str  # label of the responses
     labels: Mapping[str, str] | None
@@ -207,7 +208,8 @@ class _Drawing:
         """Draw the distribution of one output: data first, then the populations."""
         axis = self.axis
         observed, weights = output.measured()
-        is_sheet = output.node.metric.exact_likelihood  # statistics, which have no distribution
+        # The statistics of a data sheet are no sample, and have no distribution.
+        is_sheet = output.node.metric.exact_likelihood
         grid = np.linspace(*limits, GRID_POINTS)
         curves_of = distribution_function if ecdf else smooth_densities
         marks: dict[str, Any] = {"marker": "|", "color": ink(), "gid": "rug", "zorder": 3}
@@ -221,8 +223,8 @@ class _Drawing:
         else:
             density = measured_density(observed, weights, grid)
             top = float(density.max())
-            look: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
-            axis.fill_between(grid, density, **look, label="measured, smoothed", gid="measured")
+            text = "measured, smoothed"
+            fill(axis, grid, density, color=GREY, alpha=0.3, label=text, gid="measured")
             finite = observed[np.isfinite(observed)]
             axis.scatter(finite, 0 * finite, 60, label="measured", **marks)
         initial = np.zeros(1)
@@ -232,11 +234,11 @@ class _Drawing:
             axis.plot(grid, initial, "--", color=VERMILION, label=text, gid="before")
         curves = curves_of(*population, grid)
         top = max(top, draw_calibrated(axis, grid, curves, self.ensemble, self.prob))
-        if initial.max() > 2 * top:  # a narrow peak before would dwarf all other curves
+        if initial.max() > 2 * top:
+            # A narrow peak before the calibration would flatten all other curves.
             axis.set_ylim(-0.05 * top, 2 * top)
-        failed = np.count_nonzero(np.isinf(observed))
-        title = f"{observed.size} {'statistics' if is_sheet else 'measured values'}"
-        title += f", {failed} failed" if failed else ""
+        noun = "statistics" if is_sheet else "measured values"
+        title = counted_title(observed.size, noun, failed=np.isinf(observed).sum())
         y = "share of specimens" if ecdf else "density"
         axis.set(xlabel=self.text, ylabel=y, title=title, xlim=limits)
 
@@ -255,14 +257,14 @@ class _Drawing:
             places = np.array(outputs.labels, dtype=np.float64)
             order = np.argsort(places)
             center, unit = np.zeros(places.size), np.ones(places.size)
-        else:  # outputs with names, each in its own spread
+        else:  # Outputs with names have different units: each is divided by its spread.
             order = np.arange(len(outputs.labels))
             places = order.astype(np.float64)
             finite = np.where(np.isfinite(observed), observed, np.nan)
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
             axis.set_xticks(places, list(outputs.names))
-            # An inch takes twelve characters of the default font
+            # An inch takes twelve characters of the default font. Longer names are turned.
             inches = axis.bbox.width / axis.figure.dpi
             if max(map(len, outputs.names)) + 1 > 12 * inches / places.size:
                 axis.tick_params(axis="x", labelrotation=90)
@@ -276,13 +278,12 @@ class _Drawing:
 
         widest = None if earlier is None else _finite_range(initial)
         low, high = axis_range(measured, _finite_range(np.median(lines, axis=0)), widest)
-        # Lines leave the picture where the specimens have failed.
+        # Failures are +inf. Clipped lines leave the picture there.
         room = high - low
         lines = np.clip(lines, low - room, high + room)
         lower, upper = (middle_of(lines[:, i], self.ensemble) for i in (0, 2))
         text = f"{INTERVAL:.0%} of the calibrated population"
-        look: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
-        axis.fill_between(x, lower, upper, **look, label=text, gid="population")
+        fill(axis, x, lower, upper, label=text, gid="population")
         line = _joined(x, measured)
         axis.plot(*line, color=GREY, linewidth=0.5, label="measured", gid="measured")
         if earlier is not None:
@@ -292,11 +293,12 @@ class _Drawing:
         median: Any = {"name": "median, calibrated", "alpha": 0.55}
         draw_calibrated(axis, x, lines[:, 1], self.ensemble, self.prob, **median)
 
-        incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
-        failed = np.count_nonzero(np.isinf(observed).any(axis=1))
-        title = f"{len(observed)} measured specimens"
-        title += f", {incomplete} incomplete" if incomplete else ""
-        title += f", {failed} failed" if failed else ""
+        title = counted_title(
+            len(observed),
+            "measured specimens",
+            incomplete=np.isnan(observed).any(axis=1).sum(),
+            failed=np.isinf(observed).any(axis=1).sum(),
+        )
         axis.set(xlabel=named(outputs.dim, self.labels), ylabel=y, title=title, ylim=(low, high))
 
 
@@ -306,7 +308,7 @@ def _finite_range(values: Floats) -> Limits:
 
 
 def _joined(x: Floats, rows: Floats) -> Floats:
-    """Return lines, (n, m), as one with gaps; a line continues after missing values."""
+    """Join rows, (n, m), into one line with gaps between rows, but not at missing values."""
     points = [np.column_stack([x, row]) for row in rows]
     return with_gaps([line[np.isfinite(line[:, 1])] for line in points])
 
@@ -314,16 +316,16 @@ def _joined(x: Floats, rows: Floats) -> Floats:
 # -- outputs in panels of their own, or as lines in one panel --------------------------------
 
 
-# Quantiles of a population that lines show: the ends of its central interval, and the median.
+# levels of the quantiles that lines show: ends of the central interval, and the median between
 LEVELS = np.array([*central_levels(INTERVAL), 0.5])[[0, 2, 1]]
 
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """One output of a simulator, or the only one, or all of a curve."""
+    """What a panel shows of a simulator: one of several outputs, its only output, or a curve."""
 
     node: PopulationSimulator
-    column: int | None  # of several outputs; None where there is one, or all are meant
+    column: int | None  # column among several outputs; None for a single output, or for all
     alone: bool  # whether the model has no other simulator
 
     @property
@@ -335,7 +337,7 @@ class Output:
 
     @property
     def is_in_lines(self) -> bool:
-        """Whether it is several outputs as lines over their labels."""
+        """Whether the panel shows all outputs, as lines over their labels."""
         return self.column is None and bool(self.node.outputs.event)
 
     @property
@@ -349,7 +351,7 @@ class Output:
 
     @property
     def axis(self) -> str:
-        """The name without its group: panels of groups have one range."""
+        """The name without the group, because panels of groups share the range of their axis."""
         return self.name.replace(f"[{self.node.group}]", "", 1) if self.node.group else self.name
 
     def text(self, labels: Mapping[str, str] | None) -> str:
@@ -375,7 +377,7 @@ class Output:
         return with_unit(f"{simulator}: {output}", unit)
 
     def of(self, values: Floats) -> Floats:
-        """Return its values among those of all outputs, (..., m) -> (...)."""
+        """Return the values of this output among those of all, (..., m) -> (...)."""
         return values if self.column is None else values[..., self.column]
 
     def measured(self) -> tuple[Floats, Floats]:
@@ -440,7 +442,7 @@ def quantiles(values: Floats, weights: Floats, levels: Floats) -> Floats:
     """Return quantiles of outputs, (P, n, m), (P, n), (L,) -> (P, L, m), without NaN."""
     populations, _, m = values.shape
     out = np.empty((populations, len(levels), m))
-    is_shared = values.strides[0] == 0  # the same values for all populations, sorted once
+    is_shared = values.strides[0] == 0  # All populations have the same values, sorted once.
     for j in range(m):
         for i in range(populations):
             if not (is_shared and i):

@@ -16,7 +16,7 @@ from prbayes.model.parameters import split_elements, variable_of
 VarNames = str | Sequence[str]
 FilterVars = Literal["like", "regex"]
 Coords = Mapping[str, Any]
-# Variable, and coordinate by dimension, of each element by name.
+# variable of each element, and its coordinate by dimension, by the name of the element
 Elements = Mapping[str, tuple[str, Mapping[str, Any]]]
 
 
@@ -56,13 +56,13 @@ def select(
 def select_variables(
     names: Iterable[str], var_names: VarNames | None, filter_vars: FilterVars | None
 ) -> list[str]:
-    """Return names that ArviZ's arguments select, each an element of a variable."""
+    """Return the names that ArviZ's arguments select; each name is an element of a variable."""
     elements: Elements = {name: (variable_of(name), {}) for name in names}
     return _select_names(elements, var_names, filter_vars)
 
 
 def subset(data: xr.Dataset, coords: Coords | None, available: Iterable[Any] = ()) -> xr.Dataset:
-    """Return data with some labels of their dimensions; ``available`` are those of other data."""
+    """Return data at the selected labels; ``available`` are dimensions that other data have."""
     for dim, value in _items(coords, {*map(str, data.dims), *map(str, available)}):
         if dim in data.dims:
             data = data.sel({dim: _selected_labels(data[dim].values.tolist(), dim, value)})

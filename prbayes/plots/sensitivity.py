@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from prbayes._validate import wrong_type
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -75,10 +76,7 @@ def plot_sensitivity(
     check_options(labels, pc_kwargs)
     variables = {"first", "total", "first_error", "total_error", "factor", "kind"}
     if not isinstance(table, xr.Dataset) or not variables <= set(table.variables):
-        got = type(table).__name__
-        raise TypeError(
-            f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
-        )
+        raise wrong_type(table, "plot_sensitivity: table", "the Dataset of prb.sensitivity")
     names = select_variables(table.factor.values.tolist(), var_names, filter_vars)
     table = table.sel(factor=names)
     refuse_labels(labels, names)

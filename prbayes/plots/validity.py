@@ -15,11 +15,12 @@ from prbayes.plots.canvas import (
     PALE,
     VERMILION,
     check_options,
+    fill,
     finish,
     ink,
     panels,
 )
-from prbayes.plots.curves import steps, with_gaps
+from prbayes.plots.curves import staircase, with_gaps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 
@@ -74,14 +75,14 @@ def plot_validity(
             f"plot_validity: got {got}, expected a ValidityTest from prb.area_test, or several by "
             "name"
         )
-    # The panel of a single test has a name too
+    # The panel of a single test needs a name as its label.
     names = [name or "u" for name in by_name]
     figure, axes = panels(names, size=(4.6, 4.8), pc_kwargs=pc_kwargs)
     for (name, test), axis in zip(by_name.items(), axes.values(), strict=True):
         color = VERMILION if test.rejected else BLUE
         directions = in_directions(test)
         if directions:
-            # Conditions of one output are one line of their own
+            # All conditions with a single output make one more line.
             single = test.u_values[~_is_of_direction(test)]
             lines = [single, *directions] if single.size else directions
             thin: dict[str, Any] = {"color": color, "linewidth": 0.8}
@@ -95,8 +96,8 @@ def plot_validity(
         else:
             values = np.abs(2 * test.u_values - 1) if test.folded else test.u_values
             ecdf = _ecdf([values])
-            axis.fill_between(*_envelope(test), color=PALE, alpha=0.4, linewidth=0, gid="envelope")
-            axis.fill_between(*_between(*ecdf), color=color, alpha=0.4, linewidth=0, gid="area")
+            fill(axis, *_envelope(test), color=PALE, alpha=0.4, gid="envelope")
+            fill(axis, *_between(*ecdf), color=color, alpha=0.4, gid="area")
             axis.plot(*ecdf, color=color, gid="ecdf")
             x = "u-value"
             y = f"share of {values.size} values"
@@ -131,14 +132,14 @@ def _ecdf(samples: Sequence[Floats]) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
     curves = []
     for values in samples:
-        heights = np.arange(values.size + 1) / values.size
-        curves.append(np.column_stack(steps(np.sort(values), heights, 0.0, 1.0)))
+        weights = np.full(values.shape, 1 / values.size)
+        curves.append(np.column_stack(staircase(values, weights, 0.0, 1.0)))
     return with_gaps(curves)
 
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     """Return places, and the lower and upper side of the area between an ECDF and the identity."""
-    # Where a step crosses the identity there is a corner too: between two corners of one height
+    # A step that crosses the identity gets a corner there, so that the sides of the area meet.
     crosses = (x[:-1] < y[:-1]) & (x[1:] > y[:-1])
     at = np.flatnonzero(crosses)
     height = y[at]

@@ -10,37 +10,29 @@ import xarray as xr
 
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
+from prbayes._validate import Floats
 from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
-from prbayes.model.parameters import (
-    optimum_elements,
-    readable_variables,
-    single_elements,
-    split_elements,
-    stacked_draws,
-    table_elements,
-    variable_of,
-)
+from prbayes.model.parameters import readable_variables, variable_of
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots.canvas import named
+from prbayes.plots.canvas import named, with_label
 from prbayes.plots.validity import in_directions
-from prbayes.reports.material import Material, kind_of_decision
+from prbayes.reports.material import Material, Observed, kind_of_decision
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
     described,
     enumerated,
+    finite_sd,
     in_percent,
     number,
     plus_minus,
     rows_table,
-    sample_sd,
     with_zeros,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT, with_unit
+from prbayes.results.compare import estimates_in, estimates_of
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.conditions import Comparable, comparables
 
 # -- page one --------------------------------------------------------------------------------
 
@@ -65,7 +57,7 @@ def verdict(m: Material) -> list[Section]:
     elif m.results:
         title = "Not tested"
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
-    elif m.description is None:
+    elif not m.description["variables"]:
         return []
     if m.results and mark != "bad" and None in m.diagnoses.values():
         text.append("Not all results were diagnosed: that needs the model.")
@@ -80,7 +72,7 @@ def verdict(m: Material) -> list[Section]:
 
 
 def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
-    """Return a requirement with its answer; of a model that may not be used it has none."""
+    """Return a requirement and, if the model may be used, its answer."""
     allowed = f"allowed: at most {percentage(table.attrs['requirement'])}"
     if not m.is_usable:
         reason = "the model is rejected" if m.rejected else "solve the problems first"
@@ -97,9 +89,9 @@ def _requirement(label: str, table: xr.Dataset, m: Material) -> Section:
 
 
 def _expected(table: xr.Dataset, prob: float) -> str:
-    """Return a probability with its interval, as shares of specimens.
+    """Return a sentence on a probability and its interval, as shares of specimens.
 
-    The interval is called by its probability if that is another than ``prob``.
+    The sentence names the probability of the interval unless it is ``prob``.
     """
     floor = min(1e-5, table.attrs.get("requirement", 1.0) / 10)
     bounds = dict.fromkeys(in_percent(p, floor) for p in np.ravel(table["probability"].values))
@@ -113,7 +105,7 @@ def _tested(m: Material) -> str:
     """Return the number of tested specimens, with their conditions where these have names."""
     labels = {label for test in m.tests.values() for label in test.specimens.tolist()}
     conditions = dict.fromkeys(name for test in m.tests.values() for name in test.of_conditions)
-    # A single condition may only have the name of a function.
+    # The name of a single condition may be that of a function, which readers do not know.
     is_named = len(conditions) > 1 or set(conditions) <= {*m.validation, *m.labels}
     shown = [named(condition, m.labels) for condition in conditions]
     where = f" ({enumerated(shown)})" if is_named and len(shown) <= 4 else ""
@@ -125,12 +117,12 @@ def _data(m: Material) -> str:
     data = []
     for name, sheet in m.sheets.items():
         data.append(f"a data sheet of {named(name, m.labels)} ({sheet})")
-    labelled = {s["name"]: s["specimens"].partition(":")[0] for s in m.simulators}
+    labelled = {s["name"]: s["n_specimens"] for s in m.description["simulators"]}
     for name, y in m.observed.items():
-        measured = counted(y.size, "measured value")
-        if y.ndim > 1:
-            n, outputs = y.shape
-            # Of a group the specimens are not known where they have labels.
+        measured = counted(y.values.size, "measured value")
+        if y.values.ndim > 1:
+            n, outputs = y.values.shape
+            # If specimens have labels, it is unknown how many of them a group has.
             is_labelled = bool(labelled.get(name.partition("[")[0]))
             rows = counted(n, "reading" if is_labelled else "specimen")
             measured = f"{labelled.get(name) or rows} with {counted(outputs, 'output')}"
@@ -139,7 +131,7 @@ def _data(m: Material) -> str:
 
 
 def population_in_units(m: Material) -> list[Section]:
-    """Return moments, quantiles and tolerance bounds of the inputs, by the first result."""
+    """Return moments, quantiles and tolerance bounds of the inputs, from the first result."""
     results: list[Optimum | xr.DataTree] = [*m.posteriors.values(), *m.live_optima.values()]
     result = results[0] if results else None
     if m.model is None or result is None or m.rejected or not population_simulators(m.model):
@@ -148,28 +140,24 @@ def population_in_units(m: Material) -> list[Section]:
         table = population(result, model=m.model, prob=m.prob)
     except (TypeError, ValueError, NotImplementedError):
         return []
-    words = {"sd": "standard deviation", "50% quantile": "median"}
-    columns: dict[str, dict[str, str]] = {}
-    for name, unit, cells in table.rows():
-        label = named(name, m.labels)
-        texts = {}
-        for quantity in table["quantity"].values.tolist():
-            value, interval = cells.get(quantity, ("", ""))
-            percent = "%" if quantity == "cv" and value else ""
-            text = f"{value}{percent} ({interval})" if interval else f"{value}{percent}"
-            other = quantity.removeprefix("correlation with ")
-            if other != quantity:
-                quantity = f"correlation with {named(other, m.labels)}"
-            texts[words.get(quantity, quantity.replace("cv", "coefficient of variation"))] = text
-        columns[with_unit(label, unit) if label == name else label] = texts
-    if len(columns) <= 4:  # a line for each quantity, which fits on a page
-        names = next(iter(columns.values()))
-        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in names]
+    shown = table.to_view()
+    prefix = "correlation with "
+    quantities = [
+        prefix + named(q.removeprefix(prefix), m.labels) if q.startswith(prefix) else q
+        for q in shown.header[1:]
+    ]
+    columns = {}
+    for (name, unit, _), (_, *texts) in zip(table.rows(), shown.rows, strict=True):
+        label = with_label(name, unit, m.labels)
+        columns[label] = dict(zip(quantities, texts, strict=True))
+    if len(columns) <= 4:  # With a line for each quantity the table fits on a page.
+        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in quantities]
     else:
         rows = [{"input": x} | texts for x, texts in columns.items()]
     about = (
-        "How the inputs vary from specimen to specimen, with intervals in brackets. 90% of the "
-        "specimens exceed the B-basis value, 99% the A-basis value, with 95% confidence."
+        "How the inputs vary from specimen to specimen, with intervals in brackets: mean, standard "
+        "deviation (sd), coefficient of variation (cv) and quantiles. 90% of the specimens exceed "
+        "the B-basis value, 99% the A-basis value, with 95% confidence."
     )
     return [Section("Population of the inputs", about, rows_table(rows), level=3)]
 
@@ -211,7 +199,7 @@ def _risk(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
     interval = f"{number(float(table.lower), 2)} to {number(float(table.upper), 2)}"
     return [
         {
-            # The answer first: the end of a wide table is off a phone's screen
+            # The answer is the first column, as the end of a wide table is off a phone's screen.
             "requirement is": answer,
             "probability": number(float(value), 2),
             f"{percentage(table.attrs['prob'])} interval": interval,
@@ -242,7 +230,7 @@ def _indices(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
 
 
 def _plan(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
-    """Return the rows of a plan, the present first."""
+    """Return the rows of a plan, with the present standard deviations first."""
     names = [str(name) for name in table.name.values]
 
     def row(text: str, sd: xr.DataArray) -> dict[str, Any]:
@@ -298,7 +286,7 @@ def next_steps(m: Material) -> list[Section]:
             "values lie beside the predicted ones or scatter more; then correct the simulation, "
             "let another input vary, or calibrate an error of the model."
         )
-    # In directions of several outputs the test of the scatter is a part of the statistic.
+    # For several outputs the statistic contains a test of the scatter.
     elif not any(test.folded or in_directions(test) for test in m.tests.values()):
         steps.append("Test the scatter as well, each of the two tests at half the level.")
     if not m.posteriors:
@@ -333,15 +321,18 @@ def answer(m: Material) -> list[Section]:
         return []
     label = next(iter(m.posteriors or m.optima))
     rows = []
+    has_draws = label in m.posteriors
     for name, (value, sd, *ends) in _estimates(m, label).items():
         texts = alike((value, sd, *ends), sd, 2)
         meaning = named(name, m.labels)
         row = {"parameter": name, "meaning": "" if meaning == name else meaning}
         row["estimate"] = texts[0]
-        if np.isinf(sd):  # the data do not identify it
+        if np.isinf(sd):  # The data do not identify the parameter.
             texts[1] = NOTHING
-        row["standard deviation" if ends else "standard error"] = texts[1]
-        rows.append(row | dict(zip((f"{percentage(m.prob)} from", "to"), texts[2:], strict=False)))
+        row["standard deviation" if has_draws else "standard error"] = texts[1]
+        if has_draws:
+            row |= {f"{percentage(m.prob)} from": texts[2], "to": texts[3]}
+        rows.append(row)
     shown = rows if len(rows) <= 30 else []
     text = ["The estimates are in the appendix."]
     if shown:
@@ -357,26 +348,15 @@ def answer(m: Material) -> list[Section]:
 
 
 def _estimates(m: Material, label: str) -> dict[str, tuple[float, ...]]:
-    """Return estimate and spread of each parameter by a result, and the interval of draws."""
-    estimates: dict[str, tuple[float, ...]] = {}
-    if label in m.posteriors:
-        stacked = stacked_draws(m.posteriors[label]["posterior"])
-        draws = split_elements(stacked)
-        tails = [(1 - m.prob) / 2, (1 + m.prob) / 2]
-        for name in table_elements(stacked):
-            x = draws[name]
-            ends = np.quantile(x, tails).tolist()
-            estimates[name] = float(x.mean()), float(x.std(ddof=1)), *ends
-    else:
-        optimum = m.optima[label]["optimum"].data_vars
-        stderr = m.optima[label]["stderr"].data_vars
-        points, errors = single_elements(optimum), single_elements(stderr)
-        for name in optimum_elements(optimum, stderr):
-            estimates[name] = points[name], errors[name]
-    names = m.hyperparameters
-    variable = {name: variable_of(name, names) for name in estimates}
-    variables = readable_variables(names, set(variable.values()))
-    return {name: pair for name, pair in estimates.items() if variable[name] in variables}
+    """Return estimate, spread and interval of each hyperparameter by a result."""
+    estimates, elements = estimates_of(m.results[label], m.prob)
+    variables = m.description["variables"]
+    names = [v["name"] for v in variables if v["role"] == "hyperparameter"]
+    # Without a description deterministics cannot be told from hyperparameters.
+    names = names or list(map(str, estimates_in(m.results[label]).data_vars))
+    variable = {name: variable_of(name, names) for name in elements}
+    readable = readable_variables(names, set(variable.values()))
+    return {name: estimates[name] for name in elements if variable[name] in readable}
 
 
 # -- evidence --------------------------------------------------------------------------------
@@ -388,44 +368,37 @@ def data(m: Material) -> list[Section]:
         return []
     rows: list[dict[str, Any]] = []
     text = [f"{named(name, m.labels)}: a data sheet, {x}." for name, x in m.sheets.items()]
-    for simulator in m.simulators:
+    for simulator in m.description["simulators"]:
         if simulator["specimens"]:
             text.append(f"{named(simulator['name'], m.labels)}: {simulator['specimens']}.")
     for name, y in m.observed.items():
-        outputs = m.outputs.get(name, SINGLE_OUTPUT)
-        shown = shown_outputs(m, name)
-        if y.ndim > 1 and len(shown) < y.shape[1]:
-            text.append(f"{name}: {len(shown)} of {y.shape[1]} outputs are shown.")
-        for output, j, column in shown:
-            meaning = m.labels.get(name, "")
-            if y.ndim > 1:
-                meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
-            units = outputs.units[j] if outputs.units else ""
-            row = {"measured": name, "meaning": meaning, "output": output, "units": units}
-            rows.append(row | described(column))
+        columns = y.columns()
+        shown = shown_columns(y)
+        if len(shown) < len(columns):
+            text.append(f"{name}: {len(shown)} of {len(columns)} outputs are shown.")
+        for output, unit, values in shown:
+            meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output or name, ""))
+            row = {"measured": name, "meaning": meaning, "output": output, "units": unit}
+            rows.append(row | described(values))
     return [Section("Evidence", text, rows_table(with_zeros(rows)))]
 
 
-def shown_outputs(m: Material, name: str) -> list[tuple[str, int, Any]]:
-    """Return name, place and values of at most twelve outputs, from the first to the last."""
-    y = m.observed[name]
-    if y.ndim == 1:
-        return [("", 0, y)]
-    n = y.shape[1]
-    places = map(round, np.linspace(0, n - 1, min(n, 12)).tolist())
-    names = m.outputs.get(name, SINGLE_OUTPUT).names
-    return [(names[j], j, y[:, j]) for j in places]
+def shown_columns(y: Observed) -> list[tuple[str, str, Floats]]:
+    """Return name, unit and values of at most twelve outputs, from the first to the last."""
+    columns = y.columns()
+    places = np.linspace(0, len(columns) - 1, min(len(columns), 12)).round().astype(int)
+    return [columns[place] for place in places]
 
 
 def agreement(m: Material) -> list[Section]:
     """Return the tests of the calibrated model in words, and their data."""
     rows = []
-    for _, pair in validation_pairs(m):
+    pairs = [pair for tested in m.validation.values() for pair in tested.pairs]
+    for pair in pairs:
         predicted = pair.predicted[~np.isnan(pair.predicted)]
         levels = [0.5, (1 - m.prob) / 2, (1 + m.prob) / 2]
         quantiles = np.quantile(predicted, levels, method="inverted_cdf").tolist()
-        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-        median, lower, upper = alike(quantiles, sd)
+        median, lower, upper = alike(quantiles, finite_sd(pair.measured))
         name = {"condition": named(pair.name, m.labels)}
         interval = {f"{percentage(m.prob)} from": lower, "to": upper}
         rows.append(name | described(pair.measured) | {"predicted median": median} | interval)
@@ -437,7 +410,7 @@ def agreement(m: Material) -> list[Section]:
         text.append(f"Together the tests reject a right model in up to {alpha} of cases.")
     text += [
         f"{row['condition']}: specimens failed, and no predicted one does: the model excludes them."
-        for row, (_, pair) in zip(rows, validation_pairs(m), strict=True)
+        for row, pair in zip(rows, pairs, strict=True)
         if row["failed"] and not np.isposinf(pair.predicted).any()
     ]
     if rows:
@@ -464,12 +437,3 @@ def _in_words(label: str, test: ValidityTest, m: Material) -> str:
         f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right model, {p} of such "
         f"tests differ at least as much; at {percentage(test.alpha)} or less the model is rejected."
     )
-
-
-def validation_pairs(m: Material) -> list[tuple[str, Comparable]]:
-    """Return each condition with measured and predicted values of one output."""
-    return [
-        (condition, pair)
-        for condition, (measured, predicted) in m.validation.items()
-        for pair in comparables({condition: measured}, {condition: predicted}, "Report: validation")
-    ]

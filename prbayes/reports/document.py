@@ -16,7 +16,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import percentage
-from prbayes._validate import called, file_path, flag, folder_path, plain_text
+from prbayes._validate import called, file_path, flag, folder_path, plain_text, wrong_type
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.material import date_of, gather, versions_of
 from prbayes.reports.numbers import cells
@@ -157,10 +157,7 @@ class Report:
                 note = ", ".join([*parts, f"intervals of {percentage(material.prob)} probability"])
         for section in contents:
             if not isinstance(section, Section):
-                got = type(section).__name__
-                raise TypeError(
-                    f"Report: sections: got {got}, expected prb.reports.Section objects"
-                )
+                raise wrong_type(section, "Report: sections", "prb.reports.Section objects")
         vars(self).update(
             title=title, sections=contents, author=author, date=date or "", note=note or ""
         )
@@ -186,7 +183,7 @@ class Report:
             titles = [section.title for section in self.sections]
             if after not in titles:
                 raise KeyError(f"after: got {after!r}, expected the title of a section: {titles}")
-            # Behind the parts of a section as well, for one of its own level
+            # A new section of the same level follows all parts of the section before it.
             start = titles.index(after)
             highest = max(self.sections[start].level, section.level)
             behind = range(start + 1, place)
@@ -226,7 +223,7 @@ class Report:
         return ", ".join(filter(None, (self.author, self.date)))
 
     def _html(self) -> str:
-        # The list of contents comes after the summary, which with its parts is a page of its own.
+        # The list of contents follows the summary, because that is a page of its own.
         chapters = [
             (i, section.title)
             for i, section in enumerate(self.sections, 1)
@@ -289,7 +286,7 @@ def _literal(value: Any) -> str:
     """Return a text, in one line, that Markdown shows as it is."""
     line = _MARKUP.sub(r"\\\1", " ".join(visible(str(value)).split()))
     line = _BARE_LINK.sub(r"\1\3\\\2\4", line)
-    # In '1.' the point is escaped, as digits cannot be.
+    # Digits cannot be escaped: in '1.' the point is.
     start = _AT_START.match(line)
     if start is None:
         return line

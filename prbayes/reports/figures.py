@@ -15,7 +15,6 @@ from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import variable_of
-from prbayes.optimize.optimum import Optimum
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.convergence import plot_optimizer, plot_stages
 from prbayes.plots.landscape import plot_landscape
@@ -28,15 +27,16 @@ from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.validity import plot_validity
 from prbayes.reports.material import Material, constants_of, kind_of_decision
 from prbayes.reports.section import Section, image
+from prbayes.results.diagnose import seconds_of
 
 _log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True)
 class Illustration:
-    """A picture that a report shows where it has the contents."""
+    """A picture that a report shows if it has the results for it."""
 
-    function: Callable[..., Any]  # returns a figure with ``savefig``
+    function: Callable[..., Any]  # function that returns a figure with ``savefig``
     title: str
     alt: str
     caption: str = ""
@@ -116,7 +116,7 @@ ILLUSTRATIONS = {
 # -- arguments of pictures -------------------------------------------------------------------
 
 
-# Positional and keyword arguments, or the reason for a missing picture as the end of a sentence.
+# positional and keyword arguments, or the end of a sentence on why the picture is missing
 Request = tuple[tuple[Any, ...], dict[str, Any]] | str
 
 
@@ -126,41 +126,41 @@ def requests(m: Material) -> dict[str, Request]:
     posterior = next(iter(m.posteriors.values()), None)
     # An optimum from a file has no evaluator, hence no population.
     optimum = next(iter(m.live_optima.values()), None)
-    # Labels of the model, which has no conditions of a test
+    # Pictures of the model refuse labels of conditions and constants, which it has not.
     elsewhere = {*m.validation, *constants_of(m.description)}
     of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
-    labels: dict[str, Any] = {"labels": of_model} if of_model else {}
-    prob = {"prob": m.prob} if m.prob != INTERVAL else {}
+    common: dict[str, Any] = {"model": m.model, "labels": of_model}
+    prob = {"prob": m.prob}
 
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
-        """Return as keywords the labels of names in a picture without a model."""
+        """Return the labels of names, as keywords of a picture without a model."""
         variables = {variable_of(str(name)) for name in names}
         texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": texts} if texts else {}
+        return {"labels": texts}
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
-        requested["population"] = ((result,), {"model": m.model, **labels, **prob})
-    if m.model is not None and _computes_responses(m.model) and _is_costly(optimum):
+        requested["population"] = ((result,), common | prob)
+    is_costly = optimum is None or seconds_of(optimum, 100) > 10
+    if m.model is not None and _computes_responses(m.model) and is_costly:
         requested["responses"] = "it would recompute responses; call prb.plots.plot_responses"
     elif "population" in requested:
-        # Distribution functions: a histogram of a dozen values has boxes above any density
-        of_responses = {"model": m.model, "ecdf": True, "before": False, **labels, **prob}
-        requested["responses"] = ((result,), of_responses)
-        if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
-            requested["outputs"] = ((result,), {"model": m.model, **labels})
+        # Distribution functions need no bandwidth, which a dozen values do not determine.
+        of_responses = {"ecdf": True, "before": False}
+        requested["responses"] = ((result,), common | prob | of_responses)
+        if any(len(y.columns()) > 1 for y in m.observed.values()):
+            requested["outputs"] = ((result,), common)
     if posterior is not None:
-        shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        shown = {"optimum": optimum, "model": m.model, **shown, **prob}
-        shown["backend"] = "matplotlib"
-        requested["posterior"] = ((posterior,), shown)
+        shown = {} if m.model is not None else labels_of(posterior["posterior"].data_vars)
+        shown |= {"optimum": optimum, "backend": "matplotlib"}
+        requested["posterior"] = ((posterior,), common | prob | shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
     if optimum is not None:
-        requested["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
+        requested["optimizer"] = ((optimum,), {"col_wrap": 2, "labels": of_model})
         if m.model is not None:
-            requested["landscape"] = ((optimum,), {"model": m.model, **labels})
-    if m.comparison is not None and not prob:
+            requested["landscape"] = ((optimum,), common)
+    if m.comparison is not None and m.prob == INTERVAL:
         names = m.comparison["hyperparameter"].values
         requested["comparison"] = ((m.comparison,), labels_of(names))
     if m.tests:
@@ -170,18 +170,10 @@ def requests(m: Material) -> dict[str, Request]:
     if tables:
         requested["sensitivity"] = (tuple(tables[:1]), labels_of(tables[0]["factor"].values))
     if m.validation:
-        measured = {name: pair[0] for name, pair in m.validation.items()}
-        predicted = {name: pair[1] for name, pair in m.validation.items()}
+        measured = {name: data.measured for name, data in m.validation.items()}
+        predicted = {name: data.predicted for name, data in m.validation.items()}
         requested["prediction"] = ((measured, predicted), labels_of(m.validation) | prob)
     return requested
-
-
-def _is_costly(optimum: Optimum | None) -> bool:
-    """Return whether responses of the populations of a picture would take ten seconds."""
-    if optimum is None:
-        return True
-    seconds_each = optimum.search.seconds / max(optimum.n_responses, 1)
-    return 100 * optimum.evaluator.responses_per_theta * seconds_each > 10
 
 
 def _computes_responses(model: pm.Model) -> bool:
@@ -209,7 +201,7 @@ def pictures_of(m: Material) -> dict[str, list[Section]]:
     drawn["front"] = drawn.pop("prediction", []) or drawn.pop("responses", [])
     graph = None if m.model is None else _graph(m.model)
     if graph is not None:
-        names = ", ".join(variable["name"] for variable in (m.description or {})["variables"])
+        names = ", ".join(variable["name"] for variable in m.description["variables"])
         alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
         caption = "Variables of the model; filled: compared with measured responses."
         drawn["graph"] = [Section("Graph", picture=graph, alt=alt, caption=caption, level=3)]
@@ -230,7 +222,7 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
             texts = {"alt": illustration.alt, "caption": illustration.caption}
             return Section(illustration.title, picture=picture, level=3, **texts)
         except (TypeError, ValueError, NotImplementedError) as error:
-            # Refusals of pictures; and distributions for which PyMC has no formula
+            # The picture refuses the results, or PyMC has no formula for a distribution.
             reason = str(error)
         finally:
             for figure in set(pyplot.get_fignums()) - open_figures:
@@ -244,8 +236,8 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
 
 
 def _graph(model: pm.Model) -> bytes | None:
-    """Return the model's graph; None without Graphviz, which is no reader's affair."""
-    if _computes_responses(model):  # PyMC draws each variable once for its shape
+    """Return the model's graph, or None if it cannot be drawn; the log has the reason."""
+    if _computes_responses(model):  # PyMC draws each variable once, because it needs its shape.
         _log.info("report: without the graph of the model, as PyMC would compute responses for it")
         return None
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,7 +14,8 @@ import xarray as xr
 
 from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, texts
+from prbayes._validate import Floats, called, texts, wrong_type
+from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
@@ -30,32 +31,53 @@ from prbayes.model.fingerprint import (
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
-from prbayes.results.compare import compare
+from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.conditions import comparables
+from prbayes.validation.conditions import Comparable, comparables
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The measured responses of a simulator."""
+
+    values: Floats  # (N,), or (N, m) of several outputs
+    outputs: Outputs = SINGLE_OUTPUT
+
+    def columns(self) -> list[tuple[str, str, Floats]]:
+        """Return name, unit and values of each output; a single one has no name."""
+        names = self.outputs.names or ("",)
+        units = self.outputs.units or ("",) * len(names)
+        return list(zip(names, units, np.atleast_2d(self.values.T), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Responses of specimens under a condition that were not used in the calibration."""
+
+    measured: Any
+    predicted: xr.DataArray
+    pairs: list[Comparable]  # measured and predicted values of each output
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Results by label; a single one has its kind as label."""
+    """Results by label; a single result has its kind as label."""
 
     model: pm.Model | None
-    description: dict[str, Any] | None  # of the model; from a file where there is no model
+    # variables and simulators of the model, which a file describes too; empty lists if unknown
+    description: dict[str, Any]
     optima: dict[str, xr.DataTree]
-    live_optima: dict[str, Optimum]  # the optima that are not from a file
+    live_optima: dict[str, Optimum]  # optima in memory, which have an evaluator
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
-    observed: dict[str, Floats]  # measured responses by simulator; of several outputs (N, m)
-    outputs: dict[str, Outputs]  # of a run, by simulator
+    observed: dict[str, Observed]  # measured responses by simulator
+    sheets: dict[str, str]  # statistics of data sheets, which are no responses, by simulator
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
-    # Measured and predicted responses of other specimens, by condition
-    validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
-    # Labels of variables, inputs, simulators and outputs, with units
-    labels: Mapping[str, str] = field(default_factory=dict)
-    sheets: Mapping[str, str] = field(default_factory=dict)  # statistics by simulator
+    validation: dict[str, Validation]  # responses of other specimens by condition
+    labels: Mapping[str, str]  # labels of variables, inputs, simulators and outputs, with units
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -76,15 +98,11 @@ class Material:
             if "calibration" in tree.children
         }
 
-    def attrs(self, label: str) -> dict[Any, Any]:
-        """Return the attributes of a result."""
-        return dict(_estimates(self.results[label]).attrs)
-
     @property
     def problems(self) -> list[str]:
         """The problems that a diagnosis found, each once.
 
-        Specimens that are too few for the standard errors of an optimum are none beside draws.
+        If there are draws, too few specimens for the standard errors of an optimum are no problem.
         """
         accepted = {"few-specimens"} if self.posteriors else set()
         texts = [
@@ -117,29 +135,15 @@ class Material:
         ]
         return bool(flags) and all(flags)
 
-    @property
-    def simulators(self) -> list[dict[str, Any]]:
-        """The simulators of the model; none where they are unknown."""
-        return [] if self.description is None else list(self.description["simulators"])
-
-    @property
-    def hyperparameters(self) -> list[str]:
-        """Names of the hyperparameters, without deterministics where they are known as such."""
-        if self.description is not None:
-            variables = self.description["variables"]
-            return [v["name"] for v in variables if v["role"] == "hyperparameter"]
-        first = next(iter(self.results.values()), None)
-        return [] if first is None else list(map(str, _estimates(first).data_vars))
-
 
 def metrics_of(m: Material) -> dict[str, str]:
-    """Return the metric by simulator; by result as well, where results differ in it."""
+    """Return the metric of each simulator, for each result if results have different metrics."""
     by_result = {}
     for label, table in m.calibrations.items():
         pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
         by_result[label] = {str(name): str(metric) for name, metric in pairs}
     if not by_result:
-        return {s["name"]: s["metric"] for s in m.simulators}
+        return {s["name"]: s["metric"] for s in m.description["simulators"]}
     first, *rest = by_result.values()
     if all(metrics == first for metrics in rest):
         return first
@@ -150,30 +154,28 @@ def metrics_of(m: Material) -> dict[str, str]:
     }
 
 
-def sheets_of(m: Material) -> dict[str, str]:
-    """Return the statistics of each simulator that has a data sheet in place of specimens."""
-    pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
-    found = {name: pattern.fullmatch(metric) for name, metric in metrics_of(m).items()}
-    return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
-
-
-def constants_of(description: Mapping[str, Any] | None) -> set[str]:
+def constants_of(description: Mapping[str, Any]) -> set[str]:
     """Return the names of inputs that are numbers."""
-    texts = [s["inputs"] for s in (description or {}).get("simulators", ())]
-    return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
+    inputs = [x for s in description["simulators"] for x in s["inputs"]]
+    return {name for name, _, text in inputs if text.startswith("=")}
+
+
+def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
+    """Return the attributes of a posterior or an optimum."""
+    return dict(estimates_in(result).attrs)
 
 
 def date_of(m: Material) -> str:
-    """Return the day of the latest result: of an optimum in memory today; nothing if unknown."""
-    days = [str(m.attrs(label).get("created_at", ""))[:10] for label in m.results]
+    """Return the day of the latest result, which is today for an optimum in memory."""
+    days = [str(attributes_of(r).get("created_at", ""))[:10] for r in m.results.values()]
     if m.live_optima:
         days.append(datetime.now(UTC).isoformat()[:10])
     return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
 
 
 def versions_of(m: Material) -> dict[str, str]:
-    """Return versions by package, as the results have them."""
-    attrs = [pair for label in m.results for pair in m.attrs(label).items()]
+    """Return the versions of packages that the results were computed with."""
+    attrs = [pair for result in m.results.values() for pair in attributes_of(result).items()]
     names = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy", "python")
     versions = {str(key).removesuffix("_version"): str(value) for key, value in attrs}
     return {name: versions[name] for name in names if name in versions}
@@ -194,8 +196,8 @@ def gather(
     posteriors = _by_label(posterior, "posterior")
     tests = _by_label(validity, "validity")
     decisions = _by_label(decision, "decision")
-    validation = {} if validation is None else validation
-    _require_kinds(model, optima, posteriors, tests, comparison, decisions, validation, labels)
+    _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
+    validations = _validations({} if validation is None else validation)
     live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
     optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
@@ -210,24 +212,23 @@ def gather(
     identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
-    for label, (_, predicted) in validation.items():
-        identities[f"validation, {label}"] = identity_from_attributes(predicted.attrs)
+    for label, data in validations.items():
+        identities[f"validation, {label}"] = identity_from_attributes(data.predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
-    _require_tested(validation, tests)
+    _require_tested(validations, tests)
 
-    stored = (from_attributes(_estimates(tree).attrs) for tree in results.values())
-    first = next((text for text in stored if text is not None), None)
-    description = first if model is None else describe(model)
+    stored = (from_attributes(attributes_of(tree)) for tree in results.values())
+    descriptions = filter(None, stored if model is None else [describe(model)])
+    description: dict[str, Any] = next(descriptions, {"variables": [], "simulators": []})
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
-    observed, outputs = _observed(model, results)
-    if labels and (description is not None or model is not None):
-        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
-        if description is not None:
-            names |= {str(variable["name"]) for variable in description["variables"]}
-            names |= constants_of(description)
+    observed, sheets = _observed(model, results)
+    if labels and description["variables"]:
+        names = {*validations, *sheets, *observed, *constants_of(description)}
+        names = names.union(*(simulator.outputs.names for simulator in observed.values()))
+        names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
@@ -239,7 +240,7 @@ def gather(
         needs_model = not {"optimum", "calibration"} & set(result.children)
         is_possible = own_model is not None or not needs_model
         diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
-    material = Material(
+    return Material(
         model=model,
         description=description,
         optima=optima,
@@ -248,16 +249,12 @@ def gather(
         tests=tests,
         comparison=comparison,
         observed=observed,
-        outputs=outputs,
+        sheets=sheets,
         diagnoses=diagnoses,
         decisions=decisions,
-        validation=dict(validation),
+        validation=validations,
         labels=dict(labels or {}),
     )
-    # Statistics of a data sheet are no measured responses
-    sheets = sheets_of(material)
-    sampled = {name: y for name, y in observed.items() if name not in sheets}
-    return replace(material, observed=sampled, sheets=sheets)
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:
@@ -278,34 +275,20 @@ def _require_kinds(
     tests: dict[str, Any],
     comparison: Any,
     decisions: dict[str, Any],
-    validation: Any,
     labels: Any,
 ) -> None:
     """Raise if an argument is of another kind."""
     for table in decisions.values():
         if kind_of_decision(table) is None:
-            raise TypeError(
-                f"Report: decision: got {type(table).__name__}, expected the Dataset of "
-                "prb.exceedance, prb.sensitivity or prb.plan, or several by name"
+            expected = (
+                "the Dataset of prb.exceedance, prb.sensitivity or prb.plan, or several by name"
             )
+            raise wrong_type(table, "Report: decision", expected)
     if model is not None and not isinstance(model, pm.Model):
-        raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
+        raise wrong_type(model, "Report: model", "a pm.Model")
     is_comparison = isinstance(comparison, xr.Dataset) and "estimate" in comparison
     if comparison is not None and not is_comparison:
-        raise TypeError(
-            f"Report: comparison: got {type(comparison).__name__}, expected the Dataset of "
-            "prb.compare"
-        )
-    expected = (
-        "expected by condition the measured responses and their prediction, such as "
-        '{"80 000 cycles": (lengths, prb.predict(...))}'
-    )
-    if not isinstance(validation, Mapping):
-        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
-    for condition, pair in validation.items():
-        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
-            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
-        comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
+        raise wrong_type(comparison, "Report: comparison", "the Dataset of prb.compare")
     if labels is not None:
         texts(labels, "Report: labels")
     names = sorted(set(optima) & set(posteriors))
@@ -315,20 +298,33 @@ def _require_kinds(
         )
     for label, test in tests.items():
         if not isinstance(test, ValidityTest):
-            raise TypeError(
-                f"Report: {label}: got {type(test).__name__}, expected a ValidityTest from "
-                "prb.area_test"
-            )
+            raise wrong_type(test, f"Report: {label}", "a ValidityTest from prb.area_test")
     for label, tree in posteriors.items():
         _require_group(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
 
 
+def _validations(validation: Any) -> dict[str, Validation]:
+    """Return the responses of a test by condition, or raise if an argument is no such pair."""
+    expected = (
+        "expected by condition the measured responses and their prediction, such as "
+        '{"80 000 cycles": (lengths, prb.predict(...))}'
+    )
+    if not isinstance(validation, Mapping):
+        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
+    validations = {}
+    for condition, pair in validation.items():
+        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
+            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
+        measured, predicted = pair
+        pairs = comparables({condition: measured}, {condition: predicted}, "Report: validation")
+        validations[condition] = Validation(measured, predicted, pairs)
+    return validations
+
+
 def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
-        raise TypeError(
-            f"Report: {label}: got {type(tree).__name__}, "
-            f"expected a DataTree with the group {group}, from {origin}"
-        )
+        expected = f"a DataTree with the group {group}, from {origin}"
+        raise wrong_type(tree, f"Report: {label}", expected)
     variables = tree[group].data_vars.items()
     lacking = [str(name) for name, values in variables if not set(dims) <= set(values.dims)]
     if lacking:
@@ -339,7 +335,7 @@ def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], ori
 
 
 def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
-    """Raise if no posterior is under the prior of the model, which the report prints."""
+    """Raise if all posteriors have other priors than the model, whose priors the report prints."""
     if model is None or not population_simulators(model):
         return
     expected = identity_of(model)
@@ -352,17 +348,17 @@ def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | 
 
 
 def _require_tested(
-    validation: Mapping[str, tuple[Any, xr.DataArray]], tests: Mapping[str, ValidityTest]
+    validation: Mapping[str, Validation], tests: Mapping[str, ValidityTest]
 ) -> None:
-    """Raise if validation data are not those of a test, where there are tests."""
+    """Raise if there are tests, and validation data are not those of a test."""
     tested: list[Floats] = []
     for test in tests.values():
         tested.append(test.u_values)
         tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]
-    for condition, (measured, predicted) in validation.items():
-        u = u_values({condition: measured}, {condition: predicted})
-        # Up to rounding and ties, in their order: rounded data change half of the values by far
-        # less than .02; other data are .3 apart on average.
+    for condition, data in validation.items():
+        u = u_values({condition: data.measured}, {condition: data.predicted})
+        # The data of the test may have been rounded, which changes half of the u-values by far less
+        # than .02. The u-values of other data are .3 apart on average.
         distances = [
             np.median(np.abs(values - tested_u))
             for values in (u, np.abs(2 * u - 1))
@@ -380,38 +376,30 @@ def _require_tested(
 # -- derived results -------------------------------------------------------------------------
 
 
-def _estimates(tree: xr.DataTree) -> xr.DataTree:
-    """Return the group of a result with its estimates."""
-    return tree.children["posterior" if "posterior" in tree else "optimum"]
-
-
 def _observed(
-    model: pm.Model | None, results: dict[str, xr.DataTree]
-) -> tuple[dict[str, Floats], dict[str, Outputs]]:
-    """Return the measured responses, and their columns, by simulator."""
+    model: pm.Model | None, results: Mapping[str, xr.DataTree]
+) -> tuple[dict[str, Observed], dict[str, str]]:
+    """Return the measured responses, and the statistics of data sheets, by simulator."""
+    observed, sheets = {}, {}
     if model is not None:
-        simulators = population_simulators(model)
-        observed = {simulator.name: simulator.observed for simulator in simulators}
-        return observed, {simulator.name: simulator.outputs for simulator in simulators}
-    observed, outputs = {}, {}
-    tree = next((tree for tree in results.values() if "observed_data" in tree), None)
-    for key, values in {} if tree is None else tree["observed_data"].data_vars.items():
-        name = str(key)
-        units = values.attrs.get("units")
-        if values.ndim != 2:
-            observed[name] = np.ravel(values.values)
-            outputs[name] = SINGLE_OUTPUT
-            if isinstance(units, str) and units:
-                outputs[name] = Outputs(units=(units,))
-            continue
-        if units is not None and not isinstance(units, str):  # of each output
-            values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
-        observed[name], outputs[name] = read_observed(name, values)
-    return observed, outputs
+        for simulator in population_simulators(model):
+            observed[simulator.name] = Observed(simulator.observed, simulator.outputs)
+            sheets[simulator.name] = data_sheet(simulator.metric)
+    else:
+        groups = [tree["observed_data"] for tree in results.values() if "observed_data" in tree]
+        for key, array in groups[0].data_vars.items() if groups else ():
+            name = str(key)
+            # A tool other than this package may store arrays with more axes.
+            values = array if array.ndim in (1, 2) else np.ravel(array)
+            y, outputs = read_observed(name, values.astype(np.float64))
+            observed[name] = Observed(y, outputs)
+            sheets[name] = str(array.attrs.get("data_sheet", ""))
+    sheets = {name: sheet for name, sheet in sheets.items() if sheet}
+    return {name: y for name, y in observed.items() if name not in sheets}, sheets
 
 
 def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
-    """Return the model for the diagnosis of a saved result; None if its metric or prior differs."""
+    """Return the model for diagnosing a saved result, or None if metric or priors differ."""
     identity = identity_in(result)
     if model is None or identity is None:
         return model
@@ -421,14 +409,14 @@ def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
 # -- schema of results in files --------------------------------------------------------------
 
 
-# Variables that identify a table of a decision, and the function that returns it.
+# variables that identify a table of a decision, and functions that return the tables
 _TABLES = {
     "risk": {"probability", "by_draw", "error"},
     "sensitivity": {"first", "total", "derivative"},
     "plan": {"sd", "now"},
 }
 CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
-# Variables and attributes that a report reads.
+# variables and attributes that a report reads
 _OF_DECISION = {
     "risk": ("lower", "upper", "limit", "below", "prob"),
     "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
@@ -442,7 +430,7 @@ _OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
 
 
 def kind_of_decision(table: Any) -> str | None:
-    """Return the kind of a table of a decision; None for anything else."""
+    """Return the kind of a table of a decision, or None if it is no such table."""
     if isinstance(table, xr.Dataset):
         for kind, variables in _TABLES.items():
             if variables <= set(table.data_vars):
@@ -451,7 +439,7 @@ def kind_of_decision(table: Any) -> str | None:
 
 
 def complaints(tree: xr.DataTree) -> Iterator[str]:
-    """Yield errors of a posterior, an optimum, a test of validity or a table: got, expected."""
+    """Yield what is wrong with the contents of a file: posterior, optimum, test or decision."""
     groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
     if "posterior" in groups or "optimum" in groups:
         yield from _of_estimates(groups)
@@ -480,7 +468,7 @@ def complaints(tree: xr.DataTree) -> Iterator[str]:
 
 
 def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    """Yield errors of a posterior, or else of an optimum."""
+    """Yield what is wrong with a posterior or an optimum."""
     kind = "posterior" if "posterior" in groups else "optimum"
     variables = groups[kind].data_vars
     yield from _not_numbers(kind, variables)

@@ -12,15 +12,18 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._display import View
+from prbayes._validate import wrong_type
+
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
-# Powers of ten that are written out, others have an exponent: the lower end is that of Python's
-# "g"; the upper one keeps loads in newtons and cycles to failure readable.
+# powers of ten between which numbers have no exponent: the lower end is that of Python's "g"; the
+# upper end keeps loads in newtons and cycles to failure readable
 _SMALLEST, _LARGEST = -4, 7
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """Return a number with so many significant digits, and anything else as its text."""
+    """Return the text of a value; that of a float has ``digits`` significant digits."""
     if value is None:
         return NOTHING
     if isinstance(value, bool | np.bool_):
@@ -43,12 +46,15 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def places(sd: float, digits: int = 3) -> int | None:
-    """Return the number of decimals that show so many digits of a spread; None if it has none."""
+    """Return the number of decimals that show ``digits`` digits of a spread.
+
+    None if the spread is no positive number, or one that has an exponent.
+    """
     if not (math.isfinite(sd) and sd > 0):
         return None
-    # Rounded first: 0.0996 with two digits is 0.10, which needs two decimals and not three.
+    # The spread is rounded first, because 0.0996 with two digits is 0.10, which has two decimals.
     magnitude = math.floor(math.log10(float(f"{sd:.{digits - 1}e}")))
-    # A spread may be a hundred times smaller than its value, and is still written out.
+    # A spread a hundred times smaller than its value is still written without an exponent.
     if not _SMALLEST - 2 <= magnitude < _LARGEST:
         return None
     return max(0, digits - 1 - magnitude)
@@ -62,7 +68,7 @@ def alike(values: Iterable[float], sd: float, digits: int = 3) -> list[str]:
         if decimals is None or not math.isfinite(value) or abs(value) >= 10**_LARGEST:
             texts.append(number(value))
         else:
-            texts.append(f"{value + 0.0:.{decimals}f}")  # the sum turns -0.0 into 0.0
+            texts.append(f"{value + 0.0:.{decimals}f}")  # The sum turns -0.0 into 0.0.
     return texts
 
 
@@ -73,8 +79,9 @@ def plus_minus(value: float, sd: float) -> str:
     return " ± ".join(alike((value, sd), sd, 2))
 
 
-def sample_sd(finite: Any) -> float:
-    """Return the standard deviation of finite values, NaN of fewer than two."""
+def finite_sd(y: Any) -> float:
+    """Return the standard deviation of finite values, or NaN if there are fewer than two."""
+    finite = y[np.isfinite(y)]
     return float(finite.std(ddof=1)) if finite.size > 1 else math.nan
 
 
@@ -88,7 +95,7 @@ def in_percent(p: float, floor: float = 1e-5) -> str:
 
 
 def span(values: Any, form: str) -> str:
-    """Return the least and the largest of several numbers, or one where their texts are equal."""
+    """Return the smallest and the largest number as a range, or one if their texts are equal."""
     low = f"{values.min():{form}}"
     high = f"{values.max():{form}}"
     return low if low == high else f"{low} to {high}"
@@ -101,12 +108,12 @@ def enumerated(items: list[str]) -> str:
 
 
 def described(y: Any) -> dict[str, Any]:
-    """Return counts, range, mean and spread of one output: NaN was not measured, +inf failed."""
+    """Return counts, range, mean and spread of an output; NaN was not measured, +inf failed."""
     measured = y[~np.isnan(y)]
     finite = measured[np.isfinite(measured)]
     failed = measured.size - finite.size
     missing = y.size - measured.size
-    sd = sample_sd(finite)
+    sd = finite_sd(y)
     moments = [math.nan] * 3
     if finite.size:
         moments = [float(finite.min()), float(finite.max()), float(finite.mean())]
@@ -141,7 +148,7 @@ class Cells:
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    numeric: tuple[bool, ...]  # which columns hold numbers
+    numeric: tuple[bool, ...]  # whether a column consists of numbers
 
     def aligned(self) -> tuple[tuple[str, ...], ...]:
         """Return the rows with spaces after numbers that align decimal points."""
@@ -167,13 +174,11 @@ def cells(table: Any) -> Cells:
     if isinstance(table, xr.Dataset):
         if table.dims:
             table = table.to_dataframe()
-        else:  # pandas makes no table of numbers without a dimension
+        else:  # pandas makes no table of numbers without a dimension.
             table = table.expand_dims("row").to_dataframe().reset_index(drop=True)
     if not (hasattr(table, "reset_index") and hasattr(table, "columns")):
-        raise TypeError(
-            f"table: got {type(table).__name__}, "
-            "expected a pandas.DataFrame, xarray.Dataset or xarray.DataArray"
-        )
+        expected = "a pandas.DataFrame, xarray.Dataset or xarray.DataArray"
+        raise wrong_type(table, "table", expected)
     # An unnamed index of integers only counts the rows.
     is_named = any(name is not None for name in table.index.names)
     is_unnamed_text = not is_named and table.index.dtype.kind not in "iu"
@@ -204,6 +209,12 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
             if any(value not in (None, "") for value in column)
         }
     )
+
+
+def view_table(shown: View) -> Any:
+    """Return the rows of what a reader sees of a result, as a table."""
+    pandas: Any = import_module("pandas")
+    return pandas.DataFrame(shown.rows, columns=shown.header)
 
 
 def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:

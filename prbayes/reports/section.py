@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from prbayes._validate import plain_text
+from prbayes._validate import plain_text, wrong_type
 from prbayes.reports.numbers import cells
 
-# Signs in front of the titles of verdicts: colour is not all that distinguishes them.
+# signs in front of the titles of verdicts, so that not only colour distinguishes them
 SIGNS = {"": "", "good": "\u2713", "bad": "\u2717", "open": "?"}
 
-# Beginnings of files (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, marker SOI).
+# first bytes, ending and media type of files (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, SOI)
 _BEGINNINGS = (
     (b"\x89PNG\r\n", "png", "image/png"),
     (b"\xff\xd8\xff", "jpg", "image/jpeg"),
@@ -105,7 +105,7 @@ class Section:
                 f'Section: verdict: got {verdict!r}, expected "good", "bad", "open" or nothing'
             )
         if table is not None:
-            cells(table)  # raises errors of the table now
+            cells(table)  # This raises errors of the table here, and not when it is written.
         if picture is not None:
             if not alt.strip():
                 raise ValueError(
@@ -146,18 +146,15 @@ def image(picture: Any) -> bytes:
         kind_of(picture)
         return picture
     if not hasattr(picture, "savefig"):
-        raise TypeError(
-            f"picture: got {type(picture).__name__}, expected bytes (SVG, PNG, JPEG) "
-            "or a figure with savefig"
-        )
+        raise wrong_type(picture, "picture", "bytes (SVG, PNG, JPEG) or a figure with savefig")
     from matplotlib import rc_context  # heavy, and only needed for pictures
 
     reproducible: Any = {"svg.hashsalt": "prbayes", "svg.fonttype": "path"}
     with tempfile.TemporaryDirectory() as folder, rc_context(reproducible):
         vector = Path(folder, "picture.svg")
         picture.savefig(vector, bbox_inches="tight", metadata={"Date": None})
-        # Five times as large as this package's pictures. A larger one, such as a scatter of ten
-        # thousand points, is stored as pixels, which a browser opens at once.
+        # The limit is five times the size of this package's pictures. A larger drawing, such as a
+        # scatter of ten thousand points, is stored as pixels, which a browser opens at once.
         if vector.stat().st_size <= 500_000:
             return vector.read_bytes()
         pixels = Path(folder, "picture.png")
@@ -176,7 +173,7 @@ def kind_of(picture: bytes) -> tuple[str, str]:
     for beginning, ending, media_type in _BEGINNINGS:
         if picture.startswith(beginning):
             return ending, media_type
-    # The tag begins after a declaration, a DOCTYPE and a comment.
+    # A declaration, a DOCTYPE and a comment may precede the tag.
     if b"<svg" in picture[:2000]:
         return "svg", "image/svg+xml"
     raise ValueError(

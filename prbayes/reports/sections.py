@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -16,7 +15,7 @@ from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
-    optimum_elements,
+    element_name,
     readable_elements,
     single_elements,
     split_elements,
@@ -33,14 +32,15 @@ from prbayes.reports.assessment import (
     decision,
     next_steps,
     population_in_units,
-    shown_outputs,
-    validation_pairs,
+    shown_columns,
     verdict,
 )
 from prbayes.reports.figures import pictures_of
 from prbayes.reports.material import (
     CALLED,
     Material,
+    Observed,
+    attributes_of,
     kind_of_decision,
     metrics_of,
     versions_of,
@@ -50,21 +50,21 @@ from prbayes.reports.numbers import (
     alike,
     correlation_table,
     enumerated,
+    finite_sd,
     number,
-    places,
     plus_minus,
     rows_table,
-    sample_sd,
     span,
+    view_table,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT
+from prbayes.results.compare import Comparison, estimates_of
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import DIRECTION
 
 
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
-    """Return the sections that the material allows, with or without pictures."""
+    """Return the sections for which there are results, with or without pictures."""
     drawn = pictures_of(m) if pictures else {}
     sections: list[Section] = []
     for title, parts in _CHAPTERS.items():
@@ -82,7 +82,7 @@ def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
 
 def model(m: Material) -> list[Section]:
     """Return the variables of the model, its simulators, and how responses are compared."""
-    if m.description is None:
+    if not m.description["variables"]:
         return []
     variables = [
         {
@@ -102,10 +102,13 @@ def model(m: Material) -> list[Section]:
         {
             "simulator": s["name"],
             "response": s["response"],
-            "inputs": _labelled_inputs(s["inputs"], m.labels),
-            "runs": _runs(s["propagation"]),
+            "inputs": ", ".join(
+                f"{m.labels.get(name, name + unit)} {text}".strip()
+                for name, unit, text in s["inputs"]
+            ),
+            "runs": s["runs"],
         }
-        for s in m.simulators
+        for s in m.description["simulators"]
     ]
     if simulators:
         about = "A simulator computes the response of a specimen from its inputs."
@@ -113,29 +116,9 @@ def model(m: Material) -> list[Section]:
     return sections
 
 
-def _labelled_inputs(text: str, labels: Mapping[str, str]) -> str:
-    """Return the inputs of a simulator with the labels of their names, in place of units."""
-
-    def labelled_name(found: re.Match[str]) -> str:
-        comma, name, unit = found.groups(default="")
-        return comma + labels.get(name, name + unit)
-
-    return re.sub(r"(^|, )(\w+)( \(.*?\))?(?= [=~] )", labelled_name, text)
-
-
-def _runs(propagation: str) -> str:
-    """Return in words how the population of inputs becomes one of responses."""
-    size = re.match(r"(Reweighted|Resimulated|Fresh)\(n=(\d+)", propagation)
-    if size is None:
-        return propagation.partition("(")[0]
-    if size[1] == "Reweighted":
-        return f"{size[2]} runs, once; weighted for each population"
-    return f"{size[2]} runs for each population"
-
-
 def comparison_of_responses(m: Material) -> list[Section]:
     """Return how measured and simulated responses are compared."""
-    if not (m.calibrations or m.simulators):
+    if not (m.calibrations or m.description["simulators"]):
         return []
     labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
     about = (
@@ -162,7 +145,7 @@ def comparison_of_responses(m: Material) -> list[Section]:
 
 def diagnostics(m: Material) -> list[Section]:
     """Return the problems of the results in sentences, and remarks."""
-    problems: dict[str, list[str]] = {}  # labels of the results by sentence
+    problems: dict[str, list[str]] = {}  # labels of results by sentence
     remarks: dict[str, list[str]] = {}
     for label, diagnosis in m.diagnoses.items():
         if diagnosis is None:
@@ -195,7 +178,7 @@ def _with_labels(sentences: Mapping[str, list[str]]) -> list[str]:
 
 
 def failures(m: Material) -> list[Section]:
-    """Return the failed responses with the reasons, a page of them."""
+    """Return the failed responses with the reasons, at most a page."""
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
     for tree in m.results.values():
         if "failures" in tree.children:
@@ -217,56 +200,39 @@ def failures(m: Material) -> list[Section]:
 
 
 def metric(m: Material) -> list[Section]:
-    """Return the discrepancies and epsilons of the results."""
-    rows = [
-        row
-        for label, calibration in m.calibrations.items()
-        for row in _discrepancies(label, calibration)
-    ]
+    """Return the discrepancies and epsilons of the results, or their log-likelihoods."""
+    rows: list[dict[str, Any]] = []
+    for label, calibration in m.calibrations.items():
+        sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
+        means = calibration["discrepancy"].mean(sample_dims, skipna=False)
+        for name, mean in zip(calibration["simulator"].values, means.values, strict=True):
+            values = calibration.sel(simulator=name)
+            row = {"result": label, "simulator": str(name)}
+            if "n_runs" in values:
+                row["runs"] = str(int(values["n_runs"]))
+            keys = {"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"}
+            numbers = {text: float(values[key]) for key, text in keys.items() if key in values}
+            if m.is_by_specimen:
+                rows.append(row | {"log-likelihood": -float(mean)})
+            else:
+                rows.append(row | {"discrepancy": float(mean)} | numbers)
     if not rows:
         return []
     if m.is_by_specimen:
-        for row in rows:
-            row["log-likelihood"] = -row["discrepancy"]
-        keys = ("result", "simulator", "log-likelihood", "runs")
-        table = rows_table([{key: row[key] for key in keys} for row in rows])
         about = "Runs are those of the emulator. Of a posterior the mean over its draws is shown."
-        return [Section("Log-likelihood", about, table, level=3)]
+        return [Section("Log-likelihood", about, rows_table(rows), level=3)]
     about = "Of a posterior the mean discrepancy over its draws is shown."
-    if any(row["epsilon"] is not None for row in rows):
+    if any("epsilon" in row for row in rows):
         about += " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
     return [Section("Metric and epsilon", about, rows_table(rows), level=3)]
-
-
-def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
-    """Return a row for each simulator of a result."""
-    sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
-    mean = calibration["discrepancy"].mean(sample_dims, skipna=False)
-    rows: list[dict[str, Any]] = []
-    for name in calibration["simulator"].values.tolist():
-        values = calibration.sel(simulator=name)
-        keys = ("discrepancy_error", "epsilon")
-        error, epsilon = (float(values[key]) if key in values else None for key in keys)
-        rows.append(
-            {
-                "result": label,
-                "simulator": name,
-                "discrepancy": float(mean.sel(simulator=name)),
-                "Monte Carlo error": error,
-                "epsilon": epsilon,
-                "runs": str(int(values["n_runs"])) if "n_runs" in values else None,
-            }
-        )
-    return rows
 
 
 def optima(m: Material) -> list[Section]:
     """Return a section for each optimum."""
     sections = []
     for label, tree in m.optima.items():
-        names = readable_elements(
-            optimum_elements(tree["optimum"].data_vars, tree["stderr"].data_vars)
-        )
+        estimates, elements = estimates_of(tree)
+        names = readable_elements(elements)
         attrs = tree["optimum"].attrs
         ended = "converged" if attrs.get("converged") else "did not converge"
         evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
@@ -289,11 +255,10 @@ def optima(m: Material) -> list[Section]:
             else "Standard errors are those of the estimator over repeated sets of as many "
             "specimens."
         )
-        point = single_elements(tree["optimum"].data_vars)
-        stderr = single_elements(tree["stderr"].data_vars)
         rows = []
         for name in names:
-            estimate, error = alike((point[name], stderr[name]), stderr[name])
+            value, stderr, *_ = estimates[name]
+            estimate, error = alike((value, stderr), stderr)
             rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
         title = _titled("Optimum", label, m.optima)
         sections.append(Section(title, text, rows_table(rows), level=3))
@@ -305,7 +270,7 @@ def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
 
 
 def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
-    """Return a sentence on another optimum, by scalars alone if its elements are many."""
+    """Return a sentence on another optimum; of many elements it names scalar variables alone."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
     if len(shown) > 8:
@@ -327,10 +292,10 @@ def posteriors(m: Material) -> list[Section]:
         chains = counted(int(posterior.sizes["chain"]), "chain")
         by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
         text = [f"{chains} of {posterior.sizes['draw']} draws{by}. Intervals have equal tails."]
-        # The width of the draws of `sample_smc`
+        # With a metric the width of the draws depends on the sampler's adjustment.
         adjustment = str(posterior.attrs.get("adjustment", ""))
         if m.is_by_specimen or m.sheets or not adjustment:
-            pass  # of data sheets the likelihood is exact
+            pass  # The likelihood is exact, and other samplers have no adjustment.
         elif adjustment == "estimate":
             text.append(
                 "The posterior is that given the metric's own estimate: prior times density of the "
@@ -345,10 +310,10 @@ def posteriors(m: Material) -> list[Section]:
         values = split_elements(draws)
         names = readable_elements(table_elements(draws))
         title = _titled("Posterior", label, m.posteriors)
-        table = rows_table(_posterior_rows(tree, list(values), names, m.prob))
+        table = rows_table(_posterior_rows(tree, names, m.prob))
         sections.append(Section(title, text, table, level=3))
         varying = [name for name in names if np.ptp(values[name]) > 0]
-        if 2 <= len(varying) <= 8:  # more do not fit on a page
+        if 2 <= len(varying) <= 8:  # A larger table does not fit on a page.
             r = np.corrcoef([values[name] for name in varying])
             about = "Correlations of the draws: the data hardly distinguish a pair near 1 or -1."
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
@@ -356,24 +321,21 @@ def posteriors(m: Material) -> list[Section]:
     return sections
 
 
-def _posterior_rows(
-    tree: xr.DataTree, elements: list[str], names: Sequence[str], prob: float
-) -> list[dict[str, Any]]:
+def _posterior_rows(tree: xr.DataTree, names: Sequence[str], prob: float) -> list[dict[str, Any]]:
+    """Return estimates and diagnostics of the draws of each variable."""
     arviz: Any = import_module("arviz")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
-        table = arviz.summary(tree, kind="all", ci_kind="eti", ci_prob=prob, round_to="none")
-    bounds = [key for key in table.columns if key.startswith("eti")]
+        table = arviz.summary(tree, kind="diagnostics", round_to="none")
+    estimates, _ = estimates_of(tree, prob)
     rows = []
     # ArviZ has the same elements in the same order, with names of its own.
-    for name, (_, values) in zip(elements, table.iterrows(), strict=True):
+    for (name, values), (_, checks) in zip(estimates.items(), table.iterrows(), strict=True):
         if name not in names:
             continue
-        in_units = [values[k] for k in ("mean", "sd", *bounds)]
-        mean, sd, lower, upper = alike(in_units, float(values["sd"]))
+        mean, sd, lower, upper = alike(values, values[1])
         bulk, tail, rhat, mcse = (
-            float(values[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
+            float(checks[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
         )
-        decimals = places(mcse, 2)
         rows.append(
             {
                 "variable": name,
@@ -384,7 +346,7 @@ def _posterior_rows(
                 "ESS, bulk": f"{bulk:.0f}" if math.isfinite(bulk) else NOTHING,
                 "ESS, tail": f"{tail:.0f}" if math.isfinite(tail) else NOTHING,
                 "R-hat": NOTHING if math.isnan(rhat) else f"{rhat:.3f}",
-                "error of mean": number(mcse) if decimals is None else f"{mcse:.{decimals}f}",
+                "error of mean": alike([mcse], mcse, 2)[0],
             }
         )
     return rows
@@ -394,44 +356,17 @@ def comparison(m: Material) -> list[Section]:
     """Return the results side by side."""
     if m.comparison is None:
         return []
-    table = m.comparison
-    labels = table["result"].values.tolist()
-    rows = []
-    for name in table["hyperparameter"].values.tolist():
-        for label in labels:
-            cell = table.sel(hyperparameter=name, result=label)
-            values = [float(cell[key]) for key in ("estimate", "sd", "lower", "upper")]
-            estimate, sd, lower, upper = alike(values, values[1])
-            shift = float(cell["shift"])
-            rows.append(
-                {
-                    "hyperparameter": name,
-                    "result": label,
-                    "estimate": estimate,
-                    "sd": sd,
-                    # The comparison has intervals of this probability alone
-                    f"{INTERVAL:.0%} from": lower if m.prob == INTERVAL else "",
-                    "to": upper if m.prob == INTERVAL else "",
-                    "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
-                }
-            )
-    about = (
-        f"The shift is the distance from the estimate of {labels[0]}, "
-        "in standard deviations of the result in the row."
-    )
-    sections = [Section("Comparison of results", about, rows_table(rows), level=3)]
-    scores = [
-        {"under the metric": str(key)} | dict(zip(labels, values.values.tolist(), strict=True))
-        for key, values in table.data_vars.items()
-        if values.dims == ("result",) and key not in ("n_responses", "seconds")
+    table = m.comparison  # A comparison from a file is a plain dataset.
+    shown = Comparison(table.data_vars, coords=table.coords, attrs=table.attrs).to_view()
+    text = [
+        f"The shift is the distance from the estimate of {table['result'].values[0]}, in standard "
+        "deviations of the result in the row.",
+        *shown.sentences,
     ]
-    if scores:
-        about = (
-            "Discrepancy of the population at each estimate, under each metric, "
-            "whichever metric it was calibrated with."
-        )
-        sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
-    return sections
+    columns = view_table(shown)
+    if m.prob != INTERVAL:  # All intervals of a report have the same probability.
+        columns = columns.drop(columns=f"{INTERVAL:.0%} interval")
+    return [Section("Comparison of results", text, columns, level=3)]
 
 
 # -- appendix: diagnostics -------------------------------------------------------------------
@@ -471,7 +406,7 @@ def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
     """Return the statistics of `sample_smc`; nothing of other samplers."""
     if "sample_stats" not in tree or "stage" not in tree["sample_stats"].dims:
         return []
-    # Chains have different numbers of stages: NaN from the end of a chain on.
+    # Chains have different numbers of stages; their rows are filled up with NaN.
     stats = tree["sample_stats"].to_dataset()
     stages = (~np.isnan(stats["beta"].values)).sum(axis=1)
     last = (np.arange(stages.size), stages - 1)
@@ -527,7 +462,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
     if directions and not test.folded:
         values = "u and |2u - 1|"
     digits = p_digits(test.p_value, test.alpha)
-    # The verdict first: the end of a wide table is off a phone's screen.
+    # The verdict is the first column, as the end of a wide table is off a phone's screen.
     return {
         "verdict": "rejected" if test.rejected else "not rejected",
         "values": test.u_values.size,
@@ -542,7 +477,7 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
 
 
 def specimens(m: Material) -> list[Section]:
-    """Return the measured values and u-values of each specimen of the test, a page of them."""
+    """Return measured values and u-values of the specimens of the test, at most a page."""
     rows = _measured_rows(m)
     if not rows:
         return []
@@ -558,21 +493,21 @@ def specimens(m: Material) -> list[Section]:
 def _measured_rows(m: Material) -> list[dict[str, Any]]:
     """Return a row for each specimen and output of the validation data."""
     rows = []
-    for condition, pair in validation_pairs(m):
-        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-        values = alike(pair.measured.tolist(), sd)
-        us = u_values(pair.measured, pair.predicted).tolist()
-        name = named(pair.name, m.labels)
-        labels = _specimen_labels(condition, len(m.validation[condition][0]), m)
-        rows += [
-            {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
-            for label, value, u in zip(labels, values, us, strict=True)
-        ]
+    for condition, tested in m.validation.items():
+        labels = _specimen_labels(condition, len(tested.measured), m)
+        for pair in tested.pairs:
+            values = alike(pair.measured.tolist(), finite_sd(pair.measured))
+            us = u_values(pair.measured, pair.predicted).tolist()
+            name = named(pair.name, m.labels)
+            rows += [
+                {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
+                for label, value, u in zip(labels, values, us, strict=True)
+            ]
     return rows
 
 
 def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
-    """Return the labels of a condition's n specimens in a test of them, or their numbers."""
+    """Return the labels of a condition's n specimens from the test of them, or else numbers."""
     for test in m.tests.values():
         is_single = len(test.of_conditions) == 1 and len(m.validation) == 1
         for name in test.of_conditions:
@@ -584,7 +519,7 @@ def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
 
 
 def _specimen_label(label: str, condition: str) -> str:
-    """Return a label; the number from one on of a specimen that the test counts from zero."""
+    """Return a label; tests count specimens without labels from zero, and a report from one."""
     index = label.removeprefix(f"{condition}, ")
     return str(int(index) + 1) if index != label and index.isdigit() else label
 
@@ -597,31 +532,30 @@ def measured_values(m: Material) -> list[Section]:
     if not m.observed:
         return []
     sections = []
-    # At most half a page
+    # The values of a simulator fill half a page at most.
     about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
     values = [about]
     for name, y in m.observed.items():
-        if y.ndim > 1 and y.shape[1] > 1:
-            sections.append(_correlations(name, m))
-        if y.size > 300:
-            values.append(f"{name}: {y.size} values, which are too many to print.")
+        columns = y.columns()
+        if len(columns) > 1:
+            sections.append(_correlations(name, y))
+        if y.values.size > 300:
+            values.append(f"{name}: {y.values.size} values, which are too many to print.")
             continue
-        outputs = m.outputs.get(name, SINGLE_OUTPUT)
-        names = [name] if y.ndim == 1 else [f"{name}[{output}]" for output in outputs.names]
-        for element, column in zip(names, np.atleast_2d(y.T), strict=True):
-            texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
+        for output, _, column in columns:
+            texts = alike(column.tolist(), finite_sd(column), 4)
+            element = element_name(name, [output] if output else [])
             values.append(f"{element}: {', '.join(texts)}.")
     return [*sections, Section("Measured values", values, level=3)]
 
 
-def _correlations(name: str, m: Material) -> Section:
+def _correlations(name: str, y: Observed) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
     pandas: Any = import_module("pandas")
-    columns = shown_outputs(m, name)
-    y = np.column_stack([column for *_, column in columns])
-    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
+    columns = {output: np.where(np.isfinite(x), x, np.nan) for output, _, x in shown_columns(y)}
+    r = pandas.DataFrame(columns).corr(min_periods=3).values
     about = "Each of the specimens that have both outputs, without those that failed."
-    table = correlation_table([output for output, *_ in columns], r, 3)
+    table = correlation_table(list(columns), r, 3)
     return Section(f"Correlations of {name}", about, table, level=3)
 
 
@@ -630,13 +564,13 @@ def origin(m: Material) -> list[Section]:
     if not m.results:
         return []
     costs: list[tuple[str, str, Mapping[Any, Any], str]] = []
-    for label in m.results:
-        attrs = m.attrs(label)
+    for label, result in m.results.items():
+        attrs = attributes_of(result)
         by = str(attrs.get("sampler", "minimize" if label in m.optima else ""))
         costs.append((label, by, attrs, "n_responses"))
-    for condition, (_, predicted) in m.validation.items():
+    for condition, tested in m.validation.items():
         label = f"prediction, {named(condition, m.labels)}"
-        costs.append((label, "predict", predicted.attrs, "responses"))
+        costs.append((label, "predict", tested.predicted.attrs, "responses"))
     for label, table in m.decisions.items():
         costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
     rows = []
@@ -644,13 +578,13 @@ def origin(m: Material) -> list[Section]:
         row: dict[str, Any] = {"result": label, "by": by}
         row["responses"] = str(int(record[responses])) if responses in record else None
         seconds = record.get("seconds")
-        if seconds is not None:  # to a tenth below ten
+        if seconds is not None:  # Below ten a tenth matters.
             seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
         seed = record.get("random_seed")
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
     text = ["Responses are runs for one specimen; those of a common design are counted in each."]
     text += [f"{name}: {metric}." for name, metric in metrics_of(m).items()]
-    text += [f"{s['name']}: {s['propagation']}." for s in m.simulators]
+    text += [f"{s['name']}: {s['propagation']}." for s in m.description["simulators"]]
     packages = ", ".join(f"{name} {version}" for name, version in versions_of(m).items())
     text += [f"Computed with {packages}."] if packages else []
     return [Section("Cost and origin", text, rows_table(rows), level=3)]
@@ -659,8 +593,8 @@ def origin(m: Material) -> list[Section]:
 # -- order -----------------------------------------------------------------------------------
 
 
-# Chapters with their parts in order: a function of the material, or the name of a picture. The
-# first chapter is page one, and has the verdict as its title.
+# parts of each chapter in their order: functions of the material, and names of pictures; the first
+# chapter is page one, whose title is the verdict
 _CHAPTERS: dict[str, tuple[Any, ...]] = {
     "Verdict": (verdict, "front", population_in_units),
     "Decision": (decision, "sensitivity", next_steps),

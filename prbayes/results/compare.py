@@ -15,14 +15,13 @@ from scipy.special import ndtri
 from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, called, wrong_type
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.multivariate import Joint
-from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.locking import locked
@@ -41,10 +40,9 @@ from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in, refuse_model
-from prbayes.response.inputs import event_shape
 from prbayes.results.predict import width_of_epsilon
 
-# Variables by result that are no scores.
+# variables by result that are no scores
 COSTS = ("n_responses", "seconds")
 _ESTIMATE = ("estimate", "sd", "lower", "upper")  # variables by result and element
 _METRICS = (
@@ -131,21 +129,23 @@ def compare(
     except ValueError as error:
         raise ValueError(f"{error}; use prb.rank to compare models of the same data") from None
     optima = [result for result in results.values() if isinstance(result, Optimum)]
-    # Draws without coordinates have those of the model.
+    # Draws without coordinates take those of the model, so that elements have the same names.
     naming = optima[0].model if model is None and optima else model
-    read = [_estimates(label, result, naming) for label, result in results.items()]
-    columns, shown, costs = zip(*read, strict=True)
+    trees = [_tree_of(label, result) for label, result in results.items()]
+    read = [estimates_of(tree, model=naming) for tree in trees]
+    columns, shown = zip(*read, strict=True)
     in_all = set.intersection(*map(set, columns))
     shared = [name for name in columns[0] if name in in_all]
     left_out = [name for column in columns for name in column if name not in in_all]
-    if left_out and shared and None in identities.values():  # results of other tools
+    if left_out and shared and None in identities.values():
+        # Other tools may name variables differently.
         listed = ", ".join(dict.fromkeys(left_out))
         text = f"compare: left out {listed:.300}, as not all results have these names."
         report(Finding("names-differ", text))
     if model is not None:
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         shared = [name for name in shared if variable_of(name, variables) in variables]
-    in_table = set.intersection(*shown)
+    in_table = set.intersection(*map(set, shown))
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
         got = {label: list(column) for label, column in zip(results, columns, strict=True)}
@@ -158,16 +158,17 @@ def compare(
         )
     table = np.array([[column[name] for name in names] for column in columns])
     estimates, sds = table[..., 0], table[..., 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a result without spread
+    with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
         shift = (estimates - estimates[0]) / sds
     shift[0] = 0.0
     dims = ["result", "hyperparameter"]
     data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_ESTIMATE)}
     data["shift"] = (dims, shift)
-    for i, key in enumerate(COSTS):
-        data[key] = ("result", [cost[i] for cost in costs])
+    for key in COSTS:
+        costs = [float(estimates_in(tree).attrs.get(key, np.nan)) for tree in trees]
+        data[key] = ("result", costs)
     if model is not None and (simulators(model) or specimen_likelihoods(model)):
-        # The designs of a model cover its own optimum.
+        # The designs of a model cover its own optimum; other estimates may need first samples.
         is_covered = any(optimum.model is model for optimum in optima)
         values = np.array([[column[name][0] for name in shared] for column in columns])
         for key, scores in _scores(model, shared, values, metrics, is_covered=is_covered).items():
@@ -200,50 +201,74 @@ class Comparison(Table):
             for label in self["result"].values:
                 row = self.sel(hyperparameter=name, result=label)
                 estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
-                rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}"])
+                shift = f"{float(row['shift']) + 0.0:.2f}"  # The sum turns -0.0 into 0.0.
+                rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}", shift])
         sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
         for key, scores in self.data_vars.items():
             if scores.dims == ("result",) and key not in COSTS:
                 items = scores.to_series().items()
                 listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
                 sentences.append(f"Discrepancy by {key}: {listed}.")
-        header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval"]
+        header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval", "shift in sd"]
         return View("Comparison", header, rows, sentences)
 
 
-def _estimates(
-    label: str, result: Any, naming: pm.Model | None
-) -> tuple[dict[str, tuple[float, ...]], set[str], list[float]]:
-    """Return estimate, sd and interval of each element, elements that a table shows, and costs."""
-    groups = result.children if isinstance(result, xr.DataTree) else {}
-    estimates: dict[str, tuple[float, ...]] = {}
-    if "posterior" in groups:
-        attrs = result["posterior"].attrs
-        draws = stacked_draws(result["posterior"], model=naming)
-        tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
-        for element, x in split_elements(draws).items():
-            estimates[element] = (x.mean(), x.std(ddof=1), *np.quantile(x, tails))
-        shown = table_elements(draws)
-    else:
-        if isinstance(result, Optimum):
-            attrs = {"n_responses": result.n_responses, "seconds": result.search.seconds}
-            point = labelled(result.evaluator, result.point, {}).data_vars
-            stderr = labelled(result.evaluator, result.stderr, {}).data_vars
-        elif "optimum" in groups:
-            attrs = result["optimum"].attrs
-            point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
-        else:
-            raise TypeError(
-                f"compare: results: {label}: got {type(result).__name__}, "
-                "expected an Optimum or a DataTree with a posterior group"
-            )
-        z = ndtri((1 + INTERVAL) / 2)
-        errors = single_elements(stderr)
-        for element, value in single_elements(point).items():
-            sd = errors[element]
-            estimates[element] = (value, sd, value - z * sd, value + z * sd)
-        shown = optimum_elements(point, stderr)
-    return estimates, set(shown), [float(attrs.get(key, np.nan)) for key in COSTS]
+def _tree_of(label: str, result: Any) -> xr.DataTree:
+    """Return a result as the tree that a file has, or raise if it has no estimates."""
+    tree = result.to_datatree() if isinstance(result, Optimum) else result
+    if not isinstance(tree, xr.DataTree) or not {"posterior", "optimum"} & set(tree.children):
+        expected = "an Optimum or a DataTree with a posterior group"
+        raise wrong_type(result, f"compare: results: {label}", expected)
+    return tree
+
+
+def estimates_in(result: xr.DataTree) -> xr.DataTree:
+    """Return the group of a result with its estimates."""
+    return result.children["posterior" if "posterior" in result else "optimum"]
+
+
+def estimates_of(
+    result: xr.DataTree, prob: float = INTERVAL, model: pm.Model | None = None
+) -> tuple[dict[str, tuple[float, ...]], list[str]]:
+    """Return estimate, sd and interval of each element, and the elements that a table shows.
+
+    The interval of an optimum is normal, that of draws has equal tails. Draws without coordinates
+    take those of the model.
+    """
+    levels = (1 - prob) / 2, (1 + prob) / 2
+    if "posterior" in result:
+        draws = stacked_draws(result["posterior"], model=model)
+        estimates = {
+            name: (x.mean(), x.std(ddof=1), *np.quantile(x, levels))
+            for name, x in split_elements(draws).items()
+        }
+        return estimates, table_elements(draws)
+    point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
+    errors = single_elements(stderr)
+    z = ndtri(levels[1])
+    estimates = {}
+    for name, value in single_elements(point).items():
+        sd = errors[name]
+        estimates[name] = value, sd, value - z * sd, value + z * sd
+    return estimates, optimum_elements(point, stderr)
+
+
+def thetas_at(evaluator: Evaluator, elements: Mapping[str, Floats]) -> Floats:
+    """Return thetas, (n, d), from elements of the free variables by name, (n,) or (1,) each.
+
+    Raises a KeyError if an element is missing.
+    """
+    hyperparameters = evaluator.hyperparameters
+    n = max(map(np.size, elements.values()))
+    initial = hyperparameters.constrained(hyperparameters.initial[None])
+    values = []
+    for name in (str(rv.name) for rv in evaluator.model.free_RVs):
+        shape = initial[name].shape[1:]
+        labels = coordinates(evaluator.model, name)
+        names = element_names(name, shape, labels)
+        columns = [np.broadcast_to(elements[element], n) for element in names]
+        values.append(np.stack(columns, axis=-1).reshape(n, *shape))
+    return hyperparameters.thetas_of(values)
 
 
 def _scores(
@@ -257,16 +282,11 @@ def _scores(
     """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
     evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:
-        return {}  # scores that were not requested compute no response
-    values = []
-    for rv in evaluator.model.free_RVs:
-        shape = event_shape(rv)
-        elements = element_names(str(rv.name), shape, coordinates(evaluator.model, str(rv.name)))
-        if not set(elements) <= set(names):
-            return {}
-        columns = [names.index(element) for element in elements]
-        values.append(estimates[:, columns].reshape(-1, *shape))
-    thetas = evaluator.hyperparameters.thetas_of(values)
+        return {}  # Scores that were not requested compute no response.
+    try:
+        thetas = thetas_at(evaluator, dict(zip(names, estimates.T, strict=True)))
+    except KeyError:
+        return {}  # The results have no estimate of a free variable.
     with nullcontext() if is_covered else temporary_first_samples(evaluator, thetas):
         lacking = [shortcomings(evaluator, theta[None]) for theta in thetas]
         several = len(evaluator.simulators) > 1
@@ -275,12 +295,13 @@ def _scores(
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
             default: Sequence[Metric] = _METRICS
-            if simulator.metric.by_specimen:  # its log-likelihood replaces the kernel form
+            if simulator.metric.by_specimen:
+                # The log-likelihood by specimen replaces that by kernels.
                 default = _METRICS[:-1]
             if simulator.observed.ndim > 1:
-                default = [Joint(metric) for metric in default]  # the same in all directions
+                default = [Joint(metric) for metric in default]  # It treats all outputs alike.
             selection = default if metrics is None else metrics
-            if simulator.metric.exact_likelihood:  # of statistics, not of specimens
+            if simulator.metric.exact_likelihood:  # A data sheet has statistics, no specimens.
                 selection = [simulator.metric]
             for metric in selection:
                 target = metric.against(simulator.observed, simulator.weights)

@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Finding, counted, from_json
-from prbayes._validate import Floats
+from prbayes._validate import Floats, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
@@ -57,10 +57,11 @@ from prbayes.results.likelihood_checks import (
     emulator_remarks,
     separate_modes,
 )
-from prbayes.results.predict import populations_of, width_of_epsilon
+from prbayes.results.predict import RESULT, thetas_of, width_of_epsilon
 
-# R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
-# the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each.
+# noise of R-hat: with independent draws it exceeds 1 + _NOISE / (chains x draws) about once in a
+# thousand cases; the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, from 1500 to 4000
+# sets of each
 _NOISE = 11.0
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -202,10 +203,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     tree = result.to_datatree() if isinstance(result, Optimum) else result
     groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
     if not groups & {"posterior", "optimum"}:
-        raise TypeError(
-            f"diagnose: result: got {type(result).__name__}, expected an Optimum from "
-            "prb.minimize, or a DataTree with a posterior group, such as prb.sample_smc returns"
-        )
+        raise wrong_type(result, "diagnose: result", RESULT)
     has_draws = "posterior" in groups
     calibration = tree["calibration"].to_dataset() if "calibration" in groups else xr.Dataset()
     if has_draws and not calibration:
@@ -215,22 +213,21 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     by_specimen = "is_likelihood" in calibration and bool(calibration["is_likelihood"].all())
     evaluator = None if optimum is None else optimum.evaluator
     thetas = None if optimum is None else optimum.theta[None]
-    # A model that was built again does not have the designs of draws with their calibration.
+    # The tree of a sampler of this package has the support of its draws. A model that was built
+    # again has other designs, and would not reproduce it.
     if has_draws and model is not None and (by_specimen or not calibration):
         evaluator = Evaluator.of(model)
         by_specimen = not evaluator.nodes
         every_draw = tree["posterior"].sizes["chain"] * tree["posterior"].sizes["draw"]
-        points, _ = populations_of(tree, model, every_draw, "prb.diagnose")
-        thetas = evaluator.hyperparameters.thetas_of(
-            [points[str(rv.name)] for rv in model.free_RVs]
-        )
+        thetas = thetas_of(tree, evaluator, every_draw, "prb.diagnose")
     coverage: _Coverage = {}
     if has_draws and calibration:
         coverage = _stored_coverage(calibration)
     elif evaluator is not None and thetas is not None:
         coverage = _computed_coverage(evaluator, thetas)
     attrs = tree["posterior" if has_draws else "optimum"].attrs
-    findings = from_json(str(attrs.get("findings", "[]")))  # of the run that made the result
+    # The result has the findings of the run that made it.
+    findings = from_json(str(attrs.get("findings", "[]")))
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
         checked += Checked(width_of_epsilon(tree, model))
@@ -259,7 +256,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
-    # Of the log-likelihood by specimen
+    # Only the log-likelihood by specimen stores this share.
     failing = _stored_shares(calibration, "failing_share")
     failed = _stored_shares(calibration, "failed_mass")
     failures, harmless = _failure_findings(tree, lost | failing, failed | failing)
@@ -277,7 +274,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
 def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return findings without copies, and no later ones on a condition reported earlier.
 
-    These have the same code, and the same simulator before the colon.
+    Two findings are about the same condition if they have the same code, and the same simulator
+    before the colon.
     """
 
     def condition(finding: Finding) -> tuple[str, str]:
@@ -315,7 +313,7 @@ def _check_family(optimum: Optimum) -> Checked:
         obstacle = "at an edge or a jump the optimum has no sampling distribution"
     elif not optimum.converged:
         obstacle = "the optimum did not converge; pass another start= or method= to prb.minimize"
-    elif obstacle is None and _seconds_of_test(optimum) > 30:
+    elif obstacle is None and seconds_of(optimum, SETS) > 30:
         obstacle = f"it would take {SETS * evaluator.responses_per_theta} responses"
     if obstacle is not None:
         return Checked((*small_simulators(evaluator), *failures)) + _not_tested(obstacle)
@@ -348,30 +346,29 @@ def _check_family(optimum: Optimum) -> Checked:
     return Checked((*biases, *misfit), misfits)
 
 
-def _seconds_of_test(optimum: Optimum) -> float:
-    """Return at most how long the responses take that the test needs; none if they are stored."""
+def seconds_of(optimum: Optimum, populations: int) -> float:
+    """Return an upper bound of the time for the responses of some populations, in seconds."""
     seconds_each = optimum.search.seconds / max(optimum.n_responses, 1)
-    return SETS * optimum.evaluator.responses_per_theta * seconds_each
+    return populations * optimum.evaluator.responses_per_theta * seconds_each
 
 
 # -- responses -------------------------------------------------------------------------------
 
 
 def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
-    """Return the share without response, or that fails, at the optimum or over the draws.
+    """Return the share of specimens that have no response, or that fail, by simulator.
 
-    Only where it is known.
+    It is the share at the optimum, or the mean over the draws. Simulators for which it is unknown
+    are left out.
     """
     if key not in calibration:
         return {}
-    shares = calibration[key].transpose("simulator", ...).values
-    rows = [row[~np.isnan(row)] for row in shares.reshape(len(shares), -1)]
-    means = np.array([row.mean() if row.size else np.nan for row in rows])
+    shares = calibration[key]
+    means = shares.mean([dim for dim in shares.dims if dim != "simulator"])
     if f"{key}_at_best" in calibration:
-        means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
-    names = calibration["simulator"].values.tolist()
-    pairs = zip(names, means.tolist(), strict=True)
-    return {name: share for name, share in pairs if not np.isnan(share)}
+        means = means.fillna(calibration[f"{key}_at_best"])
+    by_simulator = zip(calibration["simulator"].values.tolist(), means.values.tolist(), strict=True)
+    return {name: share for name, share in by_simulator if not np.isnan(share)}
 
 
 def _failure_findings(
@@ -393,7 +390,7 @@ def _failure_findings(
             f"at ({point}): {rows['reason'].values[0]}; "
         )
         replacement = rows["instead"].values[0]
-        share = np.nan  # a finite number in place of a failed response looks like any other
+        share = np.nan  # Finite replacements look like other responses: their share is unknown.
         if np.isnan(replacement):
             share = lost.get(name, np.nan)
         elif np.isposinf(replacement):
@@ -459,21 +456,15 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
     variables = posterior.to_dataset()
     if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
-    modes: tuple[Finding, ...] = ()
-    if by_specimen:
-        columns = {}
-        for name, values in variables.data_vars.items():
-            table = values.transpose("chain", "draw", ...).values
-            flat = table.reshape(*table.shape[:2], -1)
-            for j in range(flat.shape[-1]):
-                element = f"{name}[{j}]" if values.ndim > 2 else str(name)
-                columns[element] = flat[..., j]
-        modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
+    elements = split_elements(stacked_draws(variables))
+    sizes = posterior.sizes["chain"], posterior.sizes["draw"]
+    draws = np.stack([x.reshape(sizes) for x in elements.values()], axis=-1)
+    modes = separate_modes(draws, list(elements)) if by_specimen else ()
     findings = list(modes)
-    # Chains in different modes have a large R-hat; ArviZ gives NaN for shorter chains.
+    # Chains in different modes have a large R-hat anyway. For fewer draws ArviZ returns NaN.
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
-    findings += [*_repeated_draws(variables), *_particles_stuck(tree)]
+    findings += [*_repeated_draws(draws), *_particles_stuck(tree)]
     return Checked(tuple(findings))
 
 
@@ -493,7 +484,7 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
         )
         findings.append(Finding("chains-disagree", text, page))
     total = chains * draws
-    # For R-hat and ESS themselves to be reliable; of few draws a quarter.
+    # With 400 effective draws R-hat and ESS are reliable. Of few draws a quarter is accepted.
     needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
     small = [f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed]
@@ -509,30 +500,29 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
 def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     """Return a statistic of ArviZ by element, such as 'mu[1]', without those that never vary."""
     stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
-    with np.errstate(all="ignore"):  # a variable that never moves
+    with np.errstate(all="ignore"):  # A variable may never move.
         values = getattr(stats, statistic)(posterior)
     elements = single_elements(values.data_vars)
     return {name: elements[name] for name in table_elements(stacked_draws(posterior))}
 
 
-def _repeated_draws(draws: xr.Dataset) -> list[Finding]:
-    """Report chains with hardly any different draws."""
+def _repeated_draws(draws: Floats) -> list[Finding]:
+    """Report chains with hardly any different draws, (chains, draws, d)."""
+    n_draws = draws.shape[1]
     counts = []
-    for chain in range(draws.sizes["chain"]):
-        columns = split_elements(draws.isel(chain=chain).transpose("draw", ...).data_vars)
-        table = np.stack(list(columns.values()), axis=1)
+    for table in draws:
         size = np.abs(table).max(axis=0, initial=0.0)
-        # Equal up to thousands of times rounding, far below the width of any posterior.
+        # Draws are equal if they differ by rounding alone; posteriors are far wider than that.
         digits = np.round(table / np.where(size > 0, size, 1.0) / 1e-12)
         counts.append(len(np.unique(digits, axis=0)))
-    # A standard deviation from 50 draws has an error of a tenth.
-    expected = min(50, draws.sizes["draw"] // 2)
+    # A standard deviation from 50 different draws has an error of a tenth.
+    expected = min(50, n_draws // 2)
     few = [str(chain) for chain, count in enumerate(counts) if count < expected]
     if not few:
         return []
     chains = "chains" if len(few) > 1 else "chain"
     text = (
-        f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
+        f"Of {n_draws} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
         f"expected at least {expected}: few particles, or one, survived, and the width of the "
         "draws is meaningless. Pass more draws, priors nearer to the data, or a larger epsilon."
     )
@@ -545,15 +535,16 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
         return []
     stats = result["sample_stats"]
     moves: Any = (stats["accept_rate"] * stats["n_steps"]).values
-    # Chains have different numbers of stages: NaN from the end of a chain on.
+    # Chains have different numbers of stages; their rows are filled up with NaN.
     last = [chain[~np.isnan(chain)][-1] for chain in moves]
-    # With less than one, many copies of a particle are still the same draw.
+    # If a particle moves less than once on average, many of its copies are still the same draw.
     stuck = [str(i) for i, moved in enumerate(last) if moved < 1]
     if not stuck:
         return []
     chains = "chains" if len(stuck) > 1 else "chain"
     calibration = result["calibration"]
-    noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())  # or NaN
+    # The ratio is NaN if the Monte Carlo error is unknown.
+    noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())
     reason = f" (its Monte Carlo error is {noise:.1f} epsilon)" if noise > 1 else ""
     cure = "Pass more draws, or a threshold of 0.8"
     if result["posterior"].attrs.get("sampler") == "SMC-ABC":
@@ -571,8 +562,8 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
 
 # -- designs ---------------------------------------------------------------------------------
 
-# By simulator with a design: its support of the populations of a result, arrays of one shape; and
-# what it needs, weight ESS, largest lost mass and number of points.
+# support of the populations of a result by each design, arrays of one shape, and what the design
+# requires: weight ESS, largest lost mass and number of points; by simulator
 _Coverage = dict[str, tuple[dict[str, Floats], tuple[float, float, int]]]
 
 
@@ -616,7 +607,7 @@ def _unsupported(coverage: _Coverage) -> list[Finding]:
             continue
         text = f"{name}: the design does not support the answer: {lacking}. "
         if lacking.is_lost:
-            # More points would have no more responses.
+            # Further points would not have responses either.
             text += (
                 "Repair the response there, return +inf for specimens that fail, narrow the "
                 "priors, or raise max_lost."

@@ -21,7 +21,7 @@ from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
 
-# Inputs whose shrinkage is that of their logarithms.
+# distribution of inputs whose shrinkage is that of their logarithms
 _LOG_NORMAL = type(pm.LogNormal.rv_op)
 
 
@@ -110,7 +110,10 @@ def individuals(
         inputs, gross_error = draw_inputs(with_more_points(likelihood), rng, points)
         function = likelihood.measurements[0].responses.function
         input_names = aleatory_names(likelihood.inputs, function)
-        conditions = dict(zip(likelihood.inputs.conditions, _columns(likelihood), strict=True))
+        columns = likelihood.stacked.conditions  # values of the specimens, (S, C), or None
+        conditions = {}
+        if columns is not None:
+            conditions = dict(zip(likelihood.inputs.conditions, columns.T, strict=True))
         population = _population(likelihood, points, rng)
         for position, (name, values) in enumerate(zip(input_names, inputs, strict=True)):
             if position in conditions:
@@ -153,12 +156,9 @@ class Individuals(Tree):
         tables = []
         for name, draws in self["posterior"].data_vars.items():
             over = ("chain", "draw")
-            quantiles = draws.quantile([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], over)
             columns = {"mean": draws.mean(over), "sd": draws.std(over)}
-            columns |= {
-                key: quantiles.isel(quantile=i, drop=True)
-                for i, key in enumerate(("lower", "upper"))
-            }
+            for key, level in (("lower", (1 - INTERVAL) / 2), ("upper", (1 + INTERVAL) / 2)):
+                columns[key] = draws.quantile(level, over).drop_vars("quantile")
             table = xr.Dataset(columns).to_dataframe().reset_index()
             table.insert(0, "input", str(name))
             tables.append(table)
@@ -173,7 +173,8 @@ class Individuals(Tree):
         for name, index, values in zip(
             table["input"], indices, table[numbers].to_numpy(), strict=True
         ):
-            labels = [str(i) for i in index if i == i]  # NaN of a dimension that it has not
+            # NaN marks a dimension that the input lacks.
+            labels = [str(i) for i in index if i == i]
             mean, sd, lower, upper = (f"{x:.4g}" for x in values)
             rows.append([element_name(name, labels), mean, sd, f"{lower} to {upper}"])
         sentences = [
@@ -185,16 +186,10 @@ class Individuals(Tree):
         return View("Inputs of the measured specimens", header, rows, sentences)
 
 
-def _columns(likelihood: SpecimenLikelihood) -> list[Floats]:
-    """Return the values of the specimens of each condition that is an input, (S,)."""
-    conditions = likelihood.stacked.conditions
-    return [] if conditions is None else list(conditions.T)
-
-
 def _population(
     likelihood: SpecimenLikelihood, points: dict[str, Floats], rng: np.random.Generator
 ) -> list[Floats]:
-    """Return 256 specimens of each group and population, (P, n, *event), by input."""
+    """Return 256 specimens of each group from each population, by input, (P, n, *event)."""
     parts = []
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(points, group, rows)
@@ -206,7 +201,7 @@ def _population(
 def _array(
     name: str, values: Floats, coords: dict[str, Any], outputs: Outputs | None = None
 ) -> xr.DataArray:
-    """Return draws, (P, n, *event), with the dimensions chain, draw, specimen, and of the event."""
+    """Label draws, (P, n, *event), by chain, draw, specimen, and outputs or elements."""
     event = values.shape[2:]
     event_dims = [f"{name}_dim_{i}" for i in range(len(event))]
     if outputs is not None and outputs.labels and event:

@@ -15,6 +15,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
+from scipy.special import softmax
 
 from prbayes._finding import Finding, counted
 from prbayes._validate import Floats
@@ -30,7 +31,7 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import variables_at
+from prbayes.model.parameters import element_names, variables_at
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
@@ -50,13 +51,13 @@ from prbayes.response.inputs import Inputs, aleatory_names
 class CheckOptions:
     """Sizes and thresholds of the checks (likelihood_guards, sections 2.4 and 2.11)."""
 
-    replicates: int = 199  # of the population test
-    prior_draws: int = 500  # of the conflict of prior and data
-    specimens: int = 256  # of each draw, from which its information is computed
-    # Within-chain standard deviations between the means of chains in different modes. Chains of one
-    # mode with ten independent draws each differ by one.
+    replicates: int = 199  # synthetic data sets of the test of the population
+    prior_draws: int = 500  # draws of the prior, for its conflict with the data
+    specimens: int = 256  # specimens from which the information at a draw is computed
+    # distance of the means of chains in different modes, in within-chain standard deviations; the
+    # means of chains in one mode, with ten independent draws each, differ by one
     separation: float = 2.0
-    pull: float = 0.5  # of the prior, in standard errors, above which a conflict matters
+    pull: float = 0.5  # shift by the prior, in standard errors, from which a conflict matters
 
 
 _OPTIONS = CheckOptions()
@@ -64,14 +65,14 @@ _OPTIONS = CheckOptions()
 
 @dataclass(frozen=True)
 class Checked:
-    """Reports of checks."""
+    """What checks found, what they did not find, and which were not run."""
 
     findings: tuple[Finding, ...] = ()
-    remarks: tuple[Finding, ...] = ()  # tests without a finding, with their power
-    untested: tuple[str, ...] = ()  # tests that were not run, and why
+    remarks: tuple[Finding, ...] = ()  # results of tests that found nothing, with their power
+    untested: tuple[str, ...] = ()  # sentences on tests that were not run, with the reason
 
     def __add__(self, second: Checked) -> Checked:
-        """Return the reports of both."""
+        """Return the reports of both checks together."""
         pairs = zip(vars(self).values(), vars(second).values(), strict=True)
         return Checked(*(a + b for a, b in pairs))
 
@@ -83,7 +84,7 @@ def _not_tested(subject: str, reason: str) -> Checked:
 _FAMILY = "The family of the population"
 _CONFLICT = "The conflict of prior and data"
 
-# By optimum while it lives: the test of the population takes seconds, and reports repeat it.
+# results of the test of the population by optimum, because it takes seconds and reports repeat it
 _CACHE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
 
 
@@ -111,7 +112,7 @@ def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
 
     An error of a tenth of a standard deviation of the data widens populations by half a percent.
     """
-    texts = []
+    checked = Checked()
     for simulator in evaluator.simulators:
         table = simulator.responses.function
         if isinstance(table, Runs):
@@ -121,11 +122,9 @@ def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
                 f"runs, with a cross-validated error of {share:.2g} standard deviations of the "
                 f"observed responses{'' if share <= largest else f', expected at most {largest}'}."
             )
-            texts.append((share, Finding("table-error", text, "runs.md#the-error-of-the-surface")))
-    return Checked(
-        findings=tuple(finding for share, finding in texts if share > largest),
-        remarks=tuple(finding for share, finding in texts if share <= largest),
-    )
+            report = (Finding("table-error", text, "runs.md#the-error-of-the-surface"),)
+            checked += Checked(report) if share > largest else Checked(remarks=report)
+    return checked
 
 
 # -- population ------------------------------------------------------------------------------
@@ -174,8 +173,7 @@ def check_population(optimum: Optimum) -> Checked:
         for place, (name, shape) in enumerate(zip(names, inputs.event_shapes, strict=True)):
             if place in inputs.conditions:
                 continue
-            size = int(np.prod(shape, dtype=int))
-            labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
+            labels += element_names(name, shape)
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
         if misfit and is_rounded:
@@ -227,9 +225,10 @@ def _without_sampling(optimum: Optimum) -> str:
 
 
 def score_function(inputs: Inputs) -> Any:
-    """Compile (*parents, *points) -> distribution functions by input, normal scores of MvNormal.
+    """Compile a function from (*parents, *points) to logs of distribution functions by input.
 
-    None for dependent inputs, and inputs without a distribution function.
+    A multivariate normal input has normal scores instead. The result is None if inputs depend on
+    each other, or if one has no distribution function.
     """
     if inputs.nested:
         return None
@@ -241,8 +240,8 @@ def score_function(inputs: Inputs) -> Any:
         points.append(x)
         if isinstance(dist.owner.op, MVNORMAL):
             mean, covariance = dist.owner.op.dist_params(dist.owner)
-            if covariance.type.ndim > 2:  # that differs between specimens
-                return None
+            if covariance.type.ndim > 2:
+                return None  # The covariance differs between specimens.
             root = pt.linalg.cholesky(covariance)
             graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
             continue
@@ -289,22 +288,15 @@ def scored_specimens(
                 )
             z[rows] = np.concatenate(columns, axis=1).reshape(*log_a[rows].shape, -1)
             weights[rows] = np.broadcast_to(log_p, (1, size))[0].reshape(log_a[rows].shape)
-        # Points that fill up an array have no weight and any score.
+        # Points that fill up the arrays have no weight. Their scores are arbitrary.
         z = np.where(np.isfinite(z), z, 0.0)
-        result.append((z, _normalised(weights + log_a)))
+        log_weights = weights + log_a
+        log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
+        with np.errstate(invalid="ignore"):  # A row may have no weight at all.
+            relative = softmax(log_weights, axis=1)
+        equal = 1 / log_a.shape[1]
+        result.append((z, np.where(np.isfinite(relative), relative, equal)))
     return result
-
-
-def _normalised(log_weights: Floats) -> Floats:
-    """Return weights of sum one by row, equal ones where all are zero."""
-    log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
-    largest = log_weights.max(axis=1, keepdims=True)
-    largest = np.where(np.isfinite(largest), largest, 0.0)
-    weights = np.exp(log_weights - largest)
-    total = weights.sum(axis=1, keepdims=True)
-    has_weight = total > 0
-    relative = weights / np.where(has_weight, total, 1.0)
-    return np.where(has_weight, relative, 1 / weights.shape[1])
 
 
 # -- draws -----------------------------------------------------------------------------------
@@ -355,12 +347,12 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
     stats: Any = import_module("arviz_stats")
     findings = []
     for name, values in result["log_likelihood"].to_dataset().data_vars.items():
-        if values.ndim != 3 or values.shape[-1] < 2:  # of all specimens together
-            continue
+        if values.ndim != 3 or values.shape[-1] < 2:
+            continue  # This log-likelihood is one of all specimens together.
         limit = min(0.7, 1 - 1 / np.log10(max(values.sizes["chain"] * values.sizes["draw"], 11)))
         by_sample = values.stack(sample=("chain", "draw")).transpose(..., "sample")
         with np.errstate(all="ignore"):
-            # Of the log-likelihood itself: ArviZ takes its negative for log weights.
+            # ArviZ takes the negative of its argument as log weights of leave-one-out.
             _, k = stats.base.array_stats.psislw(by_sample.values, axis=-1)
         k = np.atleast_1d(k)
         high = np.flatnonzero(k > limit)
@@ -411,7 +403,7 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     if findings:
         return Checked(findings)
     text = f"{shift}; no hyperparameter is in conflict with its prior (p > .05)."
-    # The power was measured with a reading of each input, without limits.
+    # The power was measured with one reading of each input, and readings without limits.
     if simulation_obstacle(evaluator) is None:
         n = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
         power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
@@ -423,9 +415,10 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
 
 
 def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
-    """Return estimates of data sets simulated at draws of the prior, (S, d); NaN if unknown.
+    """Return estimates from data sets simulated at draws of the prior, (S, d); NaN if unknown.
 
-    Normal around a draw: the covariance is the inverse information of the inputs, scaled.
+    They are normal around each draw. Their covariance is the inverse information of known inputs,
+    scaled to the standard errors of the optimum.
     """
     rng = np.random.default_rng(31)
     evaluator = optimum.evaluator

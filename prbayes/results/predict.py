@@ -27,6 +27,7 @@ from prbayes._validate import (
     plain_text,
     positive_integer,
     seed_number,
+    wrong_type,
 )
 from prbayes.emulators.runs import Runs
 from prbayes.model.conditions import at_conditions, stacked_values
@@ -36,7 +37,7 @@ from prbayes.model.emulated import (
     PopulationSimulator,
     population_simulators,
 )
-from prbayes.model.evaluator import TOLERABLE, read_inputs_of_copy, shortcoming
+from prbayes.model.evaluator import TOLERABLE, Evaluator, read_inputs_of_copy, shortcoming
 from prbayes.model.fingerprint import (
     Level,
     as_attributes,
@@ -57,6 +58,12 @@ from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, is_group, model_on_context
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
+
+# Types that a function of results takes, for its errors.
+RESULT = (
+    "an Optimum from prb.minimize, or a DataTree with a posterior group, such as prb.sample_smc "
+    "returns"
+)
 
 
 @locked
@@ -207,11 +214,11 @@ def predict(
         scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    # A table costs no run, and is NaN outside its ranges.
+    # A table of runs needs no emulator: it costs no run, and is NaN outside its ranges.
     is_served = stored and not isinstance(response, Runs)
     simulator = serving(sources, responses) if is_served else None
     size = len(next(iter(points.values())))
-    # A condition that is an input has the same values as a covariate.
+    # A condition that is an input and a covariate has the same values as both.
     stated = {} if conditions is None else _by_name(inputs_read, conditions)
     values = covariate_values(label, inputs_read, at, stated, has_runs=simulator is not None)
     points |= {
@@ -266,7 +273,7 @@ class Prediction(ShownArray, xr.DataArray):
             labels = [self[d].values[i] for d, i in zip(rows_of, index, strict=True)]
             finite = x[np.isfinite(x)]
             moments = [finite.mean(), finite.std()] if finite.size else [np.nan, np.nan]
-            with np.errstate(invalid="ignore"):  # between two failures, +inf
+            with np.errstate(invalid="ignore"):  # A quantile may lie between two failures, +inf.
                 numbers = [*moments, *np.quantile(x, [0.05, 0.5, 0.95])]
             rows.append([element_name(str(self.name), labels), *(f"{n:.4g}" for n in numbers)])
         size = self.sizes[drawn[-1]]
@@ -313,9 +320,9 @@ def covariate_values(
     *,
     has_runs: bool,
 ) -> dict[str, Any]:
-    """Return a number by covariate, or those of conditions that are stated, (N,).
+    """Return the value of each covariate: a number, or the values of a stated condition, (N,).
 
-    Numbers have to be near those of runs if there are any.
+    With ``has_runs`` numbers outside the range of the runs are refused.
     """
     names = [str(covariate.name) for covariate in inputs.covariates]
     by_name = {name: stated[name] for name in names if name in stated}
@@ -331,14 +338,23 @@ def covariate_values(
         name = str(covariate.name)
         if name in by_name:
             continue
-        low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
-        if has_runs and not low <= values[name] <= high:
-            raise ValueError(
-                f"{label}: at: {name}: got {values[name]}, expected a value between {low:.4g} and "
-                f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
-                "new specimens"
-            )
+        if has_runs:
+            ends = covariate.owner.op.dist_params(covariate.owner)
+            low, high = (float(end.eval()) for end in ends)
+            _refuse_outside(f"{label}: at", name, [values[name]], low, high)
     return values | by_name
+
+
+def _refuse_outside(
+    label: str, name: str, values: Sequence[float], low: float, high: float
+) -> None:
+    """Raise if a value is outside the range of the runs, beyond which nothing is known."""
+    outside = [value for value in values if not low <= value <= high]
+    if outside:
+        raise ValueError(
+            f"{label}: got {name} = {outside[0]:g}, expected values from {low:.4g} to {high:.4g}, "
+            "the range of the runs; pass stored=False, which computes the response of new specimens"
+        )
 
 
 def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
@@ -348,14 +364,14 @@ def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
 
 
 def call_settings(executor: Any, store: Any, version: Any) -> dict[str, Any]:
-    """Return where a response is computed and kept, as arguments of `Responses`; or raise."""
+    """Check where a response is computed and kept; return it as arguments of `Responses`."""
     check_call_settings(executor, store, version, Abort())
     return {"executor": executor, "store": store, "version": version}
 
 
 def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> str:
-    """Return the name of a response; raise if a store needs one, and it has none."""
-    inner = getattr(response, "function", response)  # of `scalar`
+    """Return the name of a response; raise if a store needs its name, and it has none."""
+    inner = getattr(response, "function", response)  # `scalar` wraps a function.
     name = str(getattr(inner, "__name__", type(inner).__name__))
     is_named = hasattr(inner, "__name__") and name != "<lambda>"
     if calling.get("store") is not None and not is_named:
@@ -393,10 +409,7 @@ def populations_of(
     if isinstance(result, Optimum):
         values = result.point
     elif not isinstance(result, xr.DataTree) or "posterior" not in result:
-        raise TypeError(
-            f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a "
-            "DataTree with a posterior group, such as prb.sample_smc returns"
-        )
+        raise wrong_type(result, caller, RESULT)
     else:
         posterior = result["posterior"].to_dataset()
         size = posterior.sizes["draw"]
@@ -420,15 +433,22 @@ def populations_of(
     return points, coords
 
 
-def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:
-    """Report draws that are as wide as epsilon makes them, by whatever sampler.
+def thetas_of(result: Any, evaluator: Evaluator, draws: int, caller: str) -> Floats:
+    """Return the thetas of an optimum, or of evenly thinned draws, (k, d)."""
+    points, _ = populations_of(result, evaluator.model, draws, caller)
+    values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
+    return evaluator.hyperparameters.thetas_of(values)
 
-    Not those of a bootstrap, nor of log-likelihoods with their default epsilon.
+
+def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:
+    """Report draws whose width is that of epsilon, from any sampler.
+
+    Draws of a bootstrap, and of log-likelihoods with their default epsilon, are not reported.
     """
     groups = result.children if isinstance(result, xr.DataTree) else {}
     attrs = result["posterior"].attrs if "posterior" in groups else {}
     is_adjusted = attrs.get("adjustment", "none") != "none"
-    is_bootstrap = "converged" in attrs  # without an epsilon
+    is_bootstrap = "converged" in attrs  # A bootstrap has no epsilon.
     if "posterior" not in groups or is_adjusted or is_bootstrap:
         return ()
     has_epsilon = False
@@ -455,11 +475,12 @@ def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]
 class _Predicted:
     """Responses of specimens."""
 
-    # (k, n), or (k, n, m) of several outputs: by population; of groups (k, groups, n) and so on.
+    # responses of n specimens of k populations, (k, n), or (k, n, m) of several outputs; groups are
+    # an axis after the populations
     values: Floats
-    specimens: list[Floats]  # (k, n, *event): aleatory inputs
+    specimens: list[Floats]  # aleatory inputs, (k, n, *event) each
     source: str  # how specimens were made
-    error: Floats | None = None  # of an emulator, by output, (m,)
+    error: Floats | None = None  # error of the emulator by output, (m,)
 
 
 def _predicted(
@@ -470,9 +491,9 @@ def _predicted(
     rng: np.random.Generator,
     conditions: Floats | None,
 ) -> _Predicted:
-    """Return responses of n specimens from each population, of one group after the other.
+    """Return responses of n specimens from each population, group by group.
 
-    The specimens have the conditions, (n, C).
+    Specimens of a data set have known conditions, (n, C).
     """
     inputs = responses.inputs
     by_group = [points]
@@ -490,7 +511,7 @@ def _predicted(
         parents = [group_points[str(rv.name)] for rv in inputs.parents]
         if conditions is None:
             specimens, epistemic = new_specimens(responses.name, inputs, parents, n, rng)
-        else:  # independent ones: those of a population are a data set
+        else:  # The specimens of a population are a data set: they are independent.
             specimens, epistemic = PopulationSampler(inputs)(parents, n, rng)
             specimens = at_conditions(inputs, specimens, conditions)
         if simulator is None:
@@ -519,7 +540,10 @@ def with_known_conditions(
     *,
     stored: bool,
 ) -> tuple[list[Any], Floats | None]:
-    """Return inputs with the model's own conditions, and the values of those given, (N, C)."""
+    """Return inputs with the model's conditions in place of conditions of the same name.
+
+    The values of the latter, (N, C), are returned as well.
+    """
     of_model = {
         str(s.inputs.aleatory[place].name): s.inputs.aleatory[place]
         for s in simulators
@@ -541,14 +565,8 @@ def with_known_conditions(
     ]
     if stored:
         for name, x in conditions.items():
-            low, high = of_model[name].owner.op.range if name in of_model else (-np.inf, np.inf)
-            outside = [v for v in x.owner.op.values if not low <= v <= high]
-            if outside:
-                raise ValueError(
-                    f"{label}: got {name} = {outside[0]:g}, expected values from {low:.4g} to "
-                    f"{high:.4g}, the range of the runs; pass stored=False, which computes the "
-                    "response of new specimens"
-                )
+            if name in of_model:
+                _refuse_outside(label, name, x.owner.op.values, *of_model[name].owner.op.range)
     values = known_covariates(label, list(conditions.values()), size, None)
     return changed, stacked_values(values)
 
@@ -557,7 +575,7 @@ def _remedy(response: Any, responses: Responses) -> str:
     """Return what to do where a predicted response is NaN."""
     if not isinstance(response, Runs):
         return responses.remedy
-    # propose_runs(model) returns runs near the data, and not under another condition.
+    # The remedy is not `propose_runs`, which returns runs near the data, and none elsewhere.
     parts = [
         f"{name} from {np.min(low):.4g} to {np.max(high):.4g}"
         for name, (low, high) in response.ranges.items()
@@ -607,7 +625,7 @@ def known_outputs(
     response: Callable[..., Any],
     inputs: Inputs | None = None,
 ) -> Outputs | None:
-    """Return the outputs of a response that is a simulator's; None if only a run shows them.
+    """Return the outputs of a simulator's response, or None if only a run can show them.
 
     With another vector of constants, such as times, a response may have other outputs.
     """
@@ -626,7 +644,7 @@ def _vectors(inputs: Inputs) -> list[list[float]]:
 def known_scatter(
     simulators: Sequence[PopulationSimulator], response: Callable[..., Any]
 ) -> float | None:
-    """Return the scatter that a response may have: None, if it is random in a simulator."""
+    """Return the scatter that a response may have; None if it is random in a simulator."""
     nodes = (node for node in simulators if node.responses.function is response)
     return None if any(node.responses.scatter is None for node in nodes) else 0.01
 
@@ -634,7 +652,7 @@ def known_scatter(
 def serving(
     simulators: Sequence[PopulationSimulator], responses: Responses
 ) -> PopulationSimulator | None:
-    """Return the simulator with specimens of all these inputs, if any, best with this response."""
+    """Return a simulator that has specimens of all inputs, if any; one with this response first."""
     inputs = responses.inputs
     if inputs.epistemic:
         return None
@@ -677,7 +695,7 @@ def _resampled_responses(
 def refuse_unsupported(name: str, design: ReweightedBound, parents: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
     support = design.support(parents)
-    # Points without response become NaN, which are counted and reported separately.
+    # The lost mass is not checked here, because `_check_responses` reports the share of NaN.
     if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         return
     ess = np.median(support["weight_ess"])
@@ -694,7 +712,7 @@ def refuse_unsupported(name: str, design: ReweightedBound, parents: list[Floats]
 
 
 def specimen_names(labels: ArrayLike) -> list[str]:
-    """Return labels as text, the same for 3 and 3.0."""
+    """Return labels as texts; 3 and 3.0 have the same text."""
     return [
         str(int(label) if isinstance(label, float) and label.is_integer() else label)
         for label in np.asarray(labels).tolist()
@@ -702,12 +720,12 @@ def specimen_names(labels: ArrayLike) -> list[str]:
 
 
 def data_digest(observed: Floats) -> str:
-    """Return a digest of measured values, (n,) or (n, m), in any order."""
+    """Return a digest of measured values, (n,) or (n, m), that does not depend on their order."""
     return _array_digest(observed[in_order(observed)])
 
 
 def in_order(observed: Floats) -> NDArray[np.intp]:
-    """Return the order of measured values, of several outputs lexicographic."""
+    """Return the order of measured values, which is lexicographic for several outputs."""
     if observed.ndim == 1:
         return np.argsort(observed, kind="stable")
     return np.lexsort(observed.T[::-1])
@@ -722,13 +740,16 @@ def _array_digest(*arrays: Floats) -> str:
 
 
 def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
-    """Return digests and labels of the data of the calibration: the result's own if it has them."""
+    """Return digests and specimen labels of the data of the calibration.
+
+    The data are those of the result if it has them, and else those of the model.
+    """
     stored: Any = {}
     if isinstance(result, xr.DataTree) and "observed_data" in result:
         stored = result["observed_data"]
     is_optimum = isinstance(result, Optimum)
     simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
-    labels: dict[str, None] = {}  # in their order, without duplicates
+    labels: dict[str, None] = {}  # labels in their order, each once
     digests = []
     for node in simulators:
         observed = stored.get(node.name, node.observed)

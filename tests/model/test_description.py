@@ -61,16 +61,22 @@ def test_variables_and_simulators_are_described(model: pm.Model) -> None:
     (simulator,) = found["simulators"]
     assert simulator["name"] == "y"
     assert simulator["response"] == "stiffness"
-    assert simulator["inputs"] == ("x ~ Normal(mu, sigma), a = 2.5, b = an array of shape (3,)")
+    assert simulator["inputs"] == [
+        ["x", "", "~ Normal(mu, sigma)"],
+        ["a", "", "= 2.5"],
+        ["b", "", "= an array of shape (3,)"],
+    ]
     assert simulator["metric"].startswith("AreaMetric(")
     assert simulator["propagation"].startswith("Resimulated(")
     assert simulator["n_points"] == "32"
+    assert simulator["runs"] == "32 runs for each population"
+    assert simulator["n_specimens"] == "50 specimens"
     assert simulator["specimens"].startswith("50 specimens: 100, 101, ")
     assert simulator["specimens"].endswith("138, 139, and 10 more")
     (few,) = describe(simulated(np.repeat(["a", "b"], 25)))["simulators"]
     assert few["specimens"] == "2 specimens: a, b"
     (without,) = describe(simulated())["simulators"]
-    assert without["specimens"] == ""
+    assert without["specimens"] == without["n_specimens"] == ""
 
 
 def test_arrays_of_constants_are_shown() -> None:
@@ -90,7 +96,7 @@ def test_arrays_of_constants_are_shown() -> None:
     assert texts["other"] == "LKJCholeskyCov(2, 2, HalfNormal(0, [0.4, 2]))"
     (simulator,) = describe(model)["simulators"]
     assert simulator["response"] == "lambda(x)"
-    assert simulator["inputs"] == "x ~ MultivariateNormal(f(location), [1, 0, 0, 2])"
+    assert simulator["inputs"] == [["x", "", "~ MultivariateNormal(f(location), [1, 0, 0, 2])"]]
 
 
 def test_a_description_comes_back_from_a_file(model: pm.Model) -> None:
@@ -99,6 +105,12 @@ def test_a_description_comes_back_from_a_file(model: pm.Model) -> None:
     text["variables"][0]["code"] = "x"
     text["more"] = "x"
     assert from_attributes({"model": json.dumps(text)}) == describe(model)
+    (simulator,) = text["simulators"]
+    del simulator["runs"], simulator["n_specimens"]
+    simulator["inputs"] = "x ~ Normal(mu, sigma)"  # as 1.0.0rc1 stored them
+    (old,) = (from_attributes({"model": json.dumps(text)}) or {})["simulators"]
+    assert old["inputs"] == [["", "", "x ~ Normal(mu, sigma)"]]
+    assert old["runs"] == simulator["propagation"]
     assert json_attribute("text", {"x": "x" * 60_000}) == {}
 
 

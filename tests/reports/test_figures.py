@@ -77,14 +77,15 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
     # The others are for several outputs, a decision, and data of a test
     assert set(calls) == set(figures.ILLUSTRATIONS) - {"outputs", "sensitivity", "prediction"}
-    assert calls["population"] == ((posterior,), {"model": model})
-    assert calls["responses"] == ((posterior,), {"model": model, "ecdf": True, "before": False})
-    assert calls["posterior"] == (
-        (posterior,),
-        {"optimum": optimum, "model": model, "backend": "matplotlib"},
-    )
-    assert calls["optimizer"] == ((optimum,), {"col_wrap": 2})
-    assert calls["landscape"] == ((optimum,), {"model": model})
+    common = {"model": model, "labels": {}}
+    prob = {"prob": 0.89}
+    ecdf = {"ecdf": True, "before": False}
+    assert calls["population"] == ((posterior,), common | prob)
+    assert calls["responses"] == ((posterior,), common | prob | ecdf)
+    by_matplotlib = {"optimum": optimum, "backend": "matplotlib"}
+    assert calls["posterior"] == ((posterior,), common | prob | by_matplotlib)
+    assert calls["optimizer"] == ((optimum,), {"col_wrap": 2, "labels": {}})
+    assert calls["landscape"] == ((optimum,), common)
     assert calls["validity"] == ((test,), {})
     titles = [s.title for s in full.sections]
     for name in calls:
@@ -121,7 +122,7 @@ def test_a_report_computes_responses_only_if_they_are_cheap(
     optimum = prb.minimize(model)
     optimum = replace(optimum, search=replace(optimum.search, seconds=seconds))
     before = count, optimum.evaluator.n_responses
-    monkeypatch.setattr("prbayes.results.diagnose._seconds_of_test", lambda _: 31.0)
+    monkeypatch.setattr("prbayes.results.diagnose.seconds_of", lambda *_: 31.0)
     made = prb.Report("x", model=model, optimum=optimum)
     assert (count, optimum.evaluator.n_responses) == before
     assert ("responses" in calls) == (seconds < 1)
@@ -248,7 +249,7 @@ def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: An
     evidence = titles[titles.index("Evidence") :]
     assert evidence[1] == "Measured and calibrated responses"
     given = {name: keywords.get("labels") for name, (_, keywords) in calls.items()}
-    assert not {keywords.get("prob") for _, keywords in calls.values()} - {None}
+    assert {keywords.get("prob") for _, keywords in calls.values()} == {0.89, None}
     assert given["responses"] == given["landscape"] == {"mu": "mean", "y": "stiffness (N/mm)"}
     assert given["comparison"] == {"mu": "mean"}
     assert given["prediction"] == {"hot": "at 200 °C"}

@@ -30,7 +30,9 @@ def test_files_alone_tell_the_same(tmp_path: Path, calibrated: Any, section: Any
     titles = ["Not tested", "Answer", "Evidence", "Method", "Simulators", "Optimum", "Posterior"]
     for title in [*titles, "Comparison of results", "Cost and origin"]:
         a, b = section(alone, title), section(full, title)
-        assert a.text == b.text, title
+        # Scores need the model.
+        texts = [x for x in b.text if not x.startswith("Discrepancy by ")]
+        assert list(a.text) == texts, title
         if a.table is not None:
             assert cells(a.table) == cells(b.table), title
     del trees[0]["posterior"].attrs["model"]

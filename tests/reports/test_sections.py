@@ -17,14 +17,13 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.optimize.convergence import Result
 from prbayes.reports.assessment import data, population_in_units
-from prbayes.reports.material import gather, metrics_of
+from prbayes.reports.material import Observed, gather, metrics_of
 from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import (
-    _labelled_inputs,
     _other_optimum,
-    _runs,
     measured_values,
     metric,
+    model,
     optima,
     posteriors,
 )
@@ -101,12 +100,12 @@ def test_results_under_different_metrics(calibrated: Any) -> None:
 
 
 def test_few_values_and_many_outputs() -> None:
-    m = dataclasses.replace(gather(), observed={"y": np.array([2.5])})
+    m = dataclasses.replace(gather(), observed={"y": Observed(np.array([2.5]))})
     (row,) = cells(data(m)[0].table).rows
     assert row == ("y", "1", "2.500", "2.500", "2.500", "\u2013")
     curve = np.random.default_rng(1).normal(size=(5, 40))
-    outputs = {"y": Outputs(tuple(np.arange(40) / 2), "hour")}
-    m = dataclasses.replace(m, observed={"y": curve}, outputs=outputs)
+    outputs = Outputs(tuple(np.arange(40) / 2), "hour")
+    m = dataclasses.replace(m, observed={"y": Observed(curve, outputs)})
     (about,) = data(m)
     correlations, values = measured_values(m)
     rows = cells(about.table).rows
@@ -311,16 +310,17 @@ def test_sections_depend_on_the_results_and_come_in_order(
     assert {"Posterior", "Comparison of results", "Test of the model"}.isdisjoint(titles)
 
 
-def test_inputs_and_runs_are_in_words() -> None:
+def test_inputs_have_labels_in_place_of_name_and_unit() -> None:
+    texts = dict.fromkeys(("name", "role", "distribution", "response", "metric", "propagation"), "")
+    inputs = [["k", " (N/(m s^(1/3)))", "~ Normal(mean, sd)"], ["load", "", "= 10"], ["", "", "mu"]]
+    simulator = texts | {"inputs": inputs, "specimens": "", "n_specimens": "", "runs": "Own"}
+    description = {"variables": [texts], "simulators": [simulator]}
+    m = dataclasses.replace(gather(), description=description)
+    (plain,) = model(m)[1].table["inputs"]
+    assert plain == "k (N/(m s^(1/3))) ~ Normal(mean, sd), load = 10, mu"
     labels = {"k": "stiffness (kN/mm)", "load": "load (kN)", "mean": "never"}
-    text = "k (N/(m s^(1/3))) ~ Normal(mean, sd), load = 10"
-    assert _labelled_inputs(text, labels) == (
-        "stiffness (kN/mm) ~ Normal(mean, sd), load (kN) = 10"
-    )
-    assert _labelled_inputs(text, {}) == text
-    assert _runs("Resimulated(n=512, random_seed=0)") == "512 runs for each population"
-    assert _runs("Own(a=3)") == "Own"
-    assert _runs("emulator of 64 runs") == "emulator of 64 runs"
+    (labelled,) = model(dataclasses.replace(m, labels=labels))[1].table["inputs"]
+    assert labelled == "stiffness (kN/mm) ~ Normal(mean, sd), load (kN) = 10, mu"
 
 
 def test_labels_of_numbers_among_the_inputs_are_taken(section: Any) -> None:
@@ -549,10 +549,7 @@ def test_the_population_is_in_units_near_the_answer(calibrated: Any) -> None:
     assert part.level == 3
     table = prb.population(posterior, model=model)
     cells = dict(zip(part.table[""], part.table["stiffness (kN/mm)"], strict=True))
-    assert list(cells)[:5] == [
-        *("mean", "standard deviation", "coefficient of variation", "5% quantile", "median")
-    ]
-    assert cells["coefficient of variation"].split(" (")[0].endswith("%")
+    assert list(cells)[:5] == ["mean", "sd", "cv (%)", "5% quantile", "50% quantile"]
     lower = float(table.lower.sel(quantity="mean")[0])
     assert cells["mean"].split("(")[1].startswith(f"{lower:.2f}")
     assert cells["A-basis"] == f"{float(table.estimate.sel(quantity='A-basis')[0]):.4g}"
