@@ -19,6 +19,9 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+Shape = tuple[int, ...]
 
 # Numbers in memory at a time where work is done in blocks: 32 MiB. Where the blocks leave a trace
 # in an answer, that place says so.
@@ -167,9 +170,7 @@ def refuse_huge(array: Floats, name: str) -> None:
         )
 
 
-def simulated_sample(
-    values: ArrayLike, name: str = "simulated", *, event: tuple[int, ...] = ()
-) -> Floats:
+def simulated_sample(values: ArrayLike, name: str = "simulated", *, event: Shape = ()) -> Floats:
     """Return simulated responses, (..., n, *event), or raise if NaN or -inf; +inf has failed."""
     array = real_array(values, name)
     batch = array.shape[: max(0, array.ndim - len(event))]

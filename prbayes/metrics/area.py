@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Ints, Shape
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -157,7 +157,7 @@ class RankedBasis(Basis):
     projections is no larger than that of one.
     """
 
-    specimens: tuple[int, ...]  # N of each projection's correction, or zero
+    specimens: Shape  # N of each projection's correction, or zero
 
     def features(self, weights: Any, xp: Any = np) -> Features:
         """Return the areas, (..., K)."""
@@ -202,8 +202,8 @@ class _Integral:
     Between two simulated values F is constant, and S_N rises through it once.
     """
 
-    order: NDArray[np.intp]  # (n,): of the simulated values
-    edges: NDArray[np.intp]  # (n + 2,): first knots of the intervals in which F is constant
+    order: Ints  # (n,): of the simulated values
+    edges: Ints  # (n + 2,): first knots of the intervals in which F is constant
     observed: Floats  # (m,): S_N at the knots
     positions: Floats  # (m + 1,): of the knots, from the first one
     integral: Floats  # (m + 1,): of S_N up to each knot
@@ -211,8 +211,8 @@ class _Integral:
     @classmethod
     def of(
         cls,
-        order: NDArray[np.intp],
-        below: NDArray[np.intp],
+        order: Ints,
+        below: Ints,
         observed: Floats,
         lengths: Floats,
     ) -> _Integral:
@@ -333,9 +333,7 @@ def _rows_summed_below(ordered: Any, below: Any, xp: Any) -> Any:
 
 
 @compiled
-def sum_below(
-    weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp], out: Floats
-) -> None:
+def sum_below(weights: Floats, order: Ints, below: Ints, out: Floats) -> None:
     """Put the sums of the first ``below`` weights in an order, shape (rows, m), into ``out``.
 
     The weights have shape (rows, n), the order (n,), ``below`` (m,).

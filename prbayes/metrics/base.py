@@ -18,11 +18,13 @@ from enum import Enum
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from prbayes._validate import (
     AT_ONCE,
     Floats,
+    Ints,
+    Shape,
     observed_outputs,
     observed_sample,
     sample_weights,
@@ -35,7 +37,7 @@ from prbayes.metrics.grid import product
 class Projection:
     """A linear combination of some of the outputs less a center."""
 
-    outputs: NDArray[np.intp]  # (p,): indices
+    outputs: Ints  # (p,): indices
     caps: Floats  # (p,): the value of a specimen that failed
     center: Floats  # (p,); projections with the same array have the same outputs and caps
     direction: Floats  # (p,): coefficients of the combination
@@ -49,7 +51,7 @@ class Projection:
         """Return the combination, (..., n, m) -> (..., n)."""
         return self.centered(simulated, xp) @ self.direction
 
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Ints]:
         """Return the projection of observed values, and the rows that have all its outputs."""
         index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
         return self.of(values[index]), index
@@ -91,7 +93,7 @@ class Part:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
         return simulated if self.projection is None else self.projection.of(simulated, xp)
 
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Ints]:
         """Return the projection of observed values, (n, m) -> (n',), and the rows that have it."""
         if self.projection is None:
             return values, np.arange(len(values))
@@ -177,7 +179,7 @@ class Discrepancy(ABC):
         return replace(self, **{name: getattr(self, name)[index] for name in self._by_data_set})
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """The shape of one specimen's response: () for one output, (m,) for several."""
         return self.observed.shape[1:]
 

@@ -14,9 +14,8 @@ from functools import update_wrapper
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Ints
 
 # The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
 # of 1, t, t^2, t^3.
@@ -29,7 +28,7 @@ def product(weights: Floats, matrix: Floats) -> Floats:
     NumPy multiplies a batch of vectors one after another, many times slower.
     """
     *batch, n = weights.shape
-    rows = weights.reshape(int(np.prod(batch, dtype=int)), n)
+    rows = weights.reshape(math.prod(batch), n)
     return (rows @ matrix).reshape(*batch, matrix.shape[-1])
 
 
@@ -87,7 +86,7 @@ class KernelCells(Cells):
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by a cluster's width."""
         *batch, n = sample.shape
-        rows = int(np.prod(batch, dtype=int))
+        rows = math.prod(batch)
         nodes = self.centers.size
         # Bin the sample on the grid.
         values = np.ascontiguousarray(sample.reshape(rows, n), dtype=np.float64)
@@ -143,7 +142,7 @@ class KernelCells(Cells):
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
         """Return the smoothed cotangent at the sample, or its derivative there."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        rows = int(np.prod(batch, dtype=int))
+        rows = math.prod(batch)
         n = sample.shape[-1]
         inner = self.centers.size
         nodes = inner + 2 * self.margin
@@ -178,7 +177,7 @@ class BinCells(Cells):
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return the normalised frequency per unit length of each bin, then of the outer two."""
         *batch, n = sample.shape
-        rows = int(np.prod(batch, dtype=int))
+        rows = math.prod(batch)
         # The cells of all rows are counted at once: the bins, below, above, and NaN.
         cells = self.centers.size + 3
         first = cells * np.arange(rows)
@@ -192,7 +191,7 @@ class BinCells(Cells):
         """Return the weight of the points in each bin."""
         return self.density(np.broadcast_to(points, weights.shape), weights) * self.widths
 
-    def _cell(self, sample: Floats) -> NDArray[np.intp]:
+    def _cell(self, sample: Floats) -> Ints:
         """Return cell numbers: bins, then below, above, and NaN."""
         bins = self.centers.size
         # Positions in widths from the lower edge.

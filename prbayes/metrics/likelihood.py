@@ -6,9 +6,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, flag, real_array
+from prbayes._validate import Floats, Ints, Shape, flag, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import (
     CellwiseDiscrepancy,
@@ -148,7 +147,7 @@ class LogLikelihood(Metric):
         """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
 
-    def of_frequencies(self, rows: NDArray[np.intp], n: int) -> LogLikelihood:
+    def of_frequencies(self, rows: Ints, n: int) -> LogLikelihood:
         """Return the likelihood of specimens that are rows of n readings, by their frequencies.
 
         Arrays by reading become those of the specimens.
@@ -162,7 +161,7 @@ class LogLikelihood(Metric):
         censored = self.censored and tuple(map(of_specimens, self.censored))
         return replace(self, error=error, rounded=of_specimens(self.rounded), censored=censored)
 
-    def readings(self, values: Floats, error: Any = None, event: tuple[int, ...] = ()) -> Readings:
+    def readings(self, values: Floats, error: Any = None, event: Shape = ()) -> Readings:
         """Return measured outputs, (N, m), with their errors, limits and rounding.
 
         ``error`` replaces an error that is a model variable; ``event`` is () for one output without

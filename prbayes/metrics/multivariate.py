@@ -7,9 +7,18 @@ from functools import cache, cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from prbayes._validate import AT_ONCE, Floats, called, positive_integer, real_array, sample_weights
+from prbayes._validate import (
+    AT_ONCE,
+    Bools,
+    Floats,
+    Ints,
+    called,
+    positive_integer,
+    real_array,
+    sample_weights,
+)
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -349,7 +358,7 @@ class Joint(Metric):
         self,
         sample: Floats,
         weights: Floats,
-        outputs: NDArray[np.intp],
+        outputs: Ints,
         caps: Floats,
         n_inputs: int | None,
     ) -> tuple[_Coordinates, list[Components]]:
@@ -376,9 +385,7 @@ def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> 
     return principal.center + principal.axes @ center, principal.axes @ axes
 
 
-def _flat(
-    sample: Floats, weights: Floats, outputs: NDArray[np.intp], n_inputs: int
-) -> _Coordinates | None:
+def _flat(sample: Floats, weights: Floats, outputs: Ints, n_inputs: int) -> _Coordinates | None:
     """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
 
     Whitening weights the bend of a surface as much as the places of specimens on it, which say more
@@ -395,7 +402,7 @@ def _flat(
     return None
 
 
-def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], float]]:
+def patterns(observed: Floats, weights: Floats) -> list[tuple[Ints, float]]:
     """Return the sets of outputs that are compared, and the share of each, (N, m), (N,).
 
     They are those of the specimens, or their intersections where there are too many sets, or too
@@ -421,7 +428,7 @@ def _order(key: frozenset[int]) -> tuple[int, list[int]]:
     return -len(key), sorted(key)
 
 
-def _is_rare(key: frozenset[int], has: NDArray[np.bool_], fewest: int = 10) -> bool:
+def _is_rare(key: frozenset[int], has: Bools, fewest: int = 10) -> bool:
     """Return whether too few specimens have these outputs to whiten them, or their components.
 
     The fewest for two components are five each: scatters of fewer are uncertain.

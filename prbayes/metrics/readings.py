@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +21,7 @@ class Readings:
     step: Floats  # width to which the reading was rounded; zero if it was not
     lower: Floats  # bound of a censored reading, perhaps infinite; NaN if not censored
     upper: Floats
-    is_relative: NDArray[np.bool_]  # whether the error is a share of the output
+    is_relative: Bools  # whether the error is a share of the output
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
@@ -33,11 +32,11 @@ class Readings:
     def __len__(self) -> int:
         return len(self.values)
 
-    def rows(self, index: NDArray[np.intp]) -> Readings:
+    def rows(self, index: Ints) -> Readings:
         """Return the readings of selected specimens."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
-    def at_columns(self, columns: NDArray[np.intp]) -> Readings:
+    def at_columns(self, columns: Ints) -> Readings:
         """Return the readings of selected outputs of each specimen, (N, k)."""
         selected = {
             f.name: np.take_along_axis(getattr(self, f.name), columns, axis=1) for f in fields(self)
@@ -45,12 +44,12 @@ class Readings:
         return replace(self, **selected)
 
     @property
-    def is_measured(self) -> NDArray[np.bool_]:
+    def is_measured(self) -> Bools:
         """Which readings are numbers, (N, m)."""
         return np.isfinite(self.values)
 
     @property
-    def is_censored(self) -> NDArray[np.bool_]:
+    def is_censored(self) -> Bools:
         """Which readings are intervals, (N, m)."""
         return ~np.isnan(self.lower)
 
@@ -184,7 +183,7 @@ def side_by_side(records: Sequence[Any]) -> Any:
 
 
 def averaged(
-    readings: Readings, scale: Floats, numbers: NDArray[np.intp], count: NDArray[np.intp]
+    readings: Readings, scale: Floats, numbers: Ints, count: Ints
 ) -> tuple[Readings, Floats, Repeats]:
     """Return the readings of S specimens with their scale, (S, m); the mean of repeated readings.
 

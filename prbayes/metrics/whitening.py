@@ -8,12 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from prbayes._finding import counted
 from prbayes._stats import quantile
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Ints
 from prbayes.metrics.density import spread
 
 # More outputs than this are compared by their principal components: eight need seventy directions.
@@ -30,7 +29,7 @@ class Components:
     axes: Floats  # (m, r): orthonormal
     left_out: float  # share of the observed variance
     rest_correlation: float  # of neighbours in the remainder of the data: near zero for noise
-    outputs: NDArray[np.intp]  # (m,): which of the outputs of a specimen
+    outputs: Ints  # (m,): which of the outputs of a specimen
 
     @property
     def number(self) -> int:
@@ -82,7 +81,7 @@ class Components:
 
 
 def principal_components(
-    sample: Floats, weights: Floats, outputs: NDArray[np.intp], number: int | None = None
+    sample: Floats, weights: Floats, outputs: Ints, number: int | None = None
 ) -> Components:
     """Return principal components of observed outputs, (n, m).
 
@@ -142,7 +141,7 @@ def principal_components(
 _DEGREES = (1.0, 3.0, np.inf)
 
 
-def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def whitening(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Floats]:
     """Return center and axes of invariant coordinates ``(y - center) @ axes`` of a sample, (n, m).
 
     They are the same, to rounding, after any invertible affine map of the outputs: location and
@@ -227,7 +226,7 @@ def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     return np.asarray(axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean()))
 
 
-def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def units(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Floats]:
     """Return a median and a robust spread of each output, or raise for one without spread.
 
     Arguments are those of `whitening`.
@@ -285,6 +284,6 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return size, axes
 
 
-def _listed(outputs: NDArray[np.intp]) -> str:
+def _listed(outputs: Ints) -> str:
     """Return the numbers of outputs for a message."""
     return ", ".join(map(str, outputs.tolist()))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import NO_POPULATION, Floats, unmasked
+from prbayes._validate import NO_POPULATION, Bools, Floats, Ints, Shape, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -34,8 +34,6 @@ from prbayes.response.executors import (
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError
-
-Rows = NDArray[np.intp]
 
 
 class scalar:  # noqa: N801 (reads as a function in a model)
@@ -107,7 +105,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.arguments[list(self.varying).index(True)])
 
-    def at(self, rows: Rows | int) -> Points:
+    def at(self, rows: Ints | int) -> Points:
         """Return the points at some rows; a number selects one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
@@ -118,17 +116,17 @@ class Points:
         columns = []
         for a, varies in zip(self.arguments, self.varying, strict=True):
             values = a if varies else np.broadcast_to(a, (n, *np.shape(a)))
-            columns.append(values.reshape(n, int(np.prod(values.shape[1:], dtype=int))))
+            columns.append(values.reshape(n, math.prod(values.shape[1:])))
         return np.concatenate(columns, axis=1).astype(np.float64)
 
-    def read_keys(self, keys: Floats) -> tuple[Points, NDArray[np.bool_]]:
+    def read_keys(self, keys: Floats) -> tuple[Points, Bools]:
         """Return the points of keys (n, columns), and which have the constants of these, (n,)."""
         have_same_constants = np.ones(len(keys), dtype=bool)
         arguments = []
         stop = 0
         for a, varies in zip(self.arguments, self.varying, strict=True):
             event = np.shape(a)[1:] if varies else np.shape(a)
-            start, stop = stop, stop + int(np.prod(event, dtype=int))
+            start, stop = stop, stop + math.prod(event)
             values = keys[:, start:stop]
             if not varies:
                 have_same_constants &= (values == np.ravel(a)).all(axis=1)
@@ -194,7 +192,7 @@ def compute(
     return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
-def assign_rows(values: Floats, rows: Rows, responses: Floats) -> Floats:
+def assign_rows(values: Floats, rows: Ints, responses: Floats) -> Floats:
     """Return values with the responses at some rows, with an axis of outputs if these have one."""
     if values.ndim == 1 and responses.ndim > 1:
         values = np.repeat(values[:, None], responses.shape[1], axis=1)
@@ -242,7 +240,7 @@ def _specimen_response(result: Any, outputs: Outputs | None) -> tuple[Floats, Ou
 
 def checked(
     result: Any,
-    batch: tuple[int, ...],
+    batch: Shape,
     arguments: Sequence[Any],
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> tuple[Floats, Outputs | None]:
@@ -273,7 +271,7 @@ def checked(
     expected = event[:1] if outputs is None else outputs.event
     if array.shape != batch + expected:
         remedy = "return as many numbers as were observed of a specimen"
-        if np.prod(batch, dtype=int) == 1 and not expected:  # a specimen by itself
+        if math.prod(batch) == 1 and not expected:  # a specimen by itself
             remedy = f"return one number; {PER_SPECIMEN}"
         elif batch:
             remedy = (
@@ -381,7 +379,7 @@ def unpacked(payload: bytes) -> Callable[..., Any]:
 
 
 # A finished chunk, with the rows of its points.
-type Finished = tuple[Rows, Chunk]
+type Finished = tuple[Ints, Chunk]
 
 
 @dataclass(frozen=True)
@@ -557,7 +555,7 @@ def by_output(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def revealing_rows(values: Floats) -> Rows:
+def revealing_rows(values: Floats) -> Ints:
     """Return rows of responses, (n,) or (n, m), at which a change of the function can show.
 
     The largest, the middle and the smallest response, one that is NaN and one that is infinite.
@@ -703,7 +701,7 @@ def chunk_size(settings: CallSettings, tally: Tally, n_left: int, workers: int) 
 
 
 def chunks(
-    settings: CallSettings, points: Points, rows: Rows, tolerant: bool, tally: Tally
+    settings: CallSettings, points: Points, rows: Ints, tolerant: bool, tally: Tally
 ) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
@@ -718,10 +716,10 @@ def chunks(
     work = partial(compute, function, **options)
     workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
-    suspects: list[Rows] = []  # chunks at work when a worker was lost, computed one at a time
-    suspect: Rows | None = None  # at work
+    suspects: list[Ints] = []  # chunks at work when a worker was lost, computed one at a time
+    suspect: Ints | None = None  # at work
     loss: BaseException | None = None
-    begun: dict[Future[Chunk], Rows] = {}
+    begun: dict[Future[Chunk], Ints] = {}
     waiting = rows
     error: BaseException | None = None
     with progress(f"responses of {settings.name}", rows.size) as report:

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
-from prbayes._validate import Floats, plain_text, real_array
+from prbayes._validate import Floats, Ints, plain_text, real_array
 from prbayes.response.outputs import specimen_index
 
 
@@ -62,7 +62,7 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
 class ReadingsCondition(TensorConstant):  # type: ignore[misc]
     """The sorted values of a vector condition, (G,), and where the readings of specimens are."""
 
-    columns: NDArray[np.intp]  # (N, T): index of the value of each reading, -1 where there is none
+    columns: Ints  # (N, T): index of the value of each reading, -1 where there is none
 
 
 def condition(name: str, values: ArrayLike) -> TensorVariable:
@@ -167,7 +167,7 @@ def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVar
 
 
 def known_covariates(
-    name: str, covariates: Sequence[Any], size: int, rows: NDArray[np.intp] | None
+    name: str, covariates: Sequence[Any], size: int, rows: Ints | None
 ) -> dict[str, Floats]:
     """Return the covariates of the specimens, (N,), by name, from those of the observed rows.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -276,7 +277,7 @@ class PriorPoints:
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         variables = without_dims(variables)
         self._shapes = [event_shape(v) for v in variables]
-        self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
+        self._sizes = [math.prod(s) for s in self._shapes]
         self.size = sum(self._sizes)
         symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
         values: dict[Variable, Variable] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -11,14 +12,13 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import NO_POPULATION, plain_text, real_array
+from prbayes._validate import NO_POPULATION, Ints, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
 from prbayes.response.dims import (
@@ -65,8 +65,8 @@ class Inputs:
                 shape = argument.type.shape if is_static else argument.shape.eval()
             else:
                 shape = np.shape(argument)
-            self.sizes.append(int(np.prod(shape, dtype=int)))
-        self.dimensions = sum(int(np.prod(shape)) for shape in self.event_shapes)
+            self.sizes.append(int(math.prod(shape)))
+        self.dimensions = sum(math.prod(shape) for shape in self.event_shapes)
         # Data that can be changed, as `pymc.Data`, by name.
         self.data: dict[str, Any] = {
             str(variable.name or f"shared variable {i}"): variable
@@ -296,7 +296,7 @@ def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
         return pm.logp(dist, x, warn_rvs=False)
 
 
-def event_shape(dist: TensorVariable) -> tuple[int, ...]:
+def event_shape(dist: TensorVariable) -> Shape:
     """Return the event shape of an aleatory input, evaluated."""
     if dist.type.ndim == 0:
         return ()
@@ -350,7 +350,7 @@ def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, 
     return [*names, *elements]
 
 
-def unit_of(x: Any, index: tuple[int, ...] = ()) -> str:
+def unit_of(x: Any, index: Shape = ()) -> str:
     """Return the unit of an aleatory input, or of an element of it; an empty text without one."""
     units = getattr(x.tag, "units", "")
     if not isinstance(units, dict):
@@ -374,9 +374,7 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
 # -- batches ---------------------------------------------------------------------------------------
 
 
-def broadcast_batch(
-    values: Sequence[Any], event_ndims: Sequence[int]
-) -> tuple[tuple[int, ...], list[Any]]:
+def broadcast_batch(values: Sequence[Any], event_ndims: Sequence[int]) -> tuple[Shape, list[Any]]:
     """Broadcast the leading axes of arrays (..., *event); return their shape, and the arrays."""
     pairs = list(zip(values, event_ndims, strict=True))
     batch = np.broadcast_shapes(*[v.shape[: v.ndim - k] for v, k in pairs])
@@ -535,7 +533,7 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
         )
 
 
-def group_indices(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
+def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Ints, Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups."""
     labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,7 +28,7 @@ class InputMoments:
         self.z = np.linspace(-8.0, 8.0, 97)
         self.n_drawn = 2000  # from a population without an inverse distribution function
         (self.shape,) = inputs.event_shapes
-        self.size = int(np.prod(self.shape, dtype=int))
+        self.size = math.prod(self.shape)
         op = inputs.aleatory[0].owner.op
         self.is_multivariate = len(self.shape) == 1 == getattr(op, "ndim_supp", 0)
         self._inverse: Any = None

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, first_text, real_array, unmasked
+from prbayes._validate import Bools, Floats, Ints, Shape, first_text, real_array, unmasked
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Outputs:
     units: tuple[str, ...] = ()  # of each output, or of one number; empty where unknown
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """The shape of one specimen's outputs: () or (m,)."""
         return (len(self.labels),) if self.labels else ()
 
@@ -118,9 +117,7 @@ def relabelled(values: Any, like: Any) -> Any:
     return type(like)(values, index=like.index, **columns)
 
 
-def output_order(
-    labels: Sequence[Any], expected: Sequence[Any], found: str
-) -> NDArray[np.intp] | None:
+def output_order(labels: Sequence[Any], expected: Sequence[Any], found: str) -> Ints | None:
     """Return the places of the expected labels; None if they are equal, or one side has none.
 
     Numbers are equal up to rounding. Other labels than the expected ones are a KeyError.
@@ -355,7 +352,7 @@ def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outp
     )
 
 
-def is_missing(values: Floats) -> NDArray[np.bool_]:
+def is_missing(values: Floats) -> Bools:
     """Return which points, (n,) or (n, m) -> (n,), have an output that is NaN: no response."""
     nan = np.isnan(values)
     return nan.any(axis=-1) if nan.ndim > 1 else nan

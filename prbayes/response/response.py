@@ -15,7 +15,7 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, called, executes, folder_path
+from prbayes._validate import Floats, Shape, called, executes, folder_path
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
@@ -252,7 +252,7 @@ class Responses:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         batch, full = broadcast_batch(values, self.inputs.event_ndims)
-        size = int(np.prod(batch, dtype=int))
+        size = math.prod(batch)
         runs = self.runs
         if runs.is_shared and runs.last is not None and _equal(runs.last[0], values):
             self.count_reused(size)
@@ -327,21 +327,19 @@ class Responses:
         self.count += size
         self._n_reused += size
 
-    def _points(self, full: Sequence[Floats], batch: tuple[int, ...]) -> Points:
+    def _points(self, full: Sequence[Floats], batch: Shape) -> Points:
         """Return the points of a batch, each a row, from values of all inputs."""
-        n = int(np.prod(batch, dtype=int))
+        n = math.prod(batch)
         k = len(self.inputs.aleatory)
         rows = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
         return Points(self.inputs.fill(rows[:k], rows[k:]), varying)
 
-    def _called(
-        self, values: Sequence[Floats], batch: tuple[int, ...], *, is_run: bool = True
-    ) -> Floats:
+    def _called(self, values: Sequence[Floats], batch: Shape, *, is_run: bool = True) -> Floats:
         """Call the function once for a batch of any shape."""
         k = len(self.inputs.aleatory)
         arguments = self.inputs.fill(values[:k], values[k:])
-        size = int(np.prod(batch, dtype=int)) if is_run else 0
+        size = math.prod(batch) if is_run else 0
         budget().grant(size, least=size)
         try:
             with np.errstate(all="ignore"):
@@ -382,7 +380,7 @@ class Responses:
 
     def _place(self, points: Sequence[Floats], row: int) -> str:
         """Return the aleatory inputs of a specimen as a text, with their names."""
-        sizes = [int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes]
+        sizes = [math.prod(shape) for shape in self.inputs.event_shapes]
         names = column_names(aleatory_names(self.inputs, self.function), sizes)
         return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
 
@@ -441,13 +439,13 @@ class Responses:
             )
 
     def _refuse_one_size(
-        self, values: Sequence[Floats], batch: tuple[int, ...], error: ResponseError
+        self, values: Sequence[Floats], batch: Shape, error: ResponseError
     ) -> None:
         """Raise if the response takes no other number of specimens than that of its batch.
 
         An array of as many values inside it would be paired with points of the population.
         """
-        size = int(np.prod(batch, dtype=int))
+        size = math.prod(batch)
         few = (*[1] * (len(batch) - 1), 3 if size == 2 else 2)
         rows = np.arange(few[-1]) % size
         specimens = [v.reshape(size, *v.shape[len(batch) :])[rows] for v in values]

@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import Bools, Floats, Shape, plain_text, positive_integer, stated_path
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -39,7 +38,7 @@ class _Session:
     """A connection of one thread of one process, and the runs that it has read."""
 
     connection: sqlite3.Connection
-    opened: tuple[int, ...]  # process, device and number of the file
+    opened: Shape  # process, device and number of the file
     response: int  # number of the store's response in the file
     columns: int  # numbers that make the inputs of one run
     values: dict[bytes, bytes] = field(default_factory=dict)  # of all outputs by inputs
@@ -144,7 +143,7 @@ class Store:
     def __len__(self) -> int:
         return len(self._read().values)
 
-    def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def find(self, inputs: Floats) -> tuple[Floats, Bools]:
         """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
 
         Several outputs have shape (n, m).
@@ -250,7 +249,7 @@ class Store:
         self._local.session = session
         return session
 
-    def _file_identity(self) -> tuple[int, ...]:
+    def _file_identity(self) -> Shape:
         """Return process, device and number of the file; nothing if there is no file."""
         try:
             file = self.path.stat()

@@ -25,7 +25,7 @@ from urllib3.connection import HTTPConnection, HTTPSConnection
 from urllib3.exceptions import HTTPError, LocationParseError, ProtocolError, ReadTimeoutError
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, called, plain_text, positive_number
+from prbayes._validate import Floats, Shape, called, plain_text, positive_number
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
 
@@ -214,8 +214,8 @@ class RemoteModel:
     address: Address
     model: str
     config: str  # as JSON
-    inputs: tuple[int, ...]  # sizes of the model's input vectors
-    outputs: tuple[int, ...]
+    inputs: Shape  # sizes of the model's input vectors
+    outputs: Shape
     timeout: float | None
     patience: float
 

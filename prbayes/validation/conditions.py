@@ -16,7 +16,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated
-from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
+from prbayes._validate import (
+    Floats,
+    Ints,
+    Seed,
+    Shape,
+    called,
+    flag,
+    real_array,
+    sample_labels,
+    seed_number,
+)
 from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
@@ -42,7 +52,7 @@ class Condition:
     predicted: Floats  # (D, S): a row for each draw
     measured: Floats  # (n,) or (n, m): before the projection
     labels: tuple[str, ...] | None  # of the specimens
-    numbers: NDArray[np.intp]  # (n,): the specimens, counted over all conditions
+    numbers: Ints  # (n,): the specimens, counted over all conditions
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # of the prediction
     projection: Projection | None = None
     group: int = 0  # values of a group have one ECDF; the number of a projection, else 0
@@ -324,7 +334,7 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
     return y if order is None else y[:, order]
 
 
-def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
+def _simulated(name: str, values: Any, event: Shape) -> Floats:
     """Return predicted values, shape (D, S, *event)."""
     if isinstance(values, xr.DataArray):
         if not set(_SAMPLE_DIMS) <= set(values.dims) or len(values.dims) != 3 + len(event):

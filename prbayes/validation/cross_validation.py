@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from prbayes._display import Table, View
 from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
+from prbayes._validate import Floats, Ints, Seed, called, flag, positive_integer, seed_number
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets, specimens
 from prbayes.metrics.base import Discrepancy, Metric, Part
@@ -194,7 +193,7 @@ def most_folds(optimum: Optimum, limit: int) -> int:
 
 def _folds(
     simulators: Sequence[PopulationSimulator], folds: int, random_seed: int
-) -> tuple[list[Floats], list[Floats], NDArray[np.intp]]:
+) -> tuple[list[Floats], list[Floats], Ints]:
     """Assign specimens to folds at random.
 
     Return weights of held-out observations and of the other ones, which sum to one, (folds, n_k) by
@@ -511,7 +510,7 @@ def log_scores(
     target: Discrepancy,
     values: Floats,
     weights: Floats,
-    rows: NDArray[np.intp],
+    rows: Ints,
     gross: float = 0.1,
 ) -> Floats:
     """Return scores of observations, (r,), under a population of values (n,) or (n, m).

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from prbayes._display import Tree, View
 from prbayes._finding import Finding, counted, report
@@ -18,7 +18,9 @@ from prbayes._progress import progress, shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
+    Ints,
     Seed,
+    Shape,
     called,
     executes,
     flag,
@@ -195,7 +197,7 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         )
 
 
-def _read_data(data: object, name: str, minimum: int, event: tuple[int, ...]) -> dict[str, Floats]:
+def _read_data(data: object, name: str, minimum: int, event: Shape) -> dict[str, Floats]:
     """Return the measured responses of each product, or raise."""
     if not isinstance(data, Mapping) or not data:
         raise TypeError(
@@ -261,7 +263,7 @@ class Fleet:
             advance()
         return results
 
-    def _rows(self, name: str) -> NDArray[np.intp]:
+    def _rows(self, name: str) -> Ints:
         """Return the rows of a product among the specimens of all."""
         names = list(self.observed)
         sizes = [len(values) for values in self.observed.values()]
@@ -374,7 +376,7 @@ def _common_likelihood(
     return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
-def _of_rows(likelihood: SpecimenLikelihood, rows: NDArray[np.intp]) -> SpecimenLikelihood:
+def _of_rows(likelihood: SpecimenLikelihood, rows: Ints) -> SpecimenLikelihood:
     """Return the likelihood of some specimens, with their points."""
     (measurement,) = likelihood.measurements
     part = replace(measurement, observed=measurement.observed[rows])

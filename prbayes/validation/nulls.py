@@ -16,11 +16,18 @@ from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
-from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
+from prbayes._validate import (
+    AT_ONCE,
+    Floats,
+    Ints,
+    called,
+    positive_integer,
+    positive_number,
+    share,
+)
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
 from prbayes.model.evaluator import read_inputs_of_copy, shortcomings
@@ -554,9 +561,7 @@ def _require_population(condition: Condition, values: Floats, weights: Floats) -
         )
 
 
-def _validated_counts(
-    nodes: Sequence[Node], tested: list[_Tested]
-) -> tuple[list[NDArray[np.intp]], int]:
+def _validated_counts(nodes: Sequence[Node], tested: list[_Tested]) -> tuple[list[Ints], int]:
     """Return the numbers of each condition's specimens in the calibration, and how many are new."""
     node_numbers, total = specimens(nodes)
     # The points of a group of simulators are drawn together.
