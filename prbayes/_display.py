@@ -47,7 +47,7 @@ class View:
     sentences: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        more = len(self.rows) - 40  # of a page
+        more = len(self.rows) - 40  # rows beyond one page
         if more > 0:
             object.__setattr__(self, "rows", self.rows[:40])
             text = f"{more} more rows are in .to_dataframe()."
@@ -64,18 +64,18 @@ class View:
 
 
 def percentage(share: float) -> str:
-    """Return a share of one with all its digits, such as '99.5%'."""
+    """Return a share with all its digits as a percentage, such as '99.5%'."""
     return f"{100 * share:g}%"
 
 
 def p_digits(p: float, alpha: float) -> int:
-    """Return the number of digits of a p-value, two or more, that keep it on its side of alpha."""
+    """Return how many digits of a p-value, at least two, show on which side of alpha it is."""
     digits = (n for n in range(2, 17) if (float(f"{p:.{n}g}") <= alpha) == (p <= alpha))
     return next(digits, 17)
 
 
 def html_of(shown: View) -> str:
-    """Return the HTML of what a reader sees."""
+    """Return a view as HTML."""
     return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
 
 
@@ -96,13 +96,13 @@ class Shown:
 
 
 class ShownArray:
-    """A result of xarray with sentences; a selection without parts of it shows as xarray's own."""
+    """An xarray object that prints as sentences; an incomplete selection prints as in xarray."""
 
     __slots__ = ()
-    # Dimensions, variables, groups and attributes of a whole result.
+    # Names of dimensions, variables, groups and attributes that a complete result has.
     _parts: ClassVar[tuple[str, ...]] = ()
 
-    # That of xarray has no annotations, by which type checkers would refuse each subclass.
+    # The method of xarray has no annotations, so that type checkers would refuse each subclass.
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
 
@@ -112,20 +112,20 @@ class ShownArray:
 
     @property
     def _is_whole(self) -> bool:
-        """Whether no part was selected."""
+        """Whether the result is complete, not a selection."""
         array: Any = self
         names = {*array.dims, *array.attrs, *getattr(array, "data_vars", ())}
         return set(self._parts) <= names | set(getattr(array, "children", ()))
 
     def __repr__(self) -> str:
-        """Return sentences; of a selection what xarray shows."""
+        """Return sentences, or for a selection the text of xarray."""
         return str(self.to_view()) if self._is_whole else super().__repr__()
 
     def __str__(self) -> str:
         return repr(self)
 
     def _repr_html_(self) -> str:
-        """Show a table; of a selection what xarray shows."""
+        """Return a table as HTML, or for a selection that of xarray."""
         if self._is_whole:
             return html_of(self.to_view())
         return str(super()._repr_html_())  # type: ignore[misc]
@@ -141,11 +141,11 @@ class Table(ShownArray, xr.Dataset):
     """A dataset with sentences."""
 
     __slots__ = ()
-    # Variables of the DataFrame, which has a row for each combination of their dimensions.
+    # Names of the variables that become columns of the data frame.
     _columns: ClassVar[tuple[str, ...]] = ()
 
     def to_dataframe(self, dim_order: Sequence[Any] | None = None) -> Any:
-        """Return the numbers of the table as a DataFrame; of a selection as xarray does."""
+        """Return the main variables as a data frame; for a selection all, as in xarray."""
         if not self._is_whole:
             return super().to_dataframe(dim_order)
         table = self[[name for name in self._columns if name in self]]

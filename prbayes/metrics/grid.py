@@ -17,8 +17,8 @@ import numpy as np
 
 from prbayes._validate import AT_ONCE, Floats, Ints
 
-# The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
-# of 1, t, t^2, t^3.
+# Coefficients of 1, t, t^2, t^3 of the four uniform cubic B-splines that are not zero at fraction t
+# between two nodes.
 _SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 
 
@@ -34,12 +34,12 @@ def product(weights: Floats, matrix: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Cells(ABC):
-    """Cells on which densities are compared, the last two for the mass below and above all else."""
+    """Cells on which densities are compared; the last two are for the mass below and above."""
 
-    widths: Floats  # (m,): length of each cell; of the outer two, as documented by the estimator
-    centers: Floats  # (m - 2,): positions of the inner cells, in units of the response
+    widths: Floats  # length of each cell, (m,); the estimator chooses that of the outer two
+    centers: Floats  # positions of the inner cells, (m - 2,), in units of the response
     smooth: bool  # whether the density has derivatives with respect to the sample's values
-    floor: float  # the density of a small share of the mass, spread evenly over all cells
+    floor: float  # density of a small share of the mass that is spread evenly over all cells
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
@@ -51,17 +51,17 @@ class Cells(ABC):
 
     @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
+        """Return r such that ``r @ g`` is the weighted mean of a function g of the cells at points.
 
         Shapes (n,), (..., n) -> (..., m).
         """
 
     @abstractmethod
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
-        """Return the derivatives of ``(density(sample, weights) * cotangent).sum()`` for weights.
+        """Return derivatives of ``(density(sample, weights) * cotangent).sum()`` by the weights.
 
-        Or those for the sample, where all weights are one. Shapes (..., n), (..., m) -> (..., n),
-        with as many leading axes in both.
+        With ``for_sample`` they are those by the sample, for weights of one. Shapes (..., n),
+        (..., m) -> (..., n), with as many leading axes in both.
         """
 
 
@@ -69,33 +69,35 @@ class Cells(ABC):
 class KernelCells(Cells):
     """Nodes of a regular grid; mass outside counts as one tight cluster on either side.
 
-    The cluster is a single kernel, where that mass is most conspicuous. A value's kernel is divided
-    between grid and cluster at the end of the grid, so that all is smooth in the values there as
-    well. The sample is binned on more nodes than the grid has: those whose kernels reach it.
+    The cluster has the density of a single kernel, so that mass outside counts as much as possible.
+    The kernel of a value near the end of the grid is divided between grid and cluster, so that the
+    density is smooth in the values there, too. The sample is binned on more nodes than the grid
+    has: all nodes whose kernels reach the grid.
     """
 
     bandwidth: float  # standard deviation of the kernel, in units of the response
     step: float  # distance of two nodes
-    kernel: Floats  # (2 k + 1,): the kernel that smooths counts at nodes into densities
+    kernel: Floats  # kernel that smooths counts at nodes into densities, (2 k + 1,)
     low: float  # position of the first node, in steps
-    # Additional nodes on either side on which values are binned: from farther out a kernel reaches
-    # no node, whichever of four its spline brings it to.
+    # Number of additional nodes on either side on which values are binned. The kernel of a value
+    # farther out reaches no node of the grid, also after its spline has spread it to four nodes.
     margin: int
-    mass_outside: Floats  # (2, g + 2 margin): of a kernel at each of these nodes, below and above
+    # Mass below and above the grid of a kernel at each node and additional node, (2, g + 2 margin).
+    mass_outside: Floats
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return densities at the nodes, then mass below and above divided by a cluster's width."""
+        """Return densities at the nodes, then mass below and above over the width of a cluster."""
         *batch, n = sample.shape
         rows = math.prod(batch)
         nodes = self.centers.size
-        # Bin the sample on the grid.
+        # Bin the sample on the grid and the additional nodes.
         values = np.ascontiguousarray(sample.reshape(rows, n), dtype=np.float64)
         rows_of_weights = np.broadcast_to(weights, sample.shape).reshape(rows, n)
         rows_of_weights = np.ascontiguousarray(rows_of_weights, dtype=np.float64)
         counts = np.zeros((rows, nodes + 2 * self.margin))
         outside = np.zeros((rows, 2))
         count(values, rows_of_weights, self.low, 1 / self.step, self.margin, counts, outside)
-        # Smooth the counts, within the grid and beyond its ends.
+        # Smooth the counts into densities on the grid, and into mass beyond its ends.
         inner = np.zeros((rows, nodes))
         smooth(counts, self.kernel, -self.margin, inner)
         for side, mass in enumerate(self.mass_outside):
@@ -108,11 +110,11 @@ class KernelCells(Cells):
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return cubic convolution weights (Keys 1981), which are exact for parabolas.
 
-        Points off the grid are read at the cell of the mass on their side.
+        Points off the grid take the value of the outer cell on their side.
         """
         last = self.centers.size - 2
         total: Any = 0.0
-        # Blocks of points whose matrices fit into memory.
+        # Work in blocks of points, so that their matrices fit into memory.
         size = max(1, AT_ONCE // self.widths.size)
         for start in range(0, max(1, points.size), size):
             block = slice(start, start + size)
@@ -146,7 +148,7 @@ class KernelCells(Cells):
         n = sample.shape[-1]
         inner = self.centers.size
         nodes = inner + 2 * self.margin
-        # Smooth the cotangent; the kernel is its own transpose.
+        # Smooth the cotangent with the same kernel, because it is symmetric.
         flat = np.ascontiguousarray(cotangent[..., :inner]).reshape(-1, inner)
         smoothed = np.zeros((len(flat), nodes))
         smooth(flat, self.kernel, self.margin, smoothed)
@@ -154,7 +156,7 @@ class KernelCells(Cells):
         smoothed = smoothed.reshape(*cotangent.shape[:-1], nodes)
         for side, mass in enumerate(self.mass_outside):
             smoothed = smoothed + ends[..., side, None] * mass
-        # The cubic beyond each node, from the splines around: (rows, g, 4).
+        # The coefficients of the cubic beyond each node, (rows, g, 4), from the splines around it.
         spline = _SPLINE
         if for_sample:
             spline = np.pad(_SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
@@ -166,7 +168,7 @@ class KernelCells(Cells):
         values = np.ascontiguousarray(values, dtype=np.float64)
         ends = np.ascontiguousarray(np.broadcast_to(ends, (*batch, 2)).reshape(rows, 2))
         out = np.empty((rows, n))
-        read(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
+        evaluate_cubics(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)
 
 
@@ -178,7 +180,7 @@ class BinCells(Cells):
         """Return the normalised frequency per unit length of each bin, then of the outer two."""
         *batch, n = sample.shape
         rows = math.prod(batch)
-        # The cells of all rows are counted at once: the bins, below, above, and NaN.
+        # Count the cells of all rows at once. Each row has its bins, below, above, and NaN.
         cells = self.centers.size + 3
         first = cells * np.arange(rows)
         cell = self._cell(sample).reshape(rows, n) + first[:, None]
@@ -199,15 +201,15 @@ class BinCells(Cells):
         low = self.centers[0] - width / 2
         position = (sample - low) / width
         finite = np.where(np.isfinite(position), position, 0.0)
-        # The upper edge belongs to the last bin, also after rounding in low + bins * width.
+        # The upper edge belongs to the last bin, also if low + bins * width is rounded.
         cell = np.clip(finite, 0, bins - 1).astype(np.intp)
-        # The margin is above the rounding of edges of some thousand bins.
+        # The tolerance exceeds the rounding of the edges of some thousand bins.
         cell = np.where(position > bins + 1e-9, bins + 1, cell)
         cell = np.where(position < -1e-9, bins, cell)
         return np.where(np.isnan(position), bins + 2, cell)
 
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
-        """Return the cell's cotangent, or zero for the sample: a step function."""
+        """Return the cotangent of the cell of each value; zero by the sample: steps are flat."""
         if for_sample:
             batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
             return np.zeros((*batch, sample.shape[-1]))
@@ -218,7 +220,7 @@ class BinCells(Cells):
 
 
 def compiled(loop: Callable[..., None]) -> Callable[..., None]:
-    """Compile with Numba at the first call, as it takes long to import, with a cache on disk."""
+    """Compile a loop with Numba at its first call, since Numba takes long to import."""
     function: Callable[..., None] | None = None
 
     def call(*args: Any) -> None:
@@ -228,7 +230,7 @@ def compiled(loop: Callable[..., None]) -> Callable[..., None]:
 
             try:
                 function = njit(cache=True, nogil=True)(loop)
-            except RuntimeError:  # no folder for the cache
+            except RuntimeError:  # there is no folder for the cache on disk
                 function = njit(nogil=True)(loop)
         function(*args)
 
@@ -247,14 +249,14 @@ def count(
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k - margin) / inverse``. Sample and weights have shape (rows, n), the
-    counts (rows, g), ``outside`` (rows, 2). NaN counts nowhere.
+    Node k is at ``(low + k - margin) / inverse``. Sample and weights have the shape (rows, n),
+    counts (rows, g), and ``outside`` (rows, 2). NaN counts nowhere.
     """
     rows, n = sample.shape
     g = counts.shape[1]
     moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
     for r in range(rows):
-        # Sum the powers of the fractions of all values beyond a node.
+        # For each node sum the powers of the fractions t of all values beyond it.
         for i in range(n):
             t = sample[r, i] * inverse - low
             w = weights[r, i]
@@ -268,7 +270,7 @@ def count(
                 outside[r, 0] += w
             elif t >= g - 2 - margin:
                 outside[r, 1] += w
-        # Four splines reach these values: their weights go to the nodes around them.
+        # Four splines are not zero at these values: distribute the weights to their nodes.
         for node in range(1, g - 2):
             m = moments[node]
             if m.any():
@@ -282,8 +284,8 @@ def count(
 def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
     """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``.
 
-    The rows have shape (rows, g), ``out`` (rows, m); the first of g is at place ``first_at``
-    of the m, which may be outside them.
+    The rows have the shape (rows, g), and ``out`` (rows, m). The first of the g numbers is at index
+    ``first_at`` of the m, which may be outside them.
     """
     rows, g = values.shape
     m = out.shape[1]
@@ -302,7 +304,7 @@ def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
 
 
 @compiled
-def read(
+def evaluate_cubics(
     sample: Floats,
     coefficients: Floats,
     outside: Floats,
@@ -311,11 +313,10 @@ def read(
     margin: int,
     out: Floats,
 ) -> None:
-    """Evaluate piecewise cubics at a sample, shape (rows, n), into ``out`` of the same shape.
+    """Evaluate piecewise cubics at a sample, (rows, n), into ``out`` of the same shape.
 
-    The coefficients of 1, t, t^2, t^3 beyond each node, which are those of `count`, have shape
-    (rows, g, 4); values below and above the grid get those of ``outside``, shape (rows, 2), and NaN
-    gets zero.
+    The coefficients of 1, t, t^2, t^3 beyond each node of `count` have the shape (rows, g, 4).
+    Values below and above the grid get the numbers of ``outside``, (rows, 2), and NaN gets zero.
     """
     rows, n = out.shape
     g = coefficients.shape[1]

@@ -92,9 +92,9 @@ class LogLikelihood(Metric):
     counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
     distance: ClassVar[bool] = False
-    # Arrays with an index, to be compared with that of observed.
+    # Arguments with an index, which is compared with that of the observed values.
     _labelled: ClassVar[tuple[Any, ...]] = ()
-    tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
+    tail_responses: ClassVar[int] = 300  # enough for standard errors that are right to a tenth
 
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
@@ -148,9 +148,9 @@ class LogLikelihood(Metric):
         return self.density is None
 
     def of_frequencies(self, rows: Ints, n: int) -> LogLikelihood:
-        """Return the likelihood of specimens that are rows of n readings, by their frequencies.
+        """Return the likelihood of data with frequencies: specimen i has row ``rows[i]`` of n.
 
-        Arrays by reading become those of the specimens.
+        Arrays with an element for each row get one for each specimen.
         """
 
         def of_specimens(value: Any) -> Any:
@@ -171,7 +171,7 @@ class LogLikelihood(Metric):
 
         def full(value: Any, name: str) -> Floats:
             array = np.asarray(value, dtype=np.float64)
-            # One output: an array by reading has the shape (N,).
+            # With one output an array with a number for each reading has the shape (N,).
             array = array[:, None] if not event and array.ndim == 1 else array
             try:
                 return np.array(np.broadcast_to(array, values.shape))
@@ -230,7 +230,8 @@ def _as_tuples(array: Floats) -> Any:
 class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     """The mean log-likelihood of fixed observed values."""
 
-    # (m,) or (..., m): ``reading @ g`` is the mean at the observed values of g, given on the cells.
+    # Weights of the cells, (m,) or (..., m): ``reading @ g`` is the mean at the observed values of
+    # a function g of the cells.
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 

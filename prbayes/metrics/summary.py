@@ -104,7 +104,7 @@ class Summary:
 
     @property
     def values(self) -> Floats:
-        """Mean, order statistics, and one standard deviation below and above the first of these."""
+        """Mean, order statistics, and the first of them minus and plus one standard deviation."""
         places = [] if self.mean is None else [self.mean]
         places += [*self.order_statistics[:, 1]]
         if self.sd is not None:
@@ -123,12 +123,12 @@ class Summary:
 
     @property
     def center(self) -> float:
-        """The middle of the sample, from which responses are measured."""
+        """The center of the sample, which is subtracted from responses."""
         return float(self.values.mean()) if self.mean is None else float(self.mean)
 
     @property
     def unit(self) -> float:
-        """The standard deviation, or that of a normal sample with these locations; else zero."""
+        """The standard deviation, or that of a normal sample with these statistics; else zero."""
         if self.sd is not None:
             return float(self.sd)
         rank, value = self.order_statistics.T
@@ -157,10 +157,11 @@ class Summary:
         if self.sd is None or not np.isfinite(high - low):
             return
         middle = (low + high) / 2 if self.mean is None else self.mean
-        # Bhatia and Davis (2000): all specimens at the ends.
+        # The standard deviation is largest if all specimens are at the ends (Bhatia and Davis
+        # 2000).
         largest = np.sqrt((high - middle) * (middle - low) * self.n / (self.n - 1))
-        smallest = (high - low) / np.sqrt(2 * (self.n - 1))  # all others in the middle
-        if not 0.999 * smallest <= self.sd <= 1.001 * largest:  # rounding
+        smallest = (high - low) / np.sqrt(2 * (self.n - 1))  # with all others in the middle
+        if not 0.999 * smallest <= self.sd <= 1.001 * largest:  # a margin for rounding
             raise ValueError(
                 f"Summary: sd: got {self.sd}, expected from {smallest:.4g} to {largest:.4g}, which "
                 f"{self.n} specimens from {low} to {high} can have; is it a standard error?"

@@ -46,7 +46,7 @@ class SummaryLikelihood(Metric):
     additive = False
 
     def __post_init__(self) -> None:
-        if self.summary.order_statistics.size:  # as many as the kernel log-likelihood needs
+        if self.summary.order_statistics.size:  # densities at them have a kernel, too
             object.__setattr__(self, "tail_responses", LogLikelihood.tail_responses)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
@@ -65,13 +65,13 @@ class SummaryLikelihood(Metric):
 
 @dataclass(frozen=True, eq=False)
 class SummaryDiscrepancy(Discrepancy):
-    """Minus log-likelihood over n; features are moments of strata and densities, in units of sd.
+    """Minus log-likelihood over n. Features are moments of strata, and densities at the knots.
 
     Attributes
     ----------
     summary : Summary
     knots : ndarray, shape (I,)
-        The order statistics.
+        The order statistics, standardised.
     counts : ndarray, shape (I + 1,)
         Numbers of other specimens between them.
     """
@@ -104,19 +104,20 @@ class SummaryDiscrepancy(Discrepancy):
 
     @property
     def _powers(self) -> int:
-        """The highest moment that the statistics need, plus one."""
+        """The number of moments of each stratum that the statistics need, from order zero."""
         return 5 if self.summary.sd is not None else 3 if self.summary.mean is not None else 1
 
     def _columns(self, simulated: Any, xp: Any) -> list[Any]:
         """Return the features of single responses, (..., n) each.
 
-        Strata by power, then densities. The kernel smooths the ends of the strata too.
+        For each power the terms of the strata, then densities at the knots. The kernel of the
+        densities also smooths the ends of the strata.
         """
-        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is beyond all others
+        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is above all other values
         z = (xp.where(is_known, simulated, self.summary.center) - self.summary.center) / self._unit
         z = xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
-        # In standard deviations. Half the width of `LogLikelihood`: the scale of a tail may be a
-        # fraction of the standard deviation.
+        # Width of the kernel in standard deviations. It is half of that in `LogLikelihood`, because
+        # the scale of a tail may be a fraction of the standard deviation.
         width = 0.175 * self.summary.n**-0.25
         steps = [(knot - z) / width for knot in self.knots]
         below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
@@ -132,7 +133,7 @@ class SummaryDiscrepancy(Discrepancy):
 
     @cached_property
     def _reference(self) -> Floats:
-        """The features of a normal population like the sample."""
+        """The features of a normal population with center and unit of the sample."""
         score = ndtri((np.arange(1001) + 0.5) / 1001)
         columns = self._columns(self.summary.center + self._unit * score, np)
         return np.array([np.mean(column) for column in columns])
@@ -150,8 +151,10 @@ class SummaryDiscrepancy(Discrepancy):
         """Return minus the log-likelihood over n."""
         (sums,) = features
         n, size = self.summary.n, self.counts.size
-        total = xp.maximum(sums[..., :size].sum(axis=-1), 1e-300)  # less than one without response
-        # A little of the normal population, so that logarithms and ratios are finite.
+        total = xp.maximum(
+            sums[..., :size].sum(axis=-1), 1e-300
+        )  # less than one if points have no response
+        # Mix in a little of the normal population, so that logarithms and ratios are finite.
         shares = (1 - 1e-9) * sums / total[..., None] + 1e-9 * self._reference
         positive = xp.maximum(shares, 1e-300)
         mass = [positive[..., j] for j in range(size)]
@@ -179,12 +182,14 @@ class SummaryDiscrepancy(Discrepancy):
             observed = n * (summary.mean - summary.center) / self._unit
             sum_score = (observed - mean_sum) / xp.sqrt(variance)
             log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
-        is_known = summary.mean is not None and counts.sum() <= 1  # by the mean
-        if summary.sd is None or is_known:
+        # With at most one other specimen the standard deviation follows from the mean.
+        follows_from_mean = summary.mean is not None and counts.sum() <= 1
+        if summary.sd is None or follows_from_mean:
             return log_l
         squares = sum(c * m[2] for c, m in strata) + (self.knots**2).sum()
         expected = xp.maximum(squares - (variance + mean_sum**2) / n, 1e-12)
-        # Influence of a specimen: its squared distance from the mean.
+        # Mean and variance of W, and its covariance with A. The influence of a specimen on W is its
+        # squared distance from the mean.
         middle = mean_sum / n
         square_variance, covariance = 0.0, 0.0
         for count, (_, first, second, third, fourth) in strata:
@@ -196,7 +201,7 @@ class SummaryDiscrepancy(Discrepancy):
             square_variance += count * (power - distance**2)
             covariance += count * (third - 2 * middle * second + middle**2 * first)
             covariance -= count * first * distance
-        if not self.knots.size:  # exact for independent specimens, as is the covariance
+        if not self.knots.size:  # for independent specimens variance and covariance are exact
             square_variance = (n - 1) / n * square_variance + 2 * (variance / n) ** 2
         square_variance, covariance = ((n - 1) / n * v for v in (square_variance, covariance))
         square_variance = xp.maximum(square_variance, 1e-12)
@@ -211,7 +216,7 @@ class SummaryDiscrepancy(Discrepancy):
         log_l = log_l - 0.5 * xp.log(scatter) - xp.log(expected) / 3
         if summary.mean is None:
             return log_l - 0.5 * square_score**2
-        # Given the mean.
+        # The standard deviation given the mean: two normal scores with a correlation.
         correlation = covariance / xp.sqrt(variance * square_variance)
         rest = xp.maximum(1 - correlation**2, 1e-6)
         residual = (square_score - correlation * sum_score) ** 2 / rest

@@ -15,9 +15,10 @@ from prbayes._stats import quantile
 from prbayes._validate import Floats, Ints
 from prbayes.metrics.density import spread
 
-# More outputs than this are compared by their principal components: eight need seventy directions.
+# Largest number of outputs that are compared without principal components. Eight outputs need
+# seventy directions.
 MOST_OUTPUTS = 8
-# Share of the variance of the data that components may leave out.
+# Largest share of the variance of the data that components may leave out.
 LEFT_OUT = 0.01
 
 
@@ -25,11 +26,13 @@ LEFT_OUT = 0.01
 class Components:
     """Scores ``(y - center) @ axes`` of outputs y, and the variance that they leave out."""
 
-    center: Floats  # (m,)
-    axes: Floats  # (m, r): orthonormal
-    left_out: float  # share of the observed variance
-    rest_correlation: float  # of neighbours in the remainder of the data: near zero for noise
-    outputs: Ints  # (m,): which of the outputs of a specimen
+    center: Floats  # center of the outputs, (m,)
+    axes: Floats  # orthonormal axes, (m, r)
+    left_out: float  # share of the observed variance that is left out
+    # Correlation of neighbouring outputs in the remainder of the data, which is near zero for
+    # noise.
+    rest_correlation: float
+    outputs: Ints  # indices of the outputs of a specimen, (m,)
 
     @property
     def number(self) -> int:
@@ -57,11 +60,11 @@ class Components:
         return float(weights @ (rest**2).sum(axis=1)) / variance if variance > 0 else 0.0
 
     def missed(self, population: float) -> str:
-        """Return a clause about what is left out; empty if it is noise that no model has.
+        """Return a clause about what is left out; empty if that is only noise of the data.
 
-        Argument is the share of the variance of the best population that they leave out.
+        ``population`` is the share of the variance of the best population that is left out.
         """
-        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # white noise has .1
+        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # that of white noise is .1
             return (
                 f"{self.summary}: this is not noise, and the metric does not compare it; pass more "
                 "components= to prb.Joint, or measure more specimens"
@@ -71,7 +74,7 @@ class Components:
                 f"{self.summary}: noise that the model also has, whose size is estimated from few "
                 "directions; leave metric= out, for the log-likelihood by specimen"
             )
-        # Components of few data leave out more of a population than of the data.
+        # A factor of three is normal: components of few data leave out more of a population.
         if population > 3 * LEFT_OUT:
             return (
                 f"{self.summary}, but {population:.2g} of that of the best population, which the "
@@ -86,14 +89,15 @@ def principal_components(
     """Return principal components of observed outputs, (n, m).
 
     The weight of a specimen falls with its distance from the middle of the data. Components that
-    vary no more than white noise follow the others. By default their ``number`` is the fewest
-    that leave out a hundredth of the variance, at most eight, or one for five specimens.
+    vary no more than white noise come last. By default ``number`` is the smallest number of
+    components that leave out at most a hundredth of the variance, but at most eight, and at most
+    one for every five specimens.
     """
     n, m = sample.shape
     middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
     squares = ((sample - middle) ** 2).sum(axis=1)
     typical = float(quantile(squares, weights, 0.5))
-    # Weights that fall with the fourth power of the distance from the middle.
+    # The weights fall with the fourth power of the distance from the middle.
     w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
     w = w / w.sum()
     center = w @ sample
@@ -101,13 +105,16 @@ def principal_components(
     scatter = (w[:, None] * deviations).T @ deviations
     variances, axes = np.linalg.eigh(scatter)
     variances = np.maximum(variances[::-1], np.finfo(float).tiny)
-    # White noise starts below the largest variance that it has by chance (Marchenko and Pastur). Of
-    # its components the most typical are compared: those that vary most have too large a variance.
-    # The largest one precedes them where there is room, as it may be no noise.
+    # Components with variances below the Marchenko-Pastur edge are noise. Noise components are
+    # sorted by how near their variance is to the mean, because the largest ones overstate the
+    # noise. The first of them stays in front if there is room for another one, because it may be
+    # signal.
     most = max(1, min(m, MOST_OUTPUTS, n // 5)) if number is None else min(number, m)
     remaining = np.arange(m, 0, -1)
     means = np.cumsum(variances[::-1])[::-1] / remaining
-    is_noise = variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2  # so is the last
+    is_noise = (
+        variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2
+    )  # always true for the last
     first = int(np.argmax(is_noise))
     first += most - first > 1
     atypical = np.abs(np.log(variances[first:] / means[first]))
@@ -117,10 +124,10 @@ def principal_components(
     if number is None:
         is_sufficient = explained >= 1 - LEFT_OUT
         number = min(int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m, most)
-    # Signs that do not depend on the algorithm.
+    # Choose signs that do not depend on the algorithm: the largest coefficient is positive.
     largest = np.abs(axes).argmax(axis=0)
     axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
-    # The correlation of neighbours in the remainder.
+    # Correlation of neighbouring outputs in the remainder.
     rest = deviations - deviations @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
     variance = float((rest**2).mean())
@@ -136,8 +143,9 @@ def principal_components(
     )
 
 
-# Degrees of freedom of the t distribution of the scatter. One is the most robust, up to a share of
-# 1 / (m + 1) of gross outliers, but does not exist where many specimens have equal outputs.
+# Degrees of freedom of the t distribution of the scatter, in the order in which they are tried.
+# With one degree the scatter is the most robust, up to a share of 1 / (m + 1) of gross outliers,
+# but it does not exist if many specimens have equal outputs.
 _DEGREES = (1.0, 3.0, np.inf)
 
 
@@ -147,8 +155,8 @@ def whitening(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, F
     They are the same, to rounding, after any invertible affine map of the outputs: location and
     scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
     scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
-    With fewer specimens than `sufficient_specimens` the scatter is shrunk, and only changes of
-    units and of the order of outputs change nothing.
+    With fewer specimens than `sufficient_specimens` the scatter is shrunk, and the coordinates are
+    invariant only under changes of units and of the order of outputs.
     Messages use the numbers of the ``outputs``, (m,). Raises ValueError if an output has equal
     values, outputs depend on each other linearly, or the specimens are fewer than m + 2.
 
@@ -186,7 +194,7 @@ def whitening(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, F
             "others; leave one of them out"
         )
     root = _shrunk(root, 1 / float(weights @ weights))
-    # Rotate to the axes of a second scatter, with signs by a third moment.
+    # Rotate to the axes of a second scatter; a third moment determines the signs.
     x = (z - location) @ root
     squares = (x**2).sum(axis=-1)
     _, axes = _singular(x, weights / (1 + squares) ** 2)
@@ -210,13 +218,14 @@ def sufficient_specimens(m: int) -> int:
 def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     """Return a root of the inverse scatter whose principal variances differ less, for few data.
 
-    A combination of outputs that happens to scatter little would count as much as all others. The
-    ratio of neighbouring variances shrinks, at most to one, by the ratio that two equal variances
-    of n normal values exceed by chance, ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. This shrinkage
-    falls to zero at a sufficient number of specimens.
+    Without shrinkage a combination of outputs that happens to scatter little would count as much as
+    all others. The ratio of neighbouring variances is reduced, at most to one, by the ratio that
+    two equal variances of n normal values exceed with probability ``chance``:
+    ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. The shrinkage falls to zero at a sufficient number of
+    specimens.
     """
     deficit = 1 - n / sufficient_specimens(len(root))
-    if deficit < 1e-9:  # rounding of weights
+    if deficit < 1e-9:  # a margin for the rounding of weights
         return root
     _, size, axes = np.linalg.svd(np.linalg.inv(root))
     log_size = np.log(size)
@@ -232,7 +241,7 @@ def units(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Float
     Arguments are those of `whitening`.
     """
     center = np.array([quantile(y, weights, 0.5) for y in sample.T])
-    # In parts of the range, whose squares do not overflow in any unit.
+    # Scale by the range first, so that squares do not overflow in any unit.
     length = np.ptp(sample, axis=0)
     constant = outputs[~(length > 0)]
     if constant.size:
@@ -247,8 +256,8 @@ def units(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Float
 def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats, Floats | None]:
     """Return location and a root of the inverse scatter of a t distribution, by iteration.
 
-    It starts with mean and covariance, so that an affine map changes no step. Last comes a linear
-    combination of outputs without scatter, or None.
+    The iteration starts with mean and covariance, so that all steps are affine equivariant. The
+    third item is a linear combination of outputs without scatter, or None.
     """
     location = np.zeros(z.shape[1])
     root = np.eye(z.shape[1])
@@ -259,7 +268,7 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
         shift = w @ x
         size, axes = _singular(x - shift, w)
         largest = max(size[0], np.abs(root).max())
-        if not size[-1] > 1e-13 * largest:  # rounding alone
+        if not size[-1] > 1e-13 * largest:  # the scatter is rounding alone
             return location, root, root @ axes[-1]
         location = location + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)
@@ -270,8 +279,8 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
         squares = (white**2).sum(axis=-1)
         w = weights / (1 + squares / degrees)
         w = w / w.sum()
-    # The least variance of a combination of outputs in units of their spread: below 1e-10, the
-    # rounding of measurements decides.
+    # Smallest variance of a combination of outputs, in units of their spread. Below 1e-10 it is the
+    # rounding of measurements.
     inverse = np.linalg.inv(root)
     _, least, combinations = np.linalg.svd(inverse / np.sqrt((inverse**2).sum(axis=0)))
     is_dependent = least[-1] ** 2 < 1e-10 or stretch > 1e-9
@@ -279,7 +288,7 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
 
 
 def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the roots of the eigenvalues of a second moment, and its eigenvectors as rows."""
+    """Return square roots of the eigenvalues of a second moment, and eigenvectors as rows."""
     _, size, axes = np.linalg.svd(x * np.sqrt(weights)[:, None], full_matrices=False)
     return size, axes
 
