@@ -64,7 +64,6 @@ from prbayes.response.condition import (
     refuse_covariates,
     refuse_vectors_of_specimens,
 )
-from prbayes.response.dims import values_of
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -76,6 +75,7 @@ from prbayes.response.inputs import (
     set_units,
 )
 from prbayes.response.outputs import Outputs, in_order_of, read_observed
+from prbayes.response.pymc_dims import values_of
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
 # Settings of a propagation for calls of the response.

@@ -21,7 +21,7 @@ from prbayes.plots.curves import (
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select
 from prbayes.response.outputs import with_unit
-from prbayes.validation.conditions import comparables
+from prbayes.validation.pit import comparables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -40,7 +40,7 @@ from prbayes.reports.numbers import (
 from prbayes.reports.section import Section
 from prbayes.response.outputs import SINGLE_OUTPUT, with_unit
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.conditions import Comparable, comparables
+from prbayes.validation.pit import Comparable, comparables
 
 # -- page one --------------------------------------------------------------------------------
 

@@ -32,8 +32,8 @@ from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose
-from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.conditions import comparables
+from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.pit import comparables, u_values
 
 
 @dataclass(frozen=True, eq=False)

@@ -178,7 +178,7 @@ def calibrate_each(
 
 
 def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
-    """Raise if a simulator has numbers of its own observed specimens, or a data sheet."""
+    """Raise if a simulator has weights, labels or others of its observed specimens."""
     weights = simulator.weights
     numbers = {
         "weights=": weights is not None and np.ptp(weights) > 0,
@@ -225,7 +225,7 @@ class Calibration:
     pareto_k: float = np.nan
     # Statistic, critical value and p-value of the validity test.
     test: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    finding: str = ""  # why it failed, or what a reader should know
+    finding: str = ""  # reason of a failure, or a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,10 +234,10 @@ class Fleet:
 
     evaluator: Evaluator
     observed: Mapping[str, Floats]
-    further: Mapping[str, Floats]  # of a validity test
+    further: Mapping[str, Floats]  # measured responses for validity tests, by product
     settings: SamplingSettings
     alpha: float
-    likelihood: SpecimenLikelihood | None = None  # of the specimens of all products, in order
+    likelihood: SpecimenLikelihood | None = None  # likelihood of all products' specimens, in order
 
     def part(self, names: Sequence[str]) -> Fleet:
         """Return the fleet of some products."""
@@ -290,7 +290,7 @@ class Fleet:
         variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
         chains = None
         if evaluator.likelihoods:
-            # Without the groups of ArviZ, which take as long as the draws.
+            # Draw without building a DataTree, which takes as long as the draws.
             target = specimen_target(evaluator, None)
             modes = modes_of(target)
             chains = None if modes is None else importance_chains(target, modes, self.settings)
@@ -344,8 +344,9 @@ def _common_likelihood(
 ) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    The emulator is that of so many evenly spaced specimens. Limits of the errors of the emulator
-    and the points are those of a product: fewer specimens, in a narrower population.
+    The emulator is fitted for ``emulated`` evenly spaced specimens. The limits of the errors of
+    emulator and points are those for one product, which has fewer specimens and a narrower
+    population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
@@ -377,19 +378,19 @@ def _common_likelihood(
 
 
 def _of_rows(likelihood: SpecimenLikelihood, rows: Ints) -> SpecimenLikelihood:
-    """Return the likelihood of some specimens, with their points."""
+    """Return the likelihood of some of the specimens, with their points of quadrature."""
     (measurement,) = likelihood.measurements
     part = replace(measurement, observed=measurement.observed[rows])
     result = replace(likelihood, measurements=(part,))
     preparation = prepared(likelihood)
     result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
-    # Compiled functions and coordinates are those of the populations, not of the specimens.
+    # Compiled functions and coordinates depend on the populations only, and are reused.
     vars(result).update(density=likelihood.density, coordinates=likelihood.coordinates)
     return result
 
 
 def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
-    """Return a report of specimens whose readings no point reproduces to so many nats."""
+    """Return a sentence about specimens whose readings no point reproduces to so many nats."""
     preparation, readings = prepared(likelihood), likelihood.readings
     sd = readings.comparison_sd(preparation.emulation.error)[:, None]
     residual = (preparation.points.outputs - readings.values[:, None]) / sd
@@ -407,7 +408,7 @@ def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
 def _resampled(
     evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
 ) -> Floats:
-    """Return responses of points of the populations, (P, n), by weight."""
+    """Resample n responses from the weighted points of each population, (P, n)."""
     hyperparameters = evaluator.hyperparameters
     free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
     responses, weights = evaluator.populations(hyperparameters.thetas_of(free), 0)

@@ -14,7 +14,7 @@ from prbayes._finding import Finding, as_json
 from prbayes.reports.assessment import agreement, answer, next_steps
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
-from prbayes.validation.conditions import DIRECTION
+from prbayes.validation.pit import DIRECTION
 
 
 def test_comparison(calibrated: Any, page: Any, row: Any) -> None:
