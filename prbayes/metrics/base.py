@@ -39,8 +39,8 @@ class Projection:
 
     outputs: Ints  # indices of the outputs, (p,)
     caps: Floats  # values that stand for a failed specimen, (p,)
-    # Values that are subtracted, (p,). Projections with the same array have the same outputs and
-    # caps.
+    # Values that are subtracted, (p,). Projections of the same outputs share the array, so that
+    # these outputs are centred once for all of them.
     center: Floats
     direction: Floats  # coefficients of the combination, (p,)
 
@@ -279,7 +279,10 @@ def is_additive(target: Discrepancy) -> bool:
 
 
 def is_likelihood(target: Discrepancy) -> bool:
-    """Return whether N times it is like a log-likelihood, which a mean over directions is not."""
+    """Return whether N times the discrepancy is on the scale of a log-likelihood.
+
+    A mean over directions is not, whatever its metric.
+    """
     return len(target.parts) == 1 and target.parts[0].target.metric.likelihood
 
 

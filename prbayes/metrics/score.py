@@ -21,7 +21,7 @@ from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """Options of scores."""
+    """Options for the computation of scores."""
 
     # Distance from the ends of the data, in default bandwidths, beyond which the score of a
     # log-density is constant. Otherwise it would grow without bound, and the tail of the population
@@ -204,8 +204,8 @@ def _part_scores(
     """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
     if target.metric.likelihood:
-        # Limit the values to the reach of the data; in a model of several simulators, to that of as
-        # many specimens as all of them have.
+        # Limit the values to the range of the data and a margin. With several simulators the range
+        # is that expected of as many specimens as all simulators have together.
         observed, weights = finite_sample(target.observed, target.weights)
         lowest, highest = observed.min(), observed.max()
         if total > len(target.observed):

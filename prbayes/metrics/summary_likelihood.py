@@ -94,7 +94,7 @@ class SummaryDiscrepancy(Discrepancy):
         return float(self.summary.n)
 
     def replicate(self, specimens: Floats) -> Floats:
-        """Return the statistics of as many specimens, (..., n) -> (..., statistics)."""
+        """Return the same statistics of other specimens, (..., n) -> (..., statistics)."""
         return self.summary.values_of(specimens)
 
     @property

@@ -74,7 +74,8 @@ class Components:
                 f"{self.summary}: noise that the model also has, whose size is estimated from few "
                 "directions; leave metric= out, for the log-likelihood by specimen"
             )
-        # A factor of three is normal: components of few data leave out more of a population.
+        # Components of few data leave out more of the variance of a population than of the data, so
+        # that up to three times as much is normal.
         if population > 3 * LEFT_OUT:
             return (
                 f"{self.summary}, but {population:.2g} of that of the best population, which the "
@@ -268,7 +269,7 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
         shift = w @ x
         size, axes = _singular(x - shift, w)
         largest = max(size[0], np.abs(root).max())
-        if not size[-1] > 1e-13 * largest:  # the scatter is rounding alone
+        if not size[-1] > 1e-13 * largest:  # a combination has no scatter but rounding
             return location, root, root @ axes[-1]
         location = location + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)

@@ -503,7 +503,7 @@ def _read_answer(name: str, path: str, status: int, text: str) -> list[Any]:
         real(digits)
         return int(digits)
 
-    words = {"nan": "NaN", "inf": "Infinity"}  # servers in Python may write the former
+    words = {"nan": "NaN", "inf": "Infinity"}  # servers in Python may write nan and inf
     answer = None
     for form in (text, re.sub(r"\b(?:nan|inf)\b", lambda word: words[word[0]], text)):
         try:
