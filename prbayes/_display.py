@@ -74,11 +74,6 @@ def p_digits(p: float, alpha: float) -> int:
     return next(digits, 17)
 
 
-def html_of(shown: View) -> str:
-    """Return a view as HTML."""
-    return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
-
-
 class Shown:
     """A result that prints as sentences, and that a notebook shows as a table."""
 
@@ -92,10 +87,11 @@ class Shown:
         return str(self.to_view())
 
     def _repr_html_(self) -> str:
-        return html_of(self.to_view())
+        shown = self.to_view()
+        return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
 
 
-class ShownArray:
+class ShownArray(Shown):
     """An xarray object that prints as sentences; an incomplete selection prints as in xarray."""
 
     __slots__ = ()
@@ -106,10 +102,6 @@ class ShownArray:
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
 
-    def to_view(self) -> View:
-        """Return what a reader sees."""
-        raise NotImplementedError
-
     @property
     def _is_whole(self) -> bool:
         """Whether the result is complete, not a selection."""
@@ -119,7 +111,7 @@ class ShownArray:
 
     def __repr__(self) -> str:
         """Return sentences, or for a selection the text of xarray."""
-        return str(self.to_view()) if self._is_whole else super().__repr__()
+        return super().__repr__() if self._is_whole else super(Shown, self).__repr__()
 
     def __str__(self) -> str:
         return repr(self)
@@ -127,8 +119,8 @@ class ShownArray:
     def _repr_html_(self) -> str:
         """Return a table as HTML, or for a selection that of xarray."""
         if self._is_whole:
-            return html_of(self.to_view())
-        return str(super()._repr_html_())  # type: ignore[misc]
+            return super()._repr_html_()
+        return str(super(Shown, self)._repr_html_())  # type: ignore[misc]
 
 
 class Tree(ShownArray, xr.DataTree):  # type: ignore[misc]  # xarray gives __repr__ a level

@@ -129,24 +129,24 @@ def observed_sample(
     return array
 
 
-def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
+def observed_outputs(values: ArrayLike) -> Floats:
     """Return measured responses of several outputs, shape (N, m), or raise.
 
     NaN, or a mask, is an output that was not measured; +inf a specimen that failed there. Every
     specimen needs an output, and every output a finite value.
     """
-    array = real_array(values, name)
+    array = real_array(values, "observed")
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
-            f"{name}: got an array of shape {array.shape}, expected (N, m), a row for each "
+            f"observed: got an array of shape {array.shape}, expected (N, m), a row for each "
             f"specimen and a column for each output; {NO_POPULATION}"
         )
     if np.isneginf(array).any():
         raise ValueError(
-            f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
+            "observed: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
             "specimen that failed"
         )
-    refuse_huge(array, name)
+    refuse_huge(array, "observed")
     missing = np.isnan(array)
     for empty, problem, line in (
         (missing.all(axis=1), "specimens without any output", "row"),
@@ -155,7 +155,7 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     ):
         if empty.any():
             raise ValueError(
-                f"{name}: got {empty.sum()} {problem} ({line} {empty.argmax()} is one, counted "
+                f"observed: got {empty.sum()} {problem} ({line} {empty.argmax()} is one, counted "
                 "from 0), expected a number in each; leave them out"
             )
     return array

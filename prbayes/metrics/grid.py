@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from prbayes._validate import AT_ONCE, Floats, Ints
+from prbayes._validate import AT_ONCE, Floats, Ints, Shape
 
 # Coefficients of 1, t, t^2, t^3 of the four uniform cubic B-splines that are not zero at fraction t
 # between two nodes.
@@ -30,6 +30,13 @@ def product(weights: Floats, matrix: Floats) -> Floats:
     *batch, n = weights.shape
     rows = weights.reshape(math.prod(batch), n)
     return (rows @ matrix).reshape(*batch, matrix.shape[-1])
+
+
+def as_rows(values: Floats, shape: Shape) -> Floats:
+    """Return values, broadcast to a shape (..., n), as contiguous rows (rows, n) for a loop."""
+    *batch, n = shape
+    rows = np.broadcast_to(values, shape).reshape(math.prod(batch), n)
+    return np.ascontiguousarray(rows, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +94,17 @@ class KernelCells(Cells):
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above over the width of a cluster."""
-        *batch, n = sample.shape
-        rows = math.prod(batch)
+        *batch, _ = sample.shape
         nodes = self.centers.size
         # Bin the sample on the grid and the additional nodes.
-        values = np.ascontiguousarray(sample.reshape(rows, n), dtype=np.float64)
-        rows_of_weights = np.broadcast_to(weights, sample.shape).reshape(rows, n)
-        rows_of_weights = np.ascontiguousarray(rows_of_weights, dtype=np.float64)
-        counts = np.zeros((rows, nodes + 2 * self.margin))
-        outside = np.zeros((rows, 2))
-        count(values, rows_of_weights, self.low, 1 / self.step, self.margin, counts, outside)
+        values = as_rows(sample, sample.shape)
+        counts = np.zeros((len(values), nodes + 2 * self.margin))
+        outside = np.zeros((len(values), 2))
+        scale = 1 / self.step
+        rows_of_weights = as_rows(weights, sample.shape)
+        count(values, rows_of_weights, self.low, scale, self.margin, counts, outside)
         # Smooth the counts into densities on the grid, and into mass beyond its ends.
-        inner = np.zeros((rows, nodes))
+        inner = np.zeros((len(values), nodes))
         smooth(counts, self.kernel, -self.margin, inner)
         for side, mass in enumerate(self.mass_outside):
             reached = np.flatnonzero(mass)
@@ -144,12 +150,11 @@ class KernelCells(Cells):
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
         """Return the smoothed cotangent at the sample, or its derivative there."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        rows = math.prod(batch)
         n = sample.shape[-1]
         inner = self.centers.size
         nodes = inner + 2 * self.margin
         # Smooth the cotangent with the same kernel, because it is symmetric.
-        flat = np.ascontiguousarray(cotangent[..., :inner]).reshape(-1, inner)
+        flat = as_rows(cotangent[..., :inner], (*cotangent.shape[:-1], inner))
         smoothed = np.zeros((len(flat), nodes))
         smooth(flat, self.kernel, self.margin, smoothed)
         ends = cotangent[..., -2:] / self.widths[-1]
@@ -161,13 +166,10 @@ class KernelCells(Cells):
         if for_sample:
             spline = np.pad(_SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
             ends = np.zeros(2)
-        smoothed = np.broadcast_to(smoothed, (*batch, nodes)).reshape(rows, nodes)
-        padded = np.pad(smoothed, [(0, 0), (1, 2)])
+        padded = np.pad(as_rows(smoothed, (*batch, nodes)), [(0, 0), (1, 2)])
         cubics = np.stack([padded[:, k : k + nodes] for k in range(4)], axis=-1) @ spline
-        values = np.broadcast_to(sample, (*batch, n)).reshape(rows, n)
-        values = np.ascontiguousarray(values, dtype=np.float64)
-        ends = np.ascontiguousarray(np.broadcast_to(ends, (*batch, 2)).reshape(rows, 2))
-        out = np.empty((rows, n))
+        values, ends = as_rows(sample, (*batch, n)), as_rows(ends, (*batch, 2))
+        out = np.empty(values.shape)
         evaluate_cubics(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from prbayes._validate import Bools, Floats, Ints
@@ -34,14 +35,15 @@ class Readings:
 
     def rows(self, index: Ints) -> Readings:
         """Return the readings of selected specimens."""
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return self._mapped(lambda array: array[index])
 
     def at_columns(self, columns: Ints) -> Readings:
         """Return the readings of selected outputs of each specimen, (N, k)."""
-        selected = {
-            f.name: np.take_along_axis(getattr(self, f.name), columns, axis=1) for f in fields(self)
-        }
-        return replace(self, **selected)
+        return self._mapped(lambda array: np.take_along_axis(array, columns, axis=1))
+
+    def _mapped(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Readings:
+        """Return the readings with a function applied to each array."""
+        return Readings(*[function(getattr(self, f.name)) for f in fields(self)])
 
     @property
     def is_measured(self) -> Bools:

@@ -84,6 +84,11 @@ class Components:
         return ""
 
 
+def medians(sample: Floats, weights: Floats) -> Floats:
+    """Return the weighted median of each output, (n, m) -> (m,)."""
+    return np.array([quantile(y, weights, 0.5) for y in sample.T])
+
+
 def principal_components(
     sample: Floats, weights: Floats, outputs: Ints, number: int | None = None
 ) -> Components:
@@ -95,7 +100,7 @@ def principal_components(
     one for every five specimens.
     """
     n, m = sample.shape
-    middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
+    middle = medians(sample, weights)
     squares = ((sample - middle) ** 2).sum(axis=1)
     typical = float(quantile(squares, weights, 0.5))
     # The weights fall with the fourth power of the distance from the middle.
@@ -241,7 +246,7 @@ def units(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Float
 
     Arguments are those of `whitening`.
     """
-    center = np.array([quantile(y, weights, 0.5) for y in sample.T])
+    center = medians(sample, weights)
     # Scale by the range first, so that squares do not overflow in any unit.
     length = np.ptp(sample, axis=0)
     constant = outputs[~(length > 0)]

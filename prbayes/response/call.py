@@ -35,6 +35,8 @@ from prbayes.response.failures import Abort, Failure, OnFailure, Replace, Respon
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError
 
+type Function = Callable[..., Any]  # the user's response, or a part of it
+
 
 class scalar:  # noqa: N801 (reads as a function in a model)
     """Turn a function of one specimen's inputs into a response; also for external programs.
@@ -64,7 +66,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
            [ 0., 16.]])
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Function) -> None:
         if not callable(function):
             got = type(function).__name__
             raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
@@ -94,7 +96,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         return batch if outputs is None else outputs.by_key(batch)
 
 
-def unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+def unwrapped(function: Function) -> Function:
     """Return the function of one specimen inside a `scalar`; other functions unchanged."""
     return function.function if isinstance(function, scalar) else function
 
@@ -154,7 +156,7 @@ class Chunk:
 
 
 def compute(
-    function: Callable[..., Any] | bytes,
+    function: Function | bytes,
     points: Points,
     tolerant: bool,
     timeout: float | None = None,
@@ -349,7 +351,7 @@ def column_names(names: Sequence[str], sizes: Sequence[int]) -> tuple[str, ...]:
     return tuple(f"{x}[{i}]" if k > 1 else x for x, k in pairs for i in range(k))
 
 
-def packed(function: Callable[..., Any]) -> bytes:
+def packed(function: Function) -> bytes:
     """Return a function as bytes for another process."""
     import cloudpickle
 
@@ -365,7 +367,7 @@ class _Limited(io.BytesIO):
         return super().write(data)
 
 
-def written_form(function: Callable[..., Any]) -> bytes | None:
+def written_form(function: Function) -> bytes | None:
     """Return a function with the variables that it reads, as bytes; None if it has no such form.
 
     Variables of an imported module are not in it.
@@ -381,7 +383,7 @@ def written_form(function: Callable[..., Any]) -> bytes | None:
 
 
 @lru_cache(maxsize=8)  # a few functions, because a model may have several simulators
-def unpacked(payload: bytes) -> Callable[..., Any]:
+def unpacked(payload: bytes) -> Function:
     """Return a function from its bytes."""
     import cloudpickle
 
@@ -397,7 +399,7 @@ class CallSettings:
     """How a response is called."""
 
     name: str  # name of the simulator, for messages
-    function: Callable[..., Any]
+    function: Function
     executor: Executor | None = None  # executor of the calls; None computes in this process
     store: Store | None = None
     on_failure: OnFailure = field(default_factory=Abort)
@@ -758,7 +760,7 @@ def chunks(
     """
     # Other processes get the function as bytes, because pickle does not take lambdas.
     options: dict[str, Any] = {"outputs": settings.outputs}
-    function: Callable[..., Any] | bytes = settings.function
+    function: Function | bytes = settings.function
     if settings.executor is not None and not isinstance(settings.executor, ThreadPoolExecutor):
         function, options["timeout"] = packed(settings.function), settings.timeout
     work = partial(compute, function, **options)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats, called, real_array, unmasked
-from prbayes.response.call import scalar, unwrapped
+from prbayes.response.call import Function, scalar, unwrapped
 from prbayes.response.outputs import relabelled
 
 
@@ -78,7 +78,7 @@ class ModelDiscrepancy(ABC):
     def combined(self, response: Floats, value: Floats) -> Floats:
         """Return a response with its discrepancy."""
 
-    def of(self, response: Callable[..., Any], condition: ArrayLike) -> Callable[..., Any]:
+    def of(self, response: Function, condition: ArrayLike) -> Function:
         """Return a response with the discrepancy under a condition, and one more input.
 
         The last input is the coefficients: a ``.dist()``, whose hyperparameters are the size of the
@@ -221,7 +221,7 @@ class Corrected:
     """A response with its discrepancy under a condition; the last input is the coefficients."""
 
     def __init__(
-        self, response: Callable[..., Any], discrepancy: ModelDiscrepancy, condition: Floats
+        self, response: Function, discrepancy: ModelDiscrepancy, condition: Floats
     ) -> None:
         self.response = response
         self.discrepancy = discrepancy
@@ -280,11 +280,11 @@ class Corrected:
         return relabelled(self.discrepancy.combined(response, value), labelled)
 
 
-def has_discrepancy(function: Callable[..., Any]) -> bool:
+def has_discrepancy(function: Function) -> bool:
     """Return whether the last input of a function is the coefficients of a model discrepancy."""
     return isinstance(unwrapped(function), Corrected)
 
 
-def findings_of(function: Callable[..., Any]) -> tuple[Finding, ...]:
+def findings_of(function: Function) -> tuple[Finding, ...]:
     """Return the warnings that a function declares for its users."""
     return tuple(getattr(unwrapped(function), "findings", ()))

@@ -20,7 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import NO_POPULATION, Ints, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
-from prbayes.response.condition import is_condition
+from prbayes.response.condition import has_mark, is_condition
 from prbayes.response.pymc_dims import (
     foreign_variable,
     has_dims,
@@ -43,6 +43,8 @@ class Inputs:
         # An argument is an int (its position in ``aleatory``), a variable (epistemic) or an array.
         self.arguments = tuple(arguments)
         self.aleatory = tuple(aleatory)  # distinct ``.dist()`` objects
+        # Sources of the arguments: a ``.dist()``, a variable or an array.
+        self.sources = [aleatory[a] if isinstance(a, int) else a for a in self.arguments]
         self.epistemic: tuple[TensorVariable, ...] = tuple(
             [a for a in self.arguments if isinstance(a, Variable)]
         )
@@ -80,8 +82,7 @@ class Inputs:
         ends: set[Variable] = set(self.parents)
         parents: dict[TensorVariable, None] = {}
         for position in positions:
-            argument = self.arguments[position]
-            x = self.aleatory[argument] if isinstance(argument, int) else argument
+            x = self.sources[position]
             if isinstance(x, Variable):
                 parents.update((v, None) for v in _ancestry([x], ends) if v in ends)
         return tuple(parents)
@@ -321,8 +322,7 @@ def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         arguments = [p.name for p in parameters if p.kind in positional]
     names = []
-    for place, argument in enumerate(inputs.arguments):
-        x = inputs.aleatory[argument] if isinstance(argument, int) else argument
+    for place, x in enumerate(inputs.sources):
         by_place = arguments[place] if place < len(arguments) else f"input {place + 1}"
         names.append(str(getattr(x, "name", None) or by_place))
     return names
@@ -492,8 +492,7 @@ def group(dim: str) -> TensorVariable:
 
 def is_group(variable: Variable) -> bool:
     """Return whether a variable is the group of a specimen."""
-    # Not isinstance: a module may be loaded twice, and then has two classes.
-    return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
+    return has_mark(variable, "is_group")
 
 
 def is_known(variable: Variable) -> bool:

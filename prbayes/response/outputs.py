@@ -185,8 +185,7 @@ def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
         if labels == tuple(range(len(labels))):
             return None
         dim = str(result.dims[axis]) if hasattr(result, "dims") else "output"
-        are_names = all(isinstance(label, str) for label in labels)
-        return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else ())
+        return Outputs(labels, dim, _keys_of(labels))
     keys: list[tuple[str, int | None]] = []
     for key, column in result.items():
         array = np.asarray(column)
@@ -200,6 +199,12 @@ def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
     for key, size in keys:
         labels += [key] if size is None else [f"{key}[{i}]" for i in range(size)]
     return Outputs(tuple(labels), keys=tuple(keys))
+
+
+def _keys_of(labels: Sequence[Any]) -> tuple[tuple[str, int | None], ...]:
+    """Return a key for each label if all are texts, else no keys."""
+    are_names = all(isinstance(label, str) for label in labels)
+    return tuple((label, None) for label in labels) if are_names else ()
 
 
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
@@ -267,9 +272,7 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
         dim = str(getattr(observed.columns, "name", None) or dim)
     else:
         return Outputs(labels)
-    are_names = all(isinstance(label, str) for label in labels)
-    keys = tuple((x, None) for x in labels) if are_names else ()
-    return Outputs(labels, dim, keys, units or _units_in(observed, labels))
+    return Outputs(labels, dim, _keys_of(labels), units or _units_in(observed, labels))
 
 
 def in_order_of(values: Any, observed: Any, name: str, *, reference: str = "observed") -> Any:

@@ -21,6 +21,7 @@ from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
     CallSettings,
+    Function,
     Points,
     Tally,
     array_advice,
@@ -129,7 +130,7 @@ class Responses:
     def __init__(
         self,
         name: str,
-        function: Callable[..., Any],
+        function: Function,
         inputs: Inputs,
         *,
         executor: Executor | None = None,
@@ -235,20 +236,13 @@ class Responses:
         """Return whether function, inputs, constants and order of outputs are the same."""
         # Arrays of a mapping are concatenated in the order of the observed outputs.
         keys = {r.outputs.keys for r in (self, other) if r.outputs is not None}
-        arguments, other_arguments = self.inputs.arguments, other.inputs.arguments
+        sources, other_sources = self.inputs.sources, other.inputs.sources
         if self.function is not other.function or len(keys) > 1:
             return False
-        if len(arguments) != len(other_arguments):
-            return False
-        for x, y in zip(arguments, other_arguments, strict=True):
-            if isinstance(x, int) and isinstance(y, int):
-                x, y = self.inputs.aleatory[x], other.inputs.aleatory[y]
-            if isinstance(x, int | Variable) or isinstance(y, int | Variable):
-                if x is not y:
-                    return False
-            elif not np.array_equal(x, y):
-                return False
-        return True
+        return len(sources) == len(other_sources) and all(
+            x is y if isinstance(x, Variable) or isinstance(y, Variable) else np.array_equal(x, y)
+            for x, y in zip(sources, other_sources, strict=True)
+        )
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""

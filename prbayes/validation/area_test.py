@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from prbayes.model.fingerprint import Identity, as_attributes
 from prbayes.model.locking import locked
 from prbayes.results.predict import data_digest
 from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
-from prbayes.validation.pit import DIRECTION, Case, Predicted, read_case
+from prbayes.validation.pit import DIRECTION, ByCondition, Case, Predicted, read_case
 
 
 @without_constructor
@@ -136,15 +135,12 @@ class ValidityTest(Shown):
 
 @locked
 def area_test(
-    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
-    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
+    observed: ByCondition[ArrayLike],
+    predicted: ByCondition[Predicted],
     *,
     alpha: float = 0.05,
     null: Null | None = None,
-    specimens: ArrayLike
-    | Mapping[str, ArrayLike | None]
-    | Sequence[ArrayLike | None]
-    | None = None,
+    specimens: ByCondition[ArrayLike | None] = None,
     folded: bool = False,
     randomize: bool = False,
     random_seed: Seed = 0,

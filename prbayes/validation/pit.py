@@ -36,6 +36,9 @@ from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
 
 Predicted = xr.DataArray | NDArray[Any]
+type ByCondition[T] = (
+    T | Mapping[str, T] | Sequence[T]
+)  # one condition, or several by name or in order
 
 # Text between the name of a condition and the number of a projection of its outputs.
 DIRECTION = ", direction "
@@ -224,8 +227,8 @@ def read_case(
 
 
 def u_values(
-    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
-    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
+    observed: ByCondition[ArrayLike],
+    predicted: ByCondition[Predicted],
     *,
     randomize: bool = False,
     random_seed: Seed = 0,
