@@ -36,9 +36,8 @@ from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
 
 Predicted = xr.DataArray | NDArray[Any]
-type ByCondition[T] = (
-    T | Mapping[str, T] | Sequence[T]
-)  # one condition, or several by name or in order
+# An argument of one condition, or of several conditions by name or in their order.
+type ByCondition[T] = T | Mapping[str, T] | Sequence[T]
 
 # Text between the name of a condition and the number of a projection of its outputs.
 DIRECTION = ", direction "
