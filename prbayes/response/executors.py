@@ -162,8 +162,10 @@ def _watchdog(seconds: float) -> Iterator[None]:
 def _set_watchdog() -> None:
     faulthandler.cancel_dump_traceback_later()
     if _deadlines:
-        left = max(min(_deadlines.values()) - time.monotonic(), 1e-3)  # the watchdog takes no zero
-        faulthandler.dump_traceback_later(left, exit=True, file=_devnull())
+        remaining = max(
+            min(_deadlines.values()) - time.monotonic(), 1e-3
+        )  # the watchdog takes no zero
+        faulthandler.dump_traceback_later(remaining, exit=True, file=_devnull())
 
 
 @lru_cache(maxsize=1)

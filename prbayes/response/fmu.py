@@ -165,18 +165,18 @@ def fmu(
 # -- arguments -------------------------------------------------------------------------------------
 
 
-def _names(argument: str, given: object) -> dict[str, str]:
+def _names(argument: str, value: object) -> dict[str, str]:
     """Return variables of the unit by the user's names, which in a list are the same."""
     pairs: list[tuple[Any, Any]] = []
     expected = 'a list of the unit\'s variables, each once, such as ["stiffness", "damping"]'
-    if isinstance(given, Mapping) and argument == "outputs":
-        pairs = list(given.items())
+    if isinstance(value, Mapping) and argument == "outputs":
+        pairs = list(value.items())
         expected += ", or a mapping of names to these"
-    elif isinstance(given, Sequence) and not isinstance(given, str):
-        pairs = [(name, name) for name in given]
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        pairs = [(name, name) for name in value]
     are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
     if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
-        raise TypeError(f"fmu: {argument}: got {called(given)}, expected {expected}")
+        raise TypeError(f"fmu: {argument}: got {called(value)}, expected {expected}")
     return dict(pairs)
 
 

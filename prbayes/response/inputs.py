@@ -246,9 +246,11 @@ def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) 
     return list(walk(variables, parents))
 
 
-def _refuse_named_expressions(label: str, known: Sequence[Variable], model: pm.Model) -> None:
+def _refuse_named_expressions(
+    label: str, of_specimens: Sequence[Variable], model: pm.Model
+) -> None:
     """Refuse a `pymc.Deterministic` that depends on a specimen: it has no single value."""
-    for variable in known:
+    for variable in of_specimens:
         for expression in model.deterministics:
             if variable in ancestors([expression]):
                 raise TypeError(

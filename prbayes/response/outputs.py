@@ -117,7 +117,7 @@ def relabelled(values: Any, like: Any) -> Any:
     return type(like)(values, index=like.index, **columns)
 
 
-def output_order(labels: Sequence[Any], expected: Sequence[Any], found: str) -> Ints | None:
+def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) -> Ints | None:
     """Return the positions of the expected labels among the labels.
 
     None if both are equal, or if one of them has no labels but 0, 1, ... Numbers are equal up to
@@ -135,7 +135,7 @@ def output_order(labels: Sequence[Any], expected: Sequence[Any], found: str) -> 
     elif set(labels) == set(expected) and len(set(labels)) == len(labels):
         return np.array([labels.index(label) for label in expected], dtype=np.intp)
     raise KeyError(
-        f"{found} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
+        f"{prefix} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
     )
 
 

@@ -100,10 +100,10 @@ def is_random(variable: Variable) -> bool:
     )
 
 
-def foreign_variable(x: Any, own: set[Variable]) -> Variable | None:
+def foreign_variable(x: Any, model_variables: set[Variable]) -> Variable | None:
     """Return a variable of another model, with dimensions, that an input depends on; else None."""
-    for v in ancestors([x], blockers=own):
-        is_named = v is not x and v not in own and v.name and has_dims(v)
-        if is_named and any(map(is_random, ancestors([v], blockers=own))):
+    for v in ancestors([x], blockers=model_variables):
+        is_named = v is not x and v not in model_variables and v.name and has_dims(v)
+        if is_named and any(map(is_random, ancestors([v], blockers=model_variables))):
             return v
     return None

@@ -497,23 +497,25 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
         )
 
 
-def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
-    pairs = zip(arrays, others, strict=True)
+def _equal(first: Sequence[Floats], second: Sequence[Floats]) -> bool:
+    pairs = zip(first, second, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def deduplicated_responses(
-    responses: Responses, points: Sequence[Floats], known: tuple[Sequence[Floats], Floats] | None
+    responses: Responses, points: Sequence[Floats], stored: tuple[Sequence[Floats], Floats] | None
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m); equal points are computed once.
 
-    ``known`` is a pair of points and their responses, which are not computed again.
+    ``stored`` is a pair of points and their responses, which are not computed again.
     """
     n = len(points[0])
-    known_points, known_values = ([x[:0] for x in points], np.empty(0)) if known is None else known
-    m = len(known_values)
+    stored_points, stored_values = (
+        ([x[:0] for x in points], np.empty(0)) if stored is None else stored
+    )
+    m = len(stored_values)
     # Compare points by the bits of all their numbers; adding zero turns -0.0 into 0.0.
-    columns = [np.concatenate([x[:m], y]) for x, y in zip(known_points, points, strict=True)]
+    columns = [np.concatenate([x[:m], y]) for x, y in zip(stored_points, points, strict=True)]
     columns = [x.reshape(m + n, math.prod(x.shape[1:])) for x in columns]
     bits = np.concatenate(columns, axis=1, dtype=np.float64) + 0.0
     keys = bits.view(np.dtype((np.void, bits.dtype.itemsize * bits.shape[1]))).ravel()
@@ -523,9 +525,9 @@ def deduplicated_responses(
     if is_new.all():
         return responses(points, [])
     new = np.flatnonzero(is_new)
-    computed = responses([x[new] for x in points], []) if new.size else known_values[:0]
+    computed = responses([x[new] for x in points], []) if new.size else stored_values[:0]
     values = np.full((m + n, *computed.shape[1:]), np.nan)
-    values[:m] = known_values.reshape(m, *computed.shape[1:])
+    values[:m] = stored_values.reshape(m, *computed.shape[1:])
     values[m + new] = computed
     responses.count_reused(n - new.size)
     return values[earliest[m:]]

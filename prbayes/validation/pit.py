@@ -346,15 +346,15 @@ def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[s
             )
         name = getattr(predicted, "name", None)
         return [(str(name) if name else "observed", observed, predicted, specimens)]
-    for argument, given in (("observed", observed), ("specimens", specimens)):
-        if given is None and argument == "specimens":
+    for argument, values in (("observed", observed), ("specimens", specimens)):
+        if values is None and argument == "specimens":
             continue
-        names = _names(given) if isinstance(given, Mapping) == is_mapping else None
+        names = _names(values) if isinstance(values, Mapping) == is_mapping else None
         # In a mapping of labels some conditions may be missing.
         is_partial = argument == "specimens" and is_mapping
         keys = set(names or ())
         if not keys or not keys <= set(expected) or (keys != set(expected) and not is_partial):
-            got = type(given).__name__
+            got = type(values).__name__
             if names is not None:
                 got = str(sorted(map(str, names))) if is_mapping else f"{len(names)} conditions"
             kind = "mapping" if is_mapping else "list"
