@@ -210,21 +210,16 @@ def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
 # -- batches ---------------------------------------------------------------------------------------
 
 
-def parameter_checks(graphs: Sequence[TensorVariable]) -> Iterator[tuple[Any, Any, list[Any]]]:
-    """Yield PyMC's checks of parameters in graphs: variable, value and scalar conditions."""
+def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
+    """Replace PyMC's parameter checks by -inf, so that one invalid theta spoils no batch."""
     from pymc.logprob.utils import CheckParameterValue
 
+    switches: dict[Variable, Variable] = {}
     for v in ancestors(graphs):
         if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
             value, *conditions = v.owner.inputs
-            yield v, value, [pt.all(c) for c in conditions]
-
-
-def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
-    """Replace PyMC's parameter checks by -inf, so that one invalid theta spoils no batch."""
-    switches: dict[Variable, Variable] = {}
-    for v, value, conditions in parameter_checks(graphs):
-        switches[v] = pt.switch(pt.all(conditions), value, -np.inf)
+            valid = pt.all([pt.all(c) for c in conditions])
+            switches[v] = pt.switch(valid, value, -np.inf)
     if not switches:
         return list(graphs)
     return list(graph_replace(list(graphs), switches, strict=False))

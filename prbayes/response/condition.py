@@ -234,10 +234,5 @@ def refuse_vectors_of_specimens(
 
 def is_condition(variable: Variable) -> bool:
     """Return whether a variable is a condition of a specimen."""
-    return has_mark(variable, "is_condition")
-
-
-def has_mark(variable: Variable, mark: str) -> bool:
-    """Return whether the operation that makes a variable has an attribute that is true."""
     # Not isinstance: a module may be loaded twice, and then has two classes.
-    return variable.owner is not None and getattr(variable.owner.op, mark, False)
+    return variable.owner is not None and getattr(variable.owner.op, "is_condition", False)

@@ -19,13 +19,7 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
-from prbayes.response.compile import (
-    PLAIN,
-    compile_batched,
-    interpreted,
-    parameter_checks,
-    with_leading_axis,
-)
+from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
 from prbayes.response.condition import is_condition
 from prbayes.response.inputs import Inputs, event_shape, quiet_logp
 from prbayes.response.pymc_dims import is_random, without_dims
@@ -196,11 +190,16 @@ def refuse_without_density(name: str, inputs: Inputs) -> None:
 
 def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
     """Return whether the parameters of all aleatory inputs are valid, a boolean scalar."""
+    from pymc.logprob.utils import CheckParameterValue
+
     if inputs.nested:
         return pt.constant(True)
     # The densities contain checks of their parameters, such as sigma > 0.
     densities = [density for d in aleatory if (density := _density(d)) is not None]
-    conditions = [c for *_, scalars in parameter_checks(densities) for c in scalars]
+    conditions = []
+    for v in ancestors(densities):
+        if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
+            conditions += [pt.all(c) for c in v.owner.inputs[1:]]
     return pt.all(conditions) if conditions else pt.constant(True)
 
 

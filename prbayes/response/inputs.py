@@ -20,7 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import NO_POPULATION, Ints, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
-from prbayes.response.condition import has_mark, is_condition
+from prbayes.response.condition import is_condition
 from prbayes.response.pymc_dims import (
     foreign_variable,
     has_dims,
@@ -494,7 +494,8 @@ def group(dim: str) -> TensorVariable:
 
 def is_group(variable: Variable) -> bool:
     """Return whether a variable is the group of a specimen."""
-    return has_mark(variable, "is_group")
+    # Not isinstance: a module may be loaded twice, and then has two classes.
+    return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
 
 
 def is_known(variable: Variable) -> bool:
