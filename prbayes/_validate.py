@@ -19,9 +19,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
-Shape = tuple[int, ...]
+Indices = NDArray[np.intp]
 
 # Largest number of values in memory if work is done in blocks: 32 MiB. A comment says so where the
 # size of the blocks changes results.
@@ -36,6 +35,8 @@ NO_POPULATION = (
 IN_CACHE = 1 << 18
 # Largest measured value, so that sums of squares stay finite.
 _LARGEST = 1e152
+
+Shape = tuple[int, ...]  # sizes of the axes of an array
 
 
 def called(value: object) -> str:

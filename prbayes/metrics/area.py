@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, Floats, Ints
+from prbayes._validate import AT_ONCE, Floats, Indices
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -202,8 +202,8 @@ class _Integral:
     Between two simulated values F is constant, so that S_N, which increases, crosses it once.
     """
 
-    order: Ints  # order of the simulated values, (n,)
-    edges: Ints  # first knots of the intervals in which F is constant, and the end, (n + 2,)
+    order: Indices  # order of the simulated values, (n,)
+    edges: Indices  # first knots of the intervals in which F is constant, and the end, (n + 2,)
     observed: Floats  # S_N at the knots, (m,)
     positions: Floats  # distances of the knots from the first one, (m + 1,)
     integral: Floats  # integral of S_N up to each knot, (m + 1,)
@@ -211,8 +211,8 @@ class _Integral:
     @classmethod
     def of(
         cls,
-        order: Ints,
-        below: Ints,
+        order: Indices,
+        below: Indices,
         observed: Floats,
         lengths: Floats,
     ) -> _Integral:
@@ -334,7 +334,7 @@ def _rows_summed_below(ordered: Any, below: Any, xp: Any) -> Any:
 
 
 @compiled
-def sum_below(weights: Floats, order: Ints, below: Ints, out: Floats) -> None:
+def sum_below(weights: Floats, order: Indices, below: Indices, out: Floats) -> None:
     """Write sums of the first ``below`` weights in a given order into ``out``, (rows, m).
 
     The weights have the shape (rows, n), the order (n,), and ``below`` (m,).

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from prbayes._validate import (
     AT_ONCE,
     Floats,
-    Ints,
+    Indices,
     Shape,
     observed_outputs,
     observed_sample,
@@ -37,7 +37,7 @@ from prbayes.metrics.grid import product
 class Projection:
     """A linear combination of some of the outputs after subtraction of a center."""
 
-    outputs: Ints  # indices of the outputs, (p,)
+    outputs: Indices  # indices of the outputs, (p,)
     caps: Floats  # values that stand for a failed specimen, (p,)
     # Values that are subtracted, (p,). Projections of the same outputs share the array, so that
     # these outputs are centred once for all of them.
@@ -53,7 +53,7 @@ class Projection:
         """Return the combination, (..., n, m) -> (..., n)."""
         return self.centered(simulated, xp) @ self.direction
 
-    def observed_of(self, values: Floats) -> tuple[Floats, Ints]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Indices]:
         """Return the projection of observed values, and the rows that have all its outputs."""
         index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
         return self.of(values[index]), index
@@ -95,7 +95,7 @@ class Part:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
         return simulated if self.projection is None else self.projection.of(simulated, xp)
 
-    def observed_of(self, values: Floats) -> tuple[Floats, Ints]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Indices]:
         """Return the projection of observed values, (n, m) -> (n',), and the rows that have it."""
         if self.projection is None:
             return values, np.arange(len(values))

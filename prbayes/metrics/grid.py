@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from prbayes._validate import AT_ONCE, Floats, Ints, Shape
+from prbayes._validate import AT_ONCE, Floats, Indices, Shape
 
 # Coefficients of 1, t, t^2, t^3 of the four uniform cubic B-splines that are not zero at fraction t
 # between two nodes.
@@ -195,7 +195,7 @@ class BinCells(Cells):
         """Return the weight of the points in each bin."""
         return self.density(np.broadcast_to(points, weights.shape), weights) * self.widths
 
-    def _cell(self, sample: Floats) -> Ints:
+    def _cell(self, sample: Floats) -> Indices:
         """Return cell numbers: bins, then below, above, and NaN."""
         bins = self.centers.size
         # Positions in widths from the lower edge.

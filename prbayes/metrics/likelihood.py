@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._validate import Floats, Ints, Shape, flag, real_array
+from prbayes._validate import Floats, Indices, Shape, flag, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import (
     CellwiseDiscrepancy,
@@ -147,7 +147,7 @@ class LogLikelihood(Metric):
         """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
 
-    def of_frequencies(self, rows: Ints, n: int) -> LogLikelihood:
+    def of_frequencies(self, rows: Indices, n: int) -> LogLikelihood:
         """Return the likelihood of data with frequencies: specimen i has row ``rows[i]`` of n.
 
         Arrays with an element for each row get one for each specimen.

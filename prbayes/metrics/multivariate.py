@@ -13,7 +13,7 @@ from prbayes._validate import (
     AT_ONCE,
     Bools,
     Floats,
-    Ints,
+    Indices,
     called,
     positive_integer,
     real_array,
@@ -359,7 +359,7 @@ class Joint(Metric):
         self,
         sample: Floats,
         weights: Floats,
-        outputs: Ints,
+        outputs: Indices,
         caps: Floats,
         n_inputs: int | None,
     ) -> tuple[_Coordinates, list[Components]]:
@@ -386,7 +386,7 @@ def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> 
     return principal.center + principal.axes @ center, principal.axes @ axes
 
 
-def _flat(sample: Floats, weights: Floats, outputs: Ints, n_inputs: int) -> _Coordinates | None:
+def _flat(sample: Floats, weights: Floats, outputs: Indices, n_inputs: int) -> _Coordinates | None:
     """Return white coordinates of the surface on which outputs of fewer inputs lie.
 
     Whitening of all outputs would give the bend of the surface the same weight as the positions of
@@ -403,7 +403,7 @@ def _flat(sample: Floats, weights: Floats, outputs: Ints, n_inputs: int) -> _Coo
     return None
 
 
-def patterns(observed: Floats, weights: Floats) -> list[tuple[Ints, float]]:
+def patterns(observed: Floats, weights: Floats) -> list[tuple[Indices, float]]:
     """Return the sets of outputs that are compared, and the share of each, (N, m), (N,).
 
     Specimens with the same measured outputs form a set. Sets are replaced by their intersections if

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from prbayes._validate import Bools, Floats, Ints
+from prbayes._validate import Bools, Floats, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,11 @@ class Readings:
     def __len__(self) -> int:
         return len(self.values)
 
-    def rows(self, index: Ints) -> Readings:
+    def rows(self, index: Indices) -> Readings:
         """Return the readings of selected specimens."""
         return self._mapped(lambda array: array[index])
 
-    def at_columns(self, columns: Ints) -> Readings:
+    def at_columns(self, columns: Indices) -> Readings:
         """Return the readings of selected outputs of each specimen, (N, k)."""
         return self._mapped(lambda array: np.take_along_axis(array, columns, axis=1))
 
@@ -186,7 +186,7 @@ def side_by_side(records: Sequence[Any]) -> Any:
 
 
 def averaged(
-    readings: Readings, scale: Floats, numbers: Ints, count: Ints
+    readings: Readings, scale: Floats, numbers: Indices, count: Indices
 ) -> tuple[Readings, Floats, Repeats]:
     """Return readings of S specimens, in which repeated ones are averaged, and their scale, (S, m).
 

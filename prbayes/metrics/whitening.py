@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 
 from prbayes._finding import counted
 from prbayes._stats import quantile
-from prbayes._validate import Floats, Ints
+from prbayes._validate import Floats, Indices
 from prbayes.metrics.density import spread
 
 # Largest number of outputs that are compared without principal components. Eight outputs need
@@ -32,7 +32,7 @@ class Components:
     # Correlation of neighbouring outputs in the remainder of the data, which is near zero for
     # noise.
     rest_correlation: float
-    outputs: Ints  # indices of the outputs of a specimen, (m,)
+    outputs: Indices  # indices of the outputs of a specimen, (m,)
 
     @property
     def number(self) -> int:
@@ -90,7 +90,7 @@ def medians(sample: Floats, weights: Floats) -> Floats:
 
 
 def principal_components(
-    sample: Floats, weights: Floats, outputs: Ints, number: int | None = None
+    sample: Floats, weights: Floats, outputs: Indices, number: int | None = None
 ) -> Components:
     """Return principal components of observed outputs, (n, m).
 
@@ -155,7 +155,7 @@ def principal_components(
 _DEGREES = (1.0, 3.0, np.inf)
 
 
-def whitening(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Floats]:
+def whitening(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
     """Return center and axes of invariant coordinates ``(y - center) @ axes`` of a sample, (n, m).
 
     They are the same, to rounding, after any invertible affine map of the outputs: location and
@@ -241,7 +241,7 @@ def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     return np.asarray(axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean()))
 
 
-def units(sample: Floats, weights: Floats, outputs: Ints) -> tuple[Floats, Floats]:
+def units(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
     """Return a median and a robust spread of each output, or raise for one without spread.
 
     Arguments are those of `whitening`.
@@ -299,6 +299,6 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return size, axes
 
 
-def _listed(outputs: Ints) -> str:
+def _listed(outputs: Indices) -> str:
     """Return the numbers of outputs for a message."""
     return ", ".join(map(str, outputs.tolist()))

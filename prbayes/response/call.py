@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import NO_POPULATION, Bools, Floats, Ints, Shape, unmasked
+from prbayes._validate import NO_POPULATION, Bools, Floats, Indices, Shape, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -112,7 +112,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.arguments[list(self.varying).index(True)])
 
-    def at(self, rows: Ints | int) -> Points:
+    def at(self, rows: Indices | int) -> Points:
         """Return the points at some rows; a number selects one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
@@ -202,7 +202,7 @@ def compute(
     return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
-def assign_rows(values: Floats, rows: Ints, responses: Floats) -> Floats:
+def assign_rows(values: Floats, rows: Indices, responses: Floats) -> Floats:
     """Replace some rows of values by responses; add an axis of outputs if these have one."""
     if values.ndim == 1 and responses.ndim > 1:
         values = np.repeat(values[:, None], responses.shape[1], axis=1)
@@ -391,7 +391,7 @@ def unpacked(payload: bytes) -> Function:
 
 
 # A finished chunk, with the rows of its points.
-type Finished = tuple[Ints, Chunk]
+type Finished = tuple[Indices, Chunk]
 
 
 @dataclass(frozen=True)
@@ -522,7 +522,7 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
     usable = np.flatnonzero(is_comparable)
     reasons: dict[int, str] = {}
 
-    def compute(selected: Ints) -> Floats:
+    def compute(selected: Indices) -> Floats:
         again, raised = computed_again(settings, stored_points.at(usable[selected]), tally)
         reasons.update({int(selected[i]): reason for i, reason in raised.items()})
         return again
@@ -571,7 +571,7 @@ def by_output(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def revealing_rows(values: Floats) -> Ints:
+def revealing_rows(values: Floats) -> Indices:
     """Return rows of responses, (n,) or (n, m), at which a change of the function can show.
 
     The largest, the middle and the smallest response, one that is NaN and one that is infinite.
@@ -589,7 +589,7 @@ def revealing_rows(values: Floats) -> Ints:
     return np.array(list(dict.fromkeys(np.concatenate(selected).tolist())), dtype=np.intp)
 
 
-def finite_runs(values: Floats) -> Ints:
+def finite_runs(values: Floats) -> Indices:
     """Return the rows of responses, (n,) or (n, m), all outputs of which are finite."""
     return np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
 
@@ -623,7 +623,7 @@ def first_change(values: Floats, again: Floats, tolerance: Any) -> int | None:
 
 def changed_run(
     values: Floats,
-    compute: Callable[[Ints], Floats],
+    compute: Callable[[Indices], Floats],
     share: float = 0.0,
     *,
     may_fail: bool = False,
@@ -751,7 +751,7 @@ def chunk_size(settings: CallSettings, tally: Tally, n_left: int, workers: int) 
 
 
 def chunks(
-    settings: CallSettings, points: Points, rows: Ints, tolerant: bool, tally: Tally
+    settings: CallSettings, points: Points, rows: Indices, tolerant: bool, tally: Tally
 ) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
@@ -768,10 +768,10 @@ def chunks(
     pool = Pool(settings.name, settings.executor)
     # Chunks in progress when a worker was lost: they are repeated one at a time, so that the point
     # that ends its worker is found.
-    suspects: list[Ints] = []
-    suspect: Ints | None = None  # the suspected chunk in progress
+    suspects: list[Indices] = []
+    suspect: Indices | None = None  # the suspected chunk in progress
     loss: BaseException | None = None
-    begun: dict[Future[Chunk], Ints] = {}
+    begun: dict[Future[Chunk], Indices] = {}
     waiting = rows
     error: BaseException | None = None
     with progress(f"responses of {settings.name}", rows.size) as report:

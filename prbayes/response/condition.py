@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
-from prbayes._validate import Floats, Ints, plain_text, real_array
+from prbayes._validate import Floats, Indices, plain_text, real_array
 from prbayes.response.outputs import specimen_index
 
 
@@ -62,7 +62,7 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
 class ReadingsCondition(TensorConstant):  # type: ignore[misc]
     """The sorted values of a vector condition, (G,), with the value of each reading."""
 
-    columns: Ints  # index of the value of each reading, (N, T); -1 marks a missing reading
+    columns: Indices  # index of the value of each reading, (N, T); -1 marks a missing reading
 
 
 def condition(name: str, values: ArrayLike) -> TensorVariable:
@@ -167,7 +167,7 @@ def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVar
 
 
 def known_covariates(
-    name: str, covariates: Sequence[Any], size: int, rows: Ints | None
+    name: str, covariates: Sequence[Any], size: int, rows: Indices | None
 ) -> dict[str, Floats]:
     """Return the values of covariates for each specimen, (N,), by name.
 

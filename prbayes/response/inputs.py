@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import NO_POPULATION, Ints, Shape, plain_text, real_array
+from prbayes._validate import NO_POPULATION, Indices, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
 from prbayes.response.pymc_dims import (
@@ -535,7 +535,7 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
         )
 
 
-def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Ints, Any]:
+def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups."""
     labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]

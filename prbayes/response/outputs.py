@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Bools, Floats, Ints, Shape, first_text, real_array, unmasked
+from prbayes._validate import Bools, Floats, Indices, Shape, first_text, real_array, unmasked
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def relabelled(values: Any, like: Any) -> Any:
     return type(like)(values, index=like.index, **columns)
 
 
-def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) -> Ints | None:
+def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) -> Indices | None:
     """Return the positions of the expected labels among the labels.
 
     None if both are equal, or if one of them has no labels but 0, 1, ... Numbers are equal up to

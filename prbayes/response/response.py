@@ -16,7 +16,7 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, Ints, Shape, called, executes, folder_path
+from prbayes._validate import Floats, Indices, Shape, called, executes, folder_path
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
@@ -103,7 +103,7 @@ def check_call_settings(
 
 
 @dataclass
-class SharedRuns:
+class StoredRuns:
     """Runs of a response that simulators with the same inputs and settings share."""
 
     # Pairs of points, (n, *event) for each aleatory input, and their responses, (n,) or (n, m).
@@ -178,7 +178,7 @@ class Responses:
         # Function of the number of runs of a call and the seconds of one run, for progress; the
         # seconds are NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
-        self.runs = SharedRuns()
+        self.runs = StoredRuns()
         self._is_checked = False
         self._written_form = written_form(function)
         self._n_reused = 0
@@ -193,7 +193,7 @@ class Responses:
         """Return a copy with its own counts and the same executor and store."""
         duplicate = copy.copy(self)
         duplicate._tally = self._tally.copied()
-        duplicate.runs = SharedRuns(list(self.runs.stored), users=set(self.runs.users))
+        duplicate.runs = StoredRuns(list(self.runs.stored), users=set(self.runs.users))
         return duplicate
 
     def share(self, other: Responses) -> None:
@@ -351,7 +351,7 @@ class Responses:
             raise ResponseError(f"{self.name}: {error}") from None
         return responses
 
-    def _again(self, values: Sequence[Floats], rows: Ints) -> Floats:
+    def _again(self, values: Sequence[Floats], rows: Indices) -> Floats:
         """Compute some specimens, (n, *event) by input, again; NaN where the response raises.
 
         The calls are not counted as runs, and are not stored.
@@ -364,7 +364,7 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _by_itself(self, values: Sequence[Floats], rows: Ints, copies: int) -> Floats:
+    def _by_itself(self, values: Sequence[Floats], rows: Indices, copies: int) -> Floats:
         """Compute specimens again; if a function takes no batch of one, as several copies."""
         try:
             return self._again(values, rows)
@@ -481,7 +481,7 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
     They do if the response is random, or if it depends on the other specimens of a call.
     """
 
-    def compute(rows: Ints) -> Floats:
+    def compute(rows: Indices) -> Floats:
         with unlimited():
             return computed_again(settings, points.at(rows), tally.copied())[0]
 

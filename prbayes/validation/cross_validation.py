@@ -13,7 +13,7 @@ from prbayes._display import Table, View
 from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats, Ints, Seed, called, flag, positive_integer, seed_number
+from prbayes._validate import Floats, Indices, Seed, called, flag, positive_integer, seed_number
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets, specimens
 from prbayes.metrics.base import Discrepancy, Metric, Part
@@ -193,7 +193,7 @@ def most_folds(optimum: Optimum, limit: int) -> int:
 
 def _folds(
     simulators: Sequence[PopulationSimulator], folds: int, random_seed: int
-) -> tuple[list[Floats], list[Floats], Ints]:
+) -> tuple[list[Floats], list[Floats], Indices]:
     """Assign specimens to folds at random.
 
     Return by simulator the weights of held-out observations, (folds, n_k), and those of the other
@@ -511,7 +511,7 @@ def log_scores(
     target: Discrepancy,
     values: Floats,
     weights: Floats,
-    rows: Ints,
+    rows: Indices,
     gross: float = 0.1,
 ) -> Floats:
     """Return scores of observations, (r,), under a population of values (n,) or (n, m).

@@ -18,7 +18,7 @@ from prbayes._progress import progress, shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
-    Ints,
+    Indices,
     Seed,
     Shape,
     called,
@@ -263,7 +263,7 @@ class Fleet:
             advance()
         return results
 
-    def _rows(self, name: str) -> Ints:
+    def _rows(self, name: str) -> Indices:
         """Return the rows of a product among the specimens of all."""
         names = list(self.observed)
         sizes = [len(values) for values in self.observed.values()]
@@ -377,7 +377,7 @@ def _common_likelihood(
     return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
-def _of_rows(likelihood: SpecimenLikelihood, rows: Ints) -> SpecimenLikelihood:
+def _of_rows(likelihood: SpecimenLikelihood, rows: Indices) -> SpecimenLikelihood:
     """Return the likelihood of some of the specimens, with their points of quadrature."""
     (measurement,) = likelihood.measurements
     part = replace(measurement, observed=measurement.observed[rows])

@@ -22,7 +22,7 @@ from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import (
     AT_ONCE,
     Floats,
-    Ints,
+    Indices,
     called,
     positive_integer,
     positive_number,
@@ -564,7 +564,7 @@ def _require_population(condition: TestedCondition, values: Floats, weights: Flo
         )
 
 
-def _validated_counts(nodes: Sequence[Node], tested: list[_Tested]) -> tuple[list[Ints], int]:
+def _validated_counts(nodes: Sequence[Node], tested: list[_Tested]) -> tuple[list[Indices], int]:
     """Return the specimens' numbers in the calibration, by condition, and how many are new."""
     node_numbers, total = specimens(nodes)
     # Points of simulators that share specimens are drawn together, as a group.

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._stats import cumulated
 from prbayes._validate import (
     Floats,
-    Ints,
+    Indices,
     Seed,
     Shape,
     called,
@@ -55,7 +55,7 @@ class TestedCondition:
     predicted: Floats  # predicted values, projected, (D, S); a row for each draw
     measured: Floats  # measured values before the projection, (n,) or (n, m)
     labels: tuple[str, ...] | None  # labels of the specimens
-    numbers: Ints  # numbers of the specimens, counted over all conditions, (n,)
+    numbers: Indices  # numbers of the specimens, counted over all conditions, (n,)
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # attributes of the prediction
     projection: Projection | None = None  # projection of several outputs
     group: int = 0  # number of the projection, else 0; the values of a group have one ECDF
