@@ -242,7 +242,7 @@ CASES: dict[str, Case] = dict(
         _board("folded", 20, 3, runs=60),
         _board("frame", 20, 3, runs=60),
         _case("growth, one dose", cases._growth_at_one_dose, 3),
-        _case("Virkler", cases._virkler, 1),
+        _case("Virkler", cases._virkler, 1, 400.0),
         _case("Virkler, one error", cases._virkler_with_one_error, 1, **WIDE),
         _case("a^2 + b", cases._square_and_known, 5),
         _case("a^2 + b^2", cases._ring, 5),

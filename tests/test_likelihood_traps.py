@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy.stats import norm
+from scipy.stats import beta, norm
 
 import prbayes as prb
 from benchmarks.scoreboard.problems import frame
@@ -708,3 +708,19 @@ def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
         return np.logaddexp(log_density(x), log_density(mirror) - away[:, 2] ** 2 / 2).sum(axis=1)
 
     assert shift(model, *around_optimum(model), exact) <= 0.1
+
+
+@pytest.mark.parametrize("response", [np.positive, lambda x: x + 0.3 * np.sin(3 * x)])
+def test_specimens_beside_the_ends_of_a_range(response: Callable[[Any], Any]) -> None:
+    # Two of ten specimens are 7e-7 and 3e-5 from an end, where the density is infinite.
+    x = np.random.default_rng(70).beta(0.3, 0.3, 10)
+    with pm.Model() as model:
+        population = pm.Beta.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5))
+        y = prb.Simulator("y", response, population, observed=response(x))
+    function = model.compile_logp(vars=[y], jacobian=False)
+    points = [(0.2, 0.2), (0.3, 0.3), (0.5, 0.3), (0.3, 0.15), (1.0, 1.0)]
+    right = [beta.logpdf(x, a, b).sum() for a, b in points]
+    log_l = [float(function({"a_log__": np.log(a), "b_log__": np.log(b)})) for a, b in points]
+    # The Jacobian of the response is common to all populations.
+    error = np.subtract(log_l, right)
+    assert error - error.mean() == pytest.approx(np.zeros(5), abs=0.01)

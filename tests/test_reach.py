@@ -83,18 +83,24 @@ def test_two_quadratures_of_a_square_with_a_known_input() -> None:
     assert log_l(mu, sigma) == pytest.approx(right, abs=0.02)
 
 
-def test_nodes_of_the_quadrature_of_subjects() -> None:
-    data = cases.own_times(0)
-    names = ("log_ka", "log_cl", "log_v", "sd_ka", "sd_cl", "sd_v", "beta", "error")
-    near, far = (
-        (0.27, 1.1, 3.62, 0.53, 0.23, 0.17, 0.55, 0.124),
-        (0.35, 1, 3.6, 0.6, 0.27, 0.13, 0.8, 0.13),
-    )
-    v = {
-        name: np.array(pair) for name, pair in zip(names, zip(near, far, strict=True), strict=True)
-    }
-    seven, nine = (cases.own_times_log_likelihood(data, v, n) for n in (7, 9))
-    assert seven == pytest.approx(nine, abs=0.03)
+def test_points_of_subjects() -> None:
+    data = {name: values[:3] for name, values in cases.own_times(0).items()}
+    start = {"log_ka": 0.3, "log_cl": 1.1, "log_v": 3.6, "sd_ka": 0.5, "sd_cl": 0.25, "sd_v": 0.2}
+    start |= {"beta": 0.6, "error": 0.3}
+    other = {"log_ka": 0.4, "log_cl": 1.0, "log_v": 3.5, "sd_ka": 0.4, "sd_cl": 0.3, "sd_v": 0.25}
+    v = {name: np.array([start[name], (start | other)[name]]) for name in start}
+    log_l = cases.own_times_log_likelihood(data, start, count=2**12)(v)
+    z = ndtri(np.random.default_rng(1).random((200_000, 3)))
+    right = np.zeros(2)
+    for i in range(3):
+        shift = v["beta"] * np.log(data["weight"][i] / 70)
+        for k in range(2):
+            mean = np.array([v["log_ka"][k], v["log_cl"][k], v["log_v"][k] + shift[k]])
+            x = np.exp(mean + z * [v["sd_ka"][k], v["sd_cl"][k], v["sd_v"][k]])
+            f = cases.concentration(*x.T, data["dose"][i], data["time"][i])
+            density = norm.pdf(data["readings"][i], f, 0.3 * f).prod(axis=1)
+            right[k] += np.log(density.mean())
+    assert log_l == pytest.approx(right, abs=0.08)
 
 
 def test_solver_has_the_closed_form() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from prbayes._validate import Floats, called, number, positive_integer, positive_number
@@ -147,25 +148,84 @@ class Summary:
                 f"Summary: got minimum, quantiles and maximum {values.tolist()}, expected numbers "
                 "that increase; leave one of two equal ones out"
             )
-        low = -np.inf if self.minimum is None else self.minimum
-        high = np.inf if self.maximum is None else self.maximum
-        if self.mean is not None and not low <= self.mean <= high:
+        lower, upper = self._limits()
+        low, high = float(lower.mean()), float(upper.mean())
+        # Allow for the rounding of the statistics.
+        spread = values[-1] - values[0] if values.size else 0.0
+        rounding = 0.01 * max(spread, self.sd or 0.0)
+        if self.mean is not None and not low - rounding <= self.mean <= high + rounding:
             raise ValueError(
-                f"Summary: mean: got {self.mean}, expected a number from minimum to maximum, "
-                f"{low} to {high}"
+                f"Summary: mean: got {self.mean}, expected a number from {low:.6g} to {high:.6g}, "
+                f"which {self.n} specimens with these extremes and quantiles can have; look at "
+                "the units and the order of the statistics"
             )
-        if self.sd is None or not np.isfinite(high - low):
-            return
-        middle = (low + high) / 2 if self.mean is None else self.mean
-        # The standard deviation is largest if all specimens are at the ends (Bhatia and Davis
-        # 2000).
-        largest = np.sqrt((high - middle) * (middle - low) * self.n / (self.n - 1))
-        smallest = (high - low) / np.sqrt(2 * (self.n - 1))  # with all others in the middle
-        if not 0.999 * smallest <= self.sd <= 1.001 * largest:  # a margin for rounding
+        smallest, largest = _range_of_sd(lower, upper, self.mean)
+        rounding = 5e-4 * np.abs(self.values).max()
+        low, high = 0.99 * smallest - rounding, 1.01 * largest + rounding
+        if self.sd is not None and not low <= self.sd <= high:
             raise ValueError(
                 f"Summary: sd: got {self.sd}, expected from {smallest:.4g} to {largest:.4g}, which "
-                f"{self.n} specimens from {low} to {high} can have; is it a standard error?"
+                f"{self.n} specimens with this mean, these extremes and quantiles can have; is it "
+                "a standard error?"
             )
+        levels = [*(self.quantiles or {0.0: 0.0})]
+        is_wide = max(levels) - min(levels) >= 0.5
+        if self.sd is None and is_wide and low > 10 * (values[-1] - values[0]):
+            raise ValueError(
+                f"Summary: mean: got {self.mean} beside quantiles from {values[0]} to "
+                f"{values[-1]}, which need a standard deviation of at least {smallest:.4g}; "
+                "expected statistics of one sample in the same units; leave the mean or the "
+                "quantiles out"
+            )
+
+    def _limits(self) -> tuple[Floats, Floats]:
+        """Return the smallest and the largest value of each specimen, sorted, both (n,).
+
+        A quantile between two specimens has a rank that depends on its definition: n p + p or
+        n p + 1 - p, and others between these.
+        """
+        rank, value = self.order_statistics.T
+        other = (self.n + 1) * (rank - 1) / (self.n - 1)
+        other = np.where((rank == 1) | (rank == self.n), rank, other)
+        number = np.arange(1, self.n + 1)
+        before = np.searchsorted(np.maximum(rank, other) - 1e-9, number, side="right")
+        after = np.searchsorted(np.minimum(rank, other) + 1e-9, number, side="left")
+        return np.append(-np.inf, value)[before], np.append(value, np.inf)[after]
+
+
+def _range_of_sd(lower: Floats, upper: Floats, mean: float | None) -> tuple[float, float]:
+    """Return the smallest and largest standard deviation of sorted values within limits, (n,).
+
+    The smallest one has all values as near to a number as the limits allow, the largest one all
+    values at their limits, low ones at the lower and high ones at the upper limit (Bhatia and Davis
+    2000, doi:10.1080/00029890.2000.12005203).
+    """
+    n = len(lower)
+
+    def sd(values: Floats) -> float:
+        return float(np.std(values, ddof=1))
+
+    ends = np.concatenate([lower, upper])
+    ends = ends[np.isfinite(ends)]
+    if mean is None:
+        centers = np.linspace(ends.min(), ends.max(), 201)
+        smallest = min(sd(np.clip(center, lower, upper)) for center in centers)
+    else:
+        mean = float(np.clip(mean, lower.mean(), upper.mean()))
+        # The mean of clipped values increases with the center.
+        width = n * (np.ptp(np.append(ends, mean)) + 1e-12)
+        center = brentq(
+            lambda c: float(np.clip(c, lower, upper).mean()) - mean, mean - width, mean + width
+        )
+        smallest = sd(np.clip(center, lower, upper))
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        return smallest, np.inf
+    # Sums with the first k values at their lower limit, k = 0, ..., n.
+    sums = upper.sum() - np.append(0.0, np.cumsum(upper - lower))
+    squares = (upper**2).sum() - np.append(0.0, np.cumsum(upper**2 - lower**2))
+    if mean is None:
+        return smallest, float(np.sqrt((squares - sums**2 / n).max() / (n - 1)))
+    return smallest, float(np.sqrt(np.interp(-mean * n, -sums, squares - sums**2 / n) / (n - 1)))
 
 
 def _checked_quantiles(quantiles: object) -> dict[float, float]:

@@ -30,7 +30,12 @@ from prbayes.model.data_checks import (
     repeat_findings,
     unreached,
 )
-from prbayes.model.measurement import SpecimenLikelihood, output_columns
+from prbayes.model.measurement import (
+    Measurement,
+    SpecimenLikelihood,
+    output_columns,
+    specimen_labels,
+)
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
@@ -239,12 +244,21 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         populations.prior_specimens(),
         populations.posterior,
         coordinates.bounds,
+        coordinates.ends,
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
         options=replace(likelihood.options, n_first=first_run_count(likelihood)),
         name=likelihood.name,
+        output_names=tuple(name for m in likelihood.measurements for name in _output_names(m)),
+        labels=specimen_labels(likelihood),
     )
+
+
+def _output_names(measurement: Measurement) -> list[str]:
+    """Return the names of the outputs of a simulator, as messages have them."""
+    name = measurement.name
+    return [f"{name}[{label}]" for label in measurement.outputs.names] or [name]
 
 
 def _emulate(runs: Runs, data: SpecimenData, emulation: Emulation | None) -> Preparation:
@@ -310,7 +324,7 @@ def _data_findings(
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
             values,
-            labels=[f"{m.name}[{label}]" for label in m.outputs.names] or [m.name],
+            labels=_output_names(m),
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
         )

@@ -26,6 +26,9 @@ class Coordinates:
     # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
     # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
+    # (2, d): ends of the range from zero to one of inputs that the prior has near both; infinite of
+    # other inputs.
+    ends: Floats
     is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
 
     @classmethod
@@ -48,7 +51,9 @@ class Coordinates:
 
         flat = draw(1)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
-        is_log = (flat > 0).all(axis=0) & (high > 10 * low)
+        # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
+        is_share = (flat <= 1).all(axis=0) & (high > 0.5)
+        is_log = (flat > 0).all(axis=0) & (high > 10 * low) & ~is_share
         low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
@@ -68,7 +73,9 @@ class Coordinates:
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds, is_condition)
+        range_ = (np.array([[0.0], [1.0]]) - center) / half_width
+        ends = np.where(is_share & ~is_condition, range_, [[-np.inf], [np.inf]])
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition)
 
     @property
     def size(self) -> int:

@@ -192,7 +192,7 @@ def emulate(
             if not likely.proposals.is_open() and most_corrections(*data.known.shape):
                 emulation = corrected(run, data, emulation, population)
             if emulation.bias > data.options.bias:
-                require_accurate(data, emulation)
+                require_accurate(data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population))
             return emulation, *plausible.agreeing(data), plausible.draws
         # Batches of half the runs there are, a quarter near the end; at most three times the first.
@@ -272,7 +272,7 @@ def joined(
     if np.isfinite(bias):
         at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
         error = _improved(data, error, at_sampled)
-    return Emulation(z, y, surface, error, bias)
+    return _with_bias_at_ends(data, Emulation(z, y, surface, error, bias), likely)
 
 
 def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
@@ -361,6 +361,28 @@ def error_and_bias(
     return error, float(max(bias, narrowing))
 
 
+def _with_bias_at_ends(
+    data: SpecimenData, emulation: Emulation, likely: Likely, largest: float = 0.1
+) -> Emulation:
+    """Return the emulation with the bias of specimens near an end of the range of their inputs.
+
+    A density may be infinite at the end, so that the error of an input is compared with its
+    distance from the end. The bias is too large above a share ``largest``.
+    """
+    if data.ends is None or np.isinf(data.ends).all():
+        return emulation
+    best = likely.weights.argmax(axis=1)
+    z = likely.points.z[np.arange(len(best)), best]
+    _, jacobian = emulation(z)
+    slopes = np.nan_to_num(jacobian[:, :, data.free] / emulation.error[:, None])
+    sd = np.sqrt(np.einsum("ndd->nd", np.linalg.pinv(slopes.swapaxes(1, 2) @ slopes)))
+    distance = np.minimum(z - data.ends[0], data.ends[1] - z)[:, data.free]
+    # The input may be nearer to the end by three standard deviations.
+    share = np.clip(sd / np.maximum(distance - 3 * sd, 1e-300), 0.0, 3.0)
+    at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
+    return replace(emulation, bias=max(emulation.bias, float(at_ends)))
+
+
 def _near_population(
     data: SpecimenData, z: Floats, population: Normal, far: float = 6.0
 ) -> NDArray[np.bool_]:
@@ -444,7 +466,8 @@ def audited(
         # Eight runs may miss where the emulator is wrong: halfway between both, in logarithms.
         measured = np.sqrt(((error / emulation.error) ** 2).mean())
         error = np.sqrt(min(measured, 1.0)) * emulation.error
-        return replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
+        emulation = replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
+        return _with_bias_at_ends(data, emulation, likely)
     used = _near_population(data, all_z, population)
     surface, left_out, _ = fit_surface(
         all_z, all_y, data.readings, data.name, emulation.surface, used
@@ -454,7 +477,7 @@ def audited(
         error = _improved(data, error, at_audited)
     else:  # specimens may be elsewhere
         error = np.maximum(error, emulation.error)
-    return Emulation(all_z, all_y, surface, error, bias)
+    return _with_bias_at_ends(data, Emulation(all_z, all_y, surface, error, bias), likely)
 
 
 def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
@@ -503,15 +526,21 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
     return emulation
 
 
-def require_accurate(data: SpecimenData, emulation: Emulation) -> None:
-    """Raise: the emulator's error shifts populations."""
+def require_accurate(data: SpecimenData, emulation: Emulation, likely: Likely) -> None:
+    """Raise an error that names the output and the specimen at which the emulator is worst."""
     share = emulation.error / data.readings.spread()
-    worst = int(np.argmax(share))
-    output = f"output {worst}" if len(share) > 1 else "the output"
+    output = int(np.argmax(share))
+    best = likely.weights.argmax(axis=1)
+    z = likely.points.z[np.arange(len(best)), best]
+    variance = emulation.surface.variance(z)[:, output]
+    is_read = data.readings.is_measured[:, output]
+    specimen = int(np.argmax(np.where(is_read, variance, -1.0)))
+    name = data.output_names[output] if data.output_names else data.name
+    label = specimen if data.labels is None else data.labels[specimen]
     raise DesignError(
-        f"{data.name}: the response is not smooth enough for prb.LogLikelihood() in the range of "
-        f"the priors: got an emulator of {len(emulation.z)} runs whose error at the specimens is "
-        f"{share[worst]:.2g} times the scatter of {output} and would shift an estimate by "
+        f"{data.name}: the response is not smooth enough for prb.LogLikelihood(): got an emulator "
+        f"of {len(emulation.z)} runs whose error of {name} is {share[output]:.2g} times the "
+        f"scatter, the largest at specimen {label}, and would shift an estimate by "
         f"{emulation.bias:.2g} posterior standard deviations, expected at most "
         f"{data.options.bias}; narrow the priors, ask for more first runs with prb.Reweighted(n), "
         "or use metric=prb.ProbabilityResidual()"

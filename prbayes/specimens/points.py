@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class SpecimenOptions:
     # Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
     # More runs are added where the emulator's error could cause as much.
     bias: float = 0.1
-    floor: float = 1e-6  # smallest error of the emulator, as a share of the data's spread
+    floor: float = 1e-9  # smallest error of the emulator, as a share of the data's spread
     sampled: int = 8  # runs of a batch that measure the error, at least
     n_first: int | None = None  # number of first runs; by default that of `first_runs`
     max_runs: int | None = None  # by default that of `most_runs`
@@ -123,12 +123,16 @@ class SpecimenData:
     prior: Floats  # (n, d): specimens of the prior predictive population
     posterior: Posterior  # points, their numbers and a smoothing to draws
     bounds: Floats | None = None  # (2, d): ends of data sets of the prior
+    # (2, d): ends of the range of inputs, at which a density may be infinite
+    ends: Floats | None = None
     # (free,): the columns that are not known, those whose population may be narrow first
     order: NDArray[np.intp] | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
     gross_errors: bool = False  # whether readings of single specimens may be anything
     options: SpecimenOptions = SpecimenOptions()
     name: str = "response"
+    output_names: tuple[str, ...] = ()  # names of the m outputs in messages
+    labels: NDArray[Any] | None = None  # labels of the N specimens; None for row numbers
     seed: int = 0
 
     @property

@@ -116,7 +116,14 @@ def test_intervals_contain_the_truth(cell: str) -> None:
         ({"n": 20}, "at least one statistic beside n"),
         ({"n": 20, "sd": 1.0}, "locates the population"),
         ({"n": 1, "mean": 1.0, "sd": 1.0}, "n: got 1"),
-        ({"n": 9, "mean": 5.0, "minimum": 1.0, "maximum": 4.0}, "from minimum to maximum"),
+        ({"n": 9, "mean": 5.0, "minimum": 1.0, "maximum": 4.0}, "a number from 1.33333 to 3.66667"),
+        ({"n": 2, "mean": 1.0, "minimum": 0.9, "maximum": 5.0}, "from 2.95 to 2.95"),
+        ({"n": 2, "mean": 1.0, "sd": 0.1, "minimum": 0.5}, "sd: got 0.1, expected from 0.7071"),
+        # The median of three is at most sqrt(2 / 3) standard deviations from their mean.
+        ({"n": 3, "mean": 1.0, "sd": 0.5, "quantiles": {0.5: 1.45}}, "expected from 0.7794 to inf"),
+        ({"n": 10, "mean": 5.0, "sd": 0.1, "quantiles": {0.1: 0.0, 0.9: 2.0}}, "a standard error"),
+        ({"n": 30, "mean": 1.0, "sd": 0.5, "quantiles": {0.25: 3.0, 0.75: 4.0}}, "standard error"),
+        ({"n": 100, "mean": 1.0, "quantiles": {0.25: 310.0, 0.75: 350.0}}, "in the same units"),
         ({"n": 9, "mean": 2.0, "sd": 0.1, "minimum": 1.0, "maximum": 4.0}, "a standard error"),
         ({"n": 9, "mean": 2.0, "sd": 1.7, "minimum": 1.0, "maximum": 4.0}, "sd: got 1.7"),
         ({"n": 9, "quantiles": {0.2: 2.0, 0.5: 1.0}}, "numbers that increase"),
@@ -127,6 +134,20 @@ def test_intervals_contain_the_truth(cell: str) -> None:
 def test_impossible_sheets_are_refused(given: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         prb.Summary(**given)
+
+
+@pytest.mark.parametrize("method", ["linear", "weibull", "hazen", "median_unbiased"])
+def test_rounded_statistics_of_samples_are_accepted(method: Any) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(100):
+        n, is_skew = int(rng.integers(2, 40)), bool(number % 2)
+        x = rng.lognormal(0.0, rng.uniform(0.1, 2.0), n) if is_skew else rng.normal(5.0, 1.0, n)
+        of_sample = {"mean": x.mean(), "sd": x.std(ddof=1), "minimum": x.min(), "maximum": x.max()}
+        quantiles = {p: np.quantile(x, p, method=method) for p in (0.25, 0.5, 0.9)}
+        given: dict[str, Any] = {k: float(f"{v:.3g}") for k, v in of_sample.items()}
+        if n > 12:
+            given["quantiles"] = {p: float(f"{q:.3g}") for p, q in quantiles.items()}
+        prb.Summary(n=n, **given)
 
 
 def with_sheet(**settings: Any) -> pm.Model:

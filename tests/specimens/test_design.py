@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -209,6 +210,7 @@ def test_a_response_that_no_emulator_follows_is_refused_at_the_limit() -> None:
         emulated(rough, x, options=options)
     message = str(caught.value)
     assert "response: the response is not smooth enough" in message
+    assert re.search(r"error of response is .* the largest at specimen \d+,", message)
     assert "metric=prb.ProbabilityResidual()" in message
     assert len(message) < 5 * 90
     # A batch is half of the runs so far, and the limit is checked before each.

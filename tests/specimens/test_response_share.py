@@ -48,7 +48,7 @@ def log_share(share: ResponseShare, dist: Callable[..., Any], *parents: Floats) 
         inputs = read_inputs("y", [dist(*symbols, shape=d)], model)
     ends = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
     none = np.zeros(d, dtype=bool)
-    identity = Coordinates(((d,),), none, np.zeros(d), np.ones(d), ends, none)
+    identity = Coordinates(((d,),), none, np.zeros(d), np.ones(d), ends, np.inf * ends, none)
     values = [parents[symbols.index(parent)] for parent in inputs.parents]
     return share.of_populations(PopulationDensity(inputs), values, identity)
 
