@@ -79,7 +79,9 @@ def real_array(values: ArrayLike, name: str) -> Floats:
     is_convertible = array.dtype.kind == "O" and values is not None
     if is_convertible and not any(isinstance(x, bool | np.bool_ | str | bytes) for x in array.flat):
         with suppress(TypeError, ValueError, OverflowError):
-            return np.where(pd.isna(array), np.nan, array).astype(np.float64)  # pd.NA among them
+            return np.where(pd.isna(array), np.nan, array).astype(
+                np.float64
+            )  # isna finds pd.NA, too
     got = f"an array of dtype {array.dtype}" if array.ndim else called(values)
     text = first_text(array) if array.ndim else ""
     raise TypeError(f"{name}: got {got}, expected real numbers{text and '; '}{text}")

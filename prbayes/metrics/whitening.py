@@ -120,7 +120,7 @@ def principal_components(
     means = np.cumsum(variances[::-1])[::-1] / remaining
     is_noise = (
         variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2
-    )  # always true for the last
+    )  # the last component always counts as noise
     first = int(np.argmax(is_noise))
     first += most - first > 1
     atypical = np.abs(np.log(variances[first:] / means[first]))

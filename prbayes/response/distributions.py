@@ -169,7 +169,7 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
     except NotImplementedError:
         return None
     if isinstance(dist.owner.op, RANDOM_WALK):
-        return density  # its random parts are used for their shapes only
+        return density  # only the shapes of the random parts are used
     # The zeros depend on the distribution, too, but only by its shape.
     parts = set(ancestors([density], blockers=[dist])) - {dist}
     return None if any(map(is_random, parts)) else density
@@ -218,7 +218,7 @@ def resized(dist: TensorVariable, size: tuple[Any, ...]) -> TensorVariable:
     op = dist.owner.op
     if not hasattr(op, "rv_op"):
         return change_dist_size(dist, size, expand=True)
-    # For these, such as pm.HalfCauchy, PyMC would drop the axes that come from their parameters.
+    # PyMC would drop the axes that the parameters of such a distribution (pm.HalfCauchy) add.
     shape = event_shape(dist)[: dist.type.ndim - op.ndim_supp]
     return change_dist_size(dist, (*size, *shape))
 

@@ -126,6 +126,6 @@ class InputMoments:
         numbers = np.concatenate([np.stack(moments, axis=1), levels], axis=1)
         if correlation is not None:
             below = np.tril(np.ones(correlation.shape[1:], dtype=bool), -1)
-            rows = np.where(below, correlation, np.nan)  # with an earlier element in each column
+            rows = np.where(below, correlation, np.nan)  # a column for each earlier element
             numbers = np.concatenate([numbers, np.swapaxes(rows, 1, 2)[:, :-1]], axis=1)
         return np.where(np.isfinite(numbers), numbers, np.nan)

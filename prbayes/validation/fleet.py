@@ -178,7 +178,7 @@ def calibrate_each(
 
 
 def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
-    """Raise if a simulator has weights, labels or others of its observed specimens."""
+    """Raise if a simulator has weights, labels, groups or conditions, or a data sheet."""
     weights = simulator.weights
     numbers = {
         "weights=": weights is not None and np.ptp(weights) > 0,

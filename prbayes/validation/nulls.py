@@ -289,7 +289,7 @@ class ExactModel(Null):
         return float(np.exp(-(logs[-1] + _slope(logs, quantiles) * farther)))
 
     def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
-        """Look up p-value and critical value, and simulate the envelope; simulate all with ties."""
+        """Look up p-value and critical value, simulate the envelope; with ties simulate all."""
         if case.is_dependent:
             raise ValueError(
                 f"null: got ExactModel() for {case.size} values of {case.n_specimens} specimens, "
@@ -552,7 +552,7 @@ def _require_population(condition: TestedCondition, values: Floats, weights: Flo
     expected = Predictive(values, weights).transform(at, None)
     got = Predictive(condition.predicted).transform(at, None)
     largest = np.abs(expected - got).max()
-    # With probability 5% 500 random samples differ from their population by .06 or more, and
+    # With probability 5%, 500 random samples differ from their population by .06 or more, and
     # samples of `predict` by far less. A normal population that is shifted by a quarter of a
     # standard deviation differs by .1.
     if largest > 0.1:
