@@ -146,11 +146,13 @@ def _results(files: Sequence[Path]) -> dict[str, Any]:
         dataset = tree.to_dataset()
         value: Any
         if "posterior" in tree or "optimum" in tree:
-            kind, value = "posterior" if "posterior" in tree else "optimum", tree
+            kind = "posterior" if "posterior" in tree else "optimum"
+            value = tree
         elif kind_of_decision(dataset) is not None:
             kind, value = "decision", dataset
         else:
-            kind, value = "validity", _validity_test(path, dataset)
+            kind = "validity"
+            value = _validity_test(path, dataset)
         label = path.stem if stems.count(path.stem) == 1 else str(path)
         results.setdefault(kind, {})[label] = value
     # A decision keeps the name of its file, because that describes it. Any other single result is

@@ -227,7 +227,8 @@ class _Integral:
     def areas(self, weights: Floats, correction: Floats) -> Floats:
         """Return the areas for weights of the simulated values, (..., n) -> (...)."""
         simulated = cumulated(weights, self.order)
-        first, last = self.edges[:-1], self.edges[1:]
+        first = self.edges[:-1]
+        last = self.edges[1:]
         crossing = np.searchsorted(self.observed, simulated).clip(first, last)
         below, above = (
             simulated * (self.positions[end] - self.positions[start])

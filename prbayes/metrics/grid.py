@@ -127,7 +127,8 @@ class KernelCells(Cells):
             # A point is a node and a fraction of a step beyond it.
             t = points[block] / self.step - self.low
             inside = (t >= 1) & (t < last)
-            below, above = t < 1, t >= last
+            below = t < 1
+            above = t >= last
             t = np.where(inside, t, 1.0)
             node = t.astype(np.intp)
             t -= node
@@ -168,7 +169,8 @@ class KernelCells(Cells):
             ends = np.zeros(2)
         padded = np.pad(as_rows(smoothed, (*batch, nodes)), [(0, 0), (1, 2)])
         cubics = np.stack([padded[:, k : k + nodes] for k in range(4)], axis=-1) @ spline
-        values, ends = as_rows(sample, (*batch, n)), as_rows(ends, (*batch, 2))
+        values = as_rows(sample, (*batch, n))
+        ends = as_rows(ends, (*batch, 2))
         out = np.empty(values.shape)
         evaluate_cubics(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)

@@ -187,7 +187,8 @@ class LogLikelihood(Metric):
         low, high = self.censored or (None, None)
         lowest = full(-np.inf if low is None else low, "censored")
         highest = full(np.inf if high is None else high, "censored")
-        is_low, is_high = values <= lowest, values >= highest
+        is_low = values <= lowest
+        is_high = values >= highest
         lower = np.where(is_high, highest, np.where(is_low, -np.inf, np.nan))
         upper = np.where(is_high, np.inf, np.where(is_low, lowest, np.nan))
         return Readings(
@@ -207,7 +208,8 @@ class LogLikelihood(Metric):
                 "prb.LogLikelihood(density=prb.GaussianKDE())"
             )
         cells = self.density.cells(observed, weights)
-        density, reading = cells.density(observed, weights), cells.reading(observed, weights)
+        density = cells.density(observed, weights)
+        reading = cells.reading(observed, weights)
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 

@@ -366,13 +366,15 @@ class Joint(Metric):
         """Return white coordinates of some outputs, or of their principal components."""
         if outputs.size > 1 and (outputs.size > MOST_OUTPUTS or self.components is not None):
             is_complete = ~np.isnan(sample).any(axis=-1)
-            sample, weights = sample[is_complete], weights[is_complete]
+            sample = sample[is_complete]
+            weights = weights[is_complete]
             sample = np.where(np.isposinf(sample), caps, sample)
             weights = weights / weights.sum()
             principal = principal_components(sample, weights, outputs, self.components)
             return _whitened_scores(principal, sample, weights), [principal]
         is_finite = np.isfinite(sample).all(axis=-1)
-        sample, weights = sample[is_finite], weights[is_finite]
+        sample = sample[is_finite]
+        weights = weights[is_finite]
         white = whitening(sample, weights, outputs)
         if n_inputs is not None and n_inputs < outputs.size:
             white = _flat(sample, weights, outputs, n_inputs) or white

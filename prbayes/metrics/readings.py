@@ -27,7 +27,8 @@ class Readings:
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
-        zero, missing = np.zeros_like(values), np.full_like(values, np.nan)
+        zero = np.zeros_like(values)
+        missing = np.full_like(values, np.nan)
         return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
 
     def __len__(self) -> int:
@@ -226,7 +227,8 @@ def averaged(
         return np.where(is_repeated, result, 0.0)
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        c, y = scale[present], readings.values[present]
+        c = scale[present]
+        y = readings.values[present]
         precision = total(c**-2.0)
         mean = total(y / c**2) / precision
         within = total(((y - mean[places]) / c) ** 2)
@@ -250,7 +252,8 @@ def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:
     is_upper = low > 0
     a = xp.where(is_upper, -high, low)
     b = xp.where(is_upper, -low, high)
-    log_a, log_b = _log_distribution(a, xp), _log_distribution(b, xp)
+    log_a = _log_distribution(a, xp)
+    log_b = _log_distribution(b, xp)
     return log_b + xp.log1p(-xp.exp(log_a - log_b))
 
 

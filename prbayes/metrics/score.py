@@ -207,13 +207,16 @@ def _part_scores(
         # Limit the values to the range of the data and a margin. With several simulators the range
         # is that expected of as many specimens as all simulators have together.
         observed, weights = finite_sample(target.observed, target.weights)
-        lowest, highest = observed.min(), observed.max()
+        lowest = observed.min()
+        highest = observed.max()
         if total > len(target.observed):
-            simulated, mass = np.asarray(part.of(population.responses)), population.weights
+            simulated = np.asarray(part.of(population.responses))
+            mass = population.weights
             is_finite = np.isfinite(simulated)
             prob = 1 / (total + 1)
             extremes = quantile(simulated[is_finite], mass[is_finite], [prob, 1 - prob])
-            lowest, highest = min(lowest, extremes[0]), max(highest, extremes[1])
+            lowest = min(lowest, extremes[0])
+            highest = max(highest, extremes[1])
         margin = options.reach * twice_silverman(observed, weights)
         limited = np.clip(values, lowest - margin, highest + margin)
         values = np.where(np.isfinite(values), limited, values)

@@ -150,7 +150,8 @@ class SummaryDiscrepancy(Discrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return minus the log-likelihood over n."""
         (sums,) = features
-        n, size = self.summary.n, self.counts.size
+        n = self.summary.n
+        size = self.counts.size
         total = xp.maximum(
             sums[..., :size].sum(axis=-1), 1e-300
         )  # less than one if points have no response
@@ -173,7 +174,8 @@ class SummaryDiscrepancy(Discrepancy):
 
     def _log_sums(self, moments: list[list[Any]], xp: Any) -> Any:
         """Return the log-density of mean and standard deviation, given the moments of strata."""
-        summary, n = self.summary, self.summary.n
+        summary = self.summary
+        n = self.summary.n
         strata = [(c, m) for c, m in zip(self.counts, moments, strict=True) if c]
         expected_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
         variance = xp.maximum(sum(c * (m[2] - m[1] ** 2) for c, m in strata), 1e-12)

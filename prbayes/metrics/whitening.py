@@ -53,7 +53,8 @@ class Components:
         """Return the share of the variance of a population, (n, m), that they leave out."""
         values = values[:, self.outputs]
         is_usable = np.isfinite(values).all(axis=1) & (weights > 0)
-        values, weights = values[is_usable], weights[is_usable]
+        values = values[is_usable]
+        weights = weights[is_usable]
         deviations = values - np.average(values, axis=0, weights=weights)
         rest = deviations - deviations @ self.axes @ self.axes.T
         variance = float(weights @ (deviations**2).sum(axis=1))
@@ -125,7 +126,8 @@ def principal_components(
     first += most - first > 1
     atypical = np.abs(np.log(variances[first:] / means[first]))
     order = np.concatenate([np.arange(first), first + np.argsort(atypical)])
-    variances, axes = variances[order], axes[:, ::-1][:, order]
+    variances = variances[order]
+    axes = axes[:, ::-1][:, order]
     explained = np.cumsum(variances) / variances.sum()
     if number is None:
         is_sufficient = explained >= 1 - LEFT_OUT

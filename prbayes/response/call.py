@@ -136,7 +136,8 @@ class Points:
         stop = 0
         for a, varies in zip(self.arguments, self.varying, strict=True):
             event = np.shape(a)[1:] if varies else np.shape(a)
-            start, stop = stop, stop + math.prod(event)
+            start = stop
+            stop = stop + math.prod(event)
             values = keys[:, start:stop]
             if not varies:
                 have_same_constants &= (values == np.ravel(a)).all(axis=1)
@@ -468,7 +469,8 @@ def respond(
     policy = settings.on_failure
     _verify_store(settings, points, tally)
     event = () if settings.outputs is None else settings.outputs.event
-    values, missing = np.full((len(points), *event), np.nan), np.arange(len(points))
+    values = np.full((len(points), *event), np.nan)
+    missing = np.arange(len(points))
     failed: dict[int, str] = {}
     raised: dict[int, str] = {}
     if settings.store is not None:
@@ -552,7 +554,8 @@ def computed_again(
 ) -> tuple[Floats, dict[int, str]]:
     """Return responses at points, (n, *event), NaN where they raised, and the reasons by row."""
     event = () if settings.outputs is None else settings.outputs.event
-    values, waiting = np.full((len(points), *event), np.nan), np.arange(len(points))
+    values = np.full((len(points), *event), np.nan)
+    waiting = np.arange(len(points))
     raised: dict[int, str] = {}
     for _ in range(settings.on_failure.tries):
         raised = {}
@@ -793,7 +796,8 @@ def chunks(
                     error = error or spent
                     waiting = waiting[:0]
                     break
-                chunk_rows, waiting = waiting[:size], waiting[size:]
+                chunk_rows = waiting[:size]
+                waiting = waiting[size:]
                 begun[pool.submitted(work, points.at(chunk_rows), tolerant)] = chunk_rows
             finished = []
             for future in pool.done(begun):
@@ -812,7 +816,8 @@ def chunks(
                     chunk = Chunk(np.array([np.nan]), {0: reason}, 0.0)
                 elif failure is not None:
                     error = error or failure
-                    waiting, suspects = waiting[:0], []
+                    waiting = waiting[:0]
+                    suspects = []
                     continue
                 else:
                     chunk = future.result()

@@ -26,7 +26,8 @@ from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
     """Rewrite elementwise operations that NumPy would compute slowly, or not at all."""
-    op, terms = node.op, node.inputs
+    op = node.op
+    terms = node.inputs
     if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers in Python
         (x,) = terms
         return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]

@@ -36,7 +36,8 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
     @property
     def range(self) -> tuple[float, float]:
         """Lower and upper end of the distribution, which keep the sign of the values."""
-        low, high = min(self.values), max(self.values)
+        low = min(self.values)
+        high = max(self.values)
         margin = 0.1 * (high - low)
         lower = low - margin if low < 0 or low > margin else 0.9 * low
         upper = high + margin if high > 0 or high < -margin else 0.9 * high

@@ -242,7 +242,8 @@ class Corrected:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """A warning if the condition is outside the range of the data."""
-        low, high = self.discrepancy.low, self.discrepancy.high
+        low = self.discrepancy.low
+        high = self.discrepancy.high
         if not ((self.condition < low) | (self.condition > high)).any():
             return ()
         text = (
@@ -260,7 +261,8 @@ class Corrected:
                 f"{self.__name__}: got a mapping, expected an array with an output for each "
                 "condition"
             )
-        labelled, response = response, np.asarray(unmasked(response))
+        labelled = response
+        response = np.asarray(unmasked(response))
         coefficients = np.asarray(coefficients)
         batch_ndim = coefficients.ndim - len(self.discrepancy.event)
         outputs = self.condition.shape

@@ -132,7 +132,8 @@ def fmu(
     file = file_path(path, "fmu: path")
     if not file.is_file():
         raise FileNotFoundError(f"fmu: path: got {file}, which is not there, expected an FMU")
-    input_names, output_names = _names("inputs", inputs), _names("outputs", outputs)
+    input_names = _names("inputs", inputs)
+    output_names = _names("outputs", outputs)
     values = _parameter_values(parameters)
     repeated = set(input_names) & set(values)
     if repeated:

@@ -77,7 +77,8 @@ class InputMoments:
         placed, *covariance = self._inverse(*values, np.concatenate([ndtr(self.z), self.levels]))
         n = self.z.size + self.levels.size
         x = np.broadcast_to(placed, (k, n, *self.shape)).reshape(k, n, self.size)
-        nodes, levels = x[:, : self.z.size], x[:, self.z.size :]
+        nodes = x[:, : self.z.size]
+        levels = x[:, self.z.size :]
         weights = np.exp(-0.5 * self.z**2)
         weights /= weights.sum()
         with np.errstate(invalid="ignore", over="ignore"):
@@ -112,7 +113,8 @@ class InputMoments:
         is_discrete = not dist.dtype.startswith("float")
         method: Any = "inverted_cdf" if is_discrete else "linear"
         levels = np.moveaxis(np.quantile(x, self.levels, axis=1, method=method), 0, 1)
-        mean, sd = x.mean(axis=1), x.std(axis=1)
+        mean = x.mean(axis=1)
+        sd = x.std(axis=1)
         correlation = None
         if self.is_multivariate:
             z = (x - mean[:, None]) / sd[:, None]

@@ -85,7 +85,8 @@ class Outputs:
         Series of one specimen. Values without labels keep their order.
         """
         if hasattr(result, "columns") and not self.labels and result.shape[-1] == 1:
-            column, values = result.columns[0], result.iloc[:, 0]
+            column = result.columns[0]
+            values = result.iloc[:, 0]
             return self.assembled({column: values}) if self.keys and column != 0 else values
         axis = output_axis(result, batch_ndim, self)
         if axis is None or not self.labels:
@@ -124,12 +125,14 @@ def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) ->
     rounding. Raises KeyError if other labels than the expected ones are there.
     """
     default = tuple(range(len(expected)))
-    labels, expected = tuple(labels), tuple(expected)
+    labels = tuple(labels)
+    expected = tuple(expected)
     if len(labels) != len(expected) or labels == expected or default in (labels, expected):
         return None
     numbers = [np.asarray(side) for side in (labels, expected)]
     if all(side.dtype.kind in "iuf" for side in numbers):
-        order, rank = np.argsort(numbers[0]), np.argsort(np.argsort(numbers[1]))
+        order = np.argsort(numbers[0])
+        rank = np.argsort(np.argsort(numbers[1]))
         if np.allclose(numbers[0][order], np.sort(numbers[1]), rtol=1e-9, atol=0):
             return np.asarray(order[rank])
     elif set(labels) == set(expected) and len(set(labels)) == len(labels):
@@ -281,7 +284,8 @@ def in_order_of(values: Any, observed: Any, name: str, *, reference: str = "obse
     An index 0, 1, ... counts as none, unless the other index is a permutation of it. Raises a
     ValueError if the labels of both differ.
     """
-    index, expected = specimen_index(values), specimen_index(observed)
+    index = specimen_index(values)
+    expected = specimen_index(observed)
     if index is None or expected is None or len(index) != len(expected) or index.equals(expected):
         return values
     if index.is_unique and expected.is_unique and set(index) == set(expected):

@@ -236,7 +236,8 @@ class Responses:
         """Return whether function, inputs, constants and order of outputs are the same."""
         # Arrays of a mapping are concatenated in the order of the observed outputs.
         keys = {r.outputs.keys for r in (self, other) if r.outputs is not None}
-        sources, other_sources = self.inputs.sources, other.inputs.sources
+        sources = self.inputs.sources
+        other_sources = other.inputs.sources
         if self.function is not other.function or len(keys) > 1:
             return False
         return len(sources) == len(other_sources) and all(
@@ -357,7 +358,8 @@ class Responses:
         The calls are not counted as runs, and are not stored.
         """
         # Indexing copies, so that the function may change its arguments in place.
-        selected, batch = [x[rows] for x in values], (len(rows),)
+        selected = [x[rows] for x in values]
+        batch = (len(rows),)
         with unlimited():
             if self.is_batched:
                 return self._called(selected, batch, is_run=False)
@@ -414,7 +416,8 @@ class Responses:
             if not is_random and first_change(values[part], again, tolerance) is None:
                 continue
             row = part[changed]
-            got, expected = again[changed], values[row]
+            got = again[changed]
+            expected = values[row]
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "

@@ -160,7 +160,8 @@ class CrossValidationTable(Table):
         n_failed = int((~self["converged"]).sum())
         if n_failed:
             sentences.append(f"The minimisations of {n_failed} folds did not converge.")
-        n_folds, n = self.sizes["fold"], self.sizes["specimen"]
+        n_folds = self.sizes["fold"]
+        n = self.sizes["specimen"]
         heading = f"Cross-validation of {n} specimens in {n_folds} folds, mean discrepancies"
         return View(heading, ["", "held out", "calibrated"], rows, sentences)
 
@@ -179,7 +180,8 @@ class Ranking(Table):
             [str(label), *(f"{x:.4g}" for x in numbers[:3]), "yes" if numbers[3] else "no"]
             for label, *numbers in table.itertuples(name=None)
         ]
-        n, folds = self.attrs["n_specimens"], self.attrs["folds"]
+        n = self.attrs["n_specimens"]
+        folds = self.attrs["folds"]
         heading = f"Models by the log score of {n} specimens, {folds} folds"
         header = ["", "score of a specimen", "behind by", "standard error", "beyond chance"]
         return View(heading, header, rows, [f"{v}." for v in self["verdict"].values[1:]])
@@ -245,7 +247,8 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     by_name = specimen_log_likelihoods(evaluator, thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
-        likelihood, measurement = simulator.likelihood, simulator.measurement
+        likelihood = simulator.likelihood
+        measurement = simulator.measurement
         numbers = specimen_numbers(likelihood, measurement)
         rows = numbers[simulator.rows]
         weights = weights / np.bincount(numbers)[rows]  # so that a specimen counts once
@@ -262,7 +265,8 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
 def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tuple[Floats, Floats]:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = specimens(evaluator.simulators)
-    scores, counts = np.zeros(total), np.zeros(total)
+    scores = np.zeros(total)
+    counts = np.zeros(total)
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
         counts += np.bincount(numbers[k], weights * weights.size, total)

@@ -354,7 +354,8 @@ def _common_likelihood(
     sizes = [len(values) for values in observed.values()]
     within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
     narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
-    inputs, sampler = likelihood.inputs, likelihood.density.sampler
+    inputs = likelihood.inputs
+    sampler = likelihood.density.sampler
     coordinates = Coordinates.of_prior(inputs, max(sizes), sampler=sampler)
 
     def prepared_of(values: Floats, emulation: Emulation | None) -> SpecimenLikelihood:
@@ -391,7 +392,8 @@ def _of_rows(likelihood: SpecimenLikelihood, rows: Indices) -> SpecimenLikelihoo
 
 def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
     """Return a sentence about specimens whose readings no point reproduces to so many nats."""
-    preparation, readings = prepared(likelihood), likelihood.readings
+    preparation = prepared(likelihood)
+    readings = likelihood.readings
     sd = readings.comparison_sd(preparation.emulation.error)[:, None]
     residual = (preparation.points.outputs - readings.values[:, None]) / sd
     misfit = np.where(np.isnan(residual), 0.0, residual**2).sum(axis=-1) / 2

@@ -297,7 +297,8 @@ class ExactModel(Null):
                 "each specimen through all conditions"
             )
         for condition in case.conditions:
-            n_predicted, n_observed = condition.predicted.size, condition.observed.size
+            n_predicted = condition.predicted.size
+            n_observed = condition.observed.size
             # A pool of m times as many values adds 1 / m to the variance of an ECDF. With a tenth,
             # a test at 5% rejects in some 6% of cases.
             if n_predicted < 10 * n_observed:
@@ -443,7 +444,8 @@ class JointNull(Null):
         self, case: Case, sampling: SamplingDistribution, tested: list[_Tested]
     ) -> Floats:
         """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
-        evaluator, theta = self.optimum.evaluator, self.optimum.theta
+        evaluator = self.optimum.evaluator
+        theta = self.optimum.theta
         rng_of_ties = case.rng(1)
         numbers, n_new = _validated_counts(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
@@ -577,7 +579,8 @@ def _validated_counts(nodes: Sequence[Node], tested: list[_Tested]) -> tuple[lis
     n_new = 0
     numbers = []
     for j, t in enumerate(tested):
-        condition, node = t.condition, nodes[t.simulator]
+        condition = t.condition
+        node = nodes[t.simulator]
         calibrated = node.target.observed
         if data_digest(condition.measured) == data_digest(calibrated):
             # The data are those of the calibration, perhaps in another order.

@@ -281,7 +281,8 @@ def u_values(
 
 def _by_specimen(condition: TestedCondition) -> list[TestedCondition]:
     """Split a condition into one for each specimen, with its column of predicted values."""
-    n, predicted = len(condition.observed), condition.predicted
+    n = len(condition.observed)
+    predicted = condition.predicted
     if predicted.shape[1] != n:
         raise ValueError(
             f"{condition.name}: observed: got {n} values, expected {predicted.shape[1]}, one for "
@@ -323,7 +324,8 @@ def projections(pool: Floats) -> list[Projection]:
             f"predicted: {got}. If the readings have an error, add it to the prediction, such as "
             "by prb.predict(posterior, reading, x, pm.Normal.dist(0, sd, shape=m))"
         ) from None
-    caps, number = failure_caps(rows), max(1, sufficient_directions(m))
+    caps = failure_caps(rows)
+    number = max(1, sufficient_directions(m))
     return [Projection(outputs, caps, center, axes @ u) for u in directions(m, number, 0)]
 
 
@@ -444,7 +446,8 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     """
     if not isinstance(predicted, Mapping):
         name = str(getattr(predicted, "name", None) or "response")
-        observed, predicted = {name: observed}, {name: predicted}
+        observed = {name: observed}
+        predicted = {name: predicted}
     for name, prediction in predicted.items():
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
