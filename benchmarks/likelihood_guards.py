@@ -78,7 +78,7 @@ def before_the_fit(
     """Return the codes of the findings of loops and checks before the fit."""
     try:
         return {"before the fit": observe(likelihood, base, y)}
-    except prb.DesignError as error:
+    except prb.propagation.DesignError as error:
         return {"before the fit": ["refused"], "error": str(error)}
 
 

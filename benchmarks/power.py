@@ -17,7 +17,7 @@ from scipy.special import stdtr
 from scipy.stats import cramervonmises, kstest
 
 from benchmarks.study import Study
-from prbayes.validation.conditions import area
+from prbayes.validation.pit import area
 
 FITTED, FRESH = 30, 20
 ALTERNATIVES = {"none": (0.0, 1.0)}

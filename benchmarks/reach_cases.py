@@ -726,7 +726,8 @@ def own_times_log_likelihood(
 
     def misfit(x: Any, i: int) -> tuple[Any, Any]:
         """Return the sums of squared relative deviations and of log f at points (K, 3)."""
-        f = concentration(*np.exp(x).T, data["dose"][i], data["time"][i])
+        ka, cl, volume = np.exp(x).T
+        f = concentration(ka, cl, volume, data["dose"][i], data["time"][i])
         f = np.maximum(f, 1e-300)
         return ((data["readings"][i] / f - 1) ** 2).sum(axis=1), np.log(f).sum(axis=1)
 

@@ -24,7 +24,7 @@ from scipy.stats import invwishart
 
 import prbayes as prb
 from benchmarks.study import Study
-from prbayes.validation.conditions import area
+from prbayes.validation.pit import area
 
 LEVELS = (0.01, 0.05, 0.10)
 FRESH = (10, 20, 50)

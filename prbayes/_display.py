@@ -67,20 +67,14 @@ class View:
 
 
 def percentage(share: float) -> str:
-    """Return a share of one with all its digits, such as '99.5%'."""
+    """Return a share with all its digits as a percentage, such as '99.5%'."""
     return f"{100 * share:g}%"
 
 
 def p_digits(p: float, alpha: float) -> int:
-    """Return the number of digits of a p-value, two or more, that keep it on its side of alpha."""
+    """Return how many digits of a p-value, at least two, show on which side of alpha it is."""
     digits = (n for n in range(2, 17) if (float(f"{p:.{n}g}") <= alpha) == (p <= alpha))
     return next(digits, 17)
-
-
-def html_of(shown: View) -> str:
-    """Return the HTML of what a reader sees."""
-    page = shown.first_page
-    return view(page.heading, header=page.header, rows=page.rows, sentences=page.sentences)
 
 
 class Shown:
@@ -96,43 +90,40 @@ class Shown:
         return str(self.to_view())
 
     def _repr_html_(self) -> str:
-        return html_of(self.to_view())
+        shown = self.to_view().first_page
+        return view(shown.heading, header=shown.header, rows=shown.rows, sentences=shown.sentences)
 
 
-class ShownArray:
-    """A result of xarray with sentences; a selection without parts of it shows as xarray's own."""
+class ShownArray(Shown):
+    """An xarray object that prints as sentences; an incomplete selection prints as in xarray."""
 
     __slots__ = ()
-    # Dimensions, variables, groups and attributes of a whole result.
+    # Names of dimensions, variables, groups and attributes that a complete result has.
     _parts: ClassVar[tuple[str, ...]] = ()
 
-    # That of xarray has no annotations, by which type checkers would refuse each subclass.
+    # The method of xarray has no annotations, so that type checkers would refuse each subclass.
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
 
-    def to_view(self) -> View:
-        """Return what a reader sees."""
-        raise NotImplementedError
-
     @property
     def _is_whole(self) -> bool:
-        """Whether no part was selected."""
+        """Whether the result is complete, not a selection."""
         array: Any = self
         names = {*array.dims, *array.attrs, *getattr(array, "data_vars", ())}
         return set(self._parts) <= names | set(getattr(array, "children", ()))
 
     def __repr__(self) -> str:
-        """Return sentences; of a selection what xarray shows."""
-        return str(self.to_view()) if self._is_whole else super().__repr__()
+        """Return sentences, or for a selection the text of xarray."""
+        return super().__repr__() if self._is_whole else super(Shown, self).__repr__()
 
     def __str__(self) -> str:
         return repr(self)
 
     def _repr_html_(self) -> str:
-        """Show a table; of a selection what xarray shows."""
+        """Return a table as HTML, or for a selection that of xarray."""
         if self._is_whole:
-            return html_of(self.to_view())
-        return str(super()._repr_html_())  # type: ignore[misc]
+            return super()._repr_html_()
+        return str(super(Shown, self)._repr_html_())  # type: ignore[misc]
 
 
 class Tree(ShownArray, xr.DataTree):  # type: ignore[misc]  # xarray gives __repr__ a level
@@ -145,11 +136,11 @@ class Table(ShownArray, xr.Dataset):
     """A dataset with sentences."""
 
     __slots__ = ()
-    # Variables of the DataFrame, which has a row for each combination of their dimensions.
+    # Names of the variables that become columns of the data frame.
     _columns: ClassVar[tuple[str, ...]] = ()
 
     def to_dataframe(self, dim_order: Sequence[Any] | None = None) -> Any:
-        """Return the numbers of the table as a DataFrame; of a selection as xarray does."""
+        """Return the main variables as a data frame; for a selection all, as in xarray."""
         if not self._is_whole:
             return super().to_dataframe(dim_order)
         table = self[[name for name in self._columns if name in self]]

@@ -58,7 +58,7 @@ def counted(n: int, noun: str, plural: str = "") -> str:
 
 
 def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
-    """Log findings by the logger ``prbayes``, each in a record with its ``code``; return them."""
+    """Log findings with the logger ``prbayes``, each record with its ``code``; return them."""
     for finding in findings:
         _log.log(level, "%s", finding, extra={"code": finding.code})
     return findings
@@ -157,7 +157,7 @@ def _section(link: str) -> str:
     name, _, anchor = link.partition("#")
     text = _page(name)
     headings = list(re.finditer(r"^(##+) (.+)$", text, re.MULTILINE))
-    # Anchors as GitHub and the site make them of headings.
+    # GitHub and the site derive anchors from headings in this way.
     anchors = [re.sub(r"[^\w -]", "", h[2]).lower().replace(" ", "-") for h in headings]
     start = anchors.index(anchor)
     later = (h.start() for h in headings[start + 1 :] if len(h[1]) <= len(headings[start][1]))
@@ -165,7 +165,7 @@ def _section(link: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a part of a page as Markdown: without hidden code, directives and relative links."""
+    """Return a part of a page as Markdown without hidden code, directives and relative links."""
     for pattern, replacement in (
         (r"^```\{code-cell\} ipython3\n:tags: \[[^\n]*remove-(?:cell|input).*?^```\n+", ""),
         (r"^```\{code-cell\} ipython3\n(?::tags: [^\n]*\n)?\n*", "```python\n"),

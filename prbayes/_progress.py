@@ -24,9 +24,9 @@ from prbayes._validate import flag
 
 _log = logging.getLogger("prbayes")
 
-# Expected seconds from which a bar appears: shorter work needs none.
+# Expected seconds from which a bar appears, because shorter work needs none.
 _SHOWN_FROM = 2.0
-# Seconds between lines where no bar can move, as in the log of a night.
+# Seconds between lines of text if no bar can move, as in a log file.
 _LINE_EVERY = 60.0
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
@@ -40,10 +40,10 @@ def _in_kernel() -> bool:
 
 
 def _console() -> Console:
-    """Return a console on stderr; one of a notebook only with widgets, without which rich warns.
+    """Return a console on stderr; in a notebook only with widgets, without which rich warns.
 
-    A kernel without widgets is no terminal either, although its environment asks for colours: each
-    move of a bar would be a line.
+    A kernel without widgets is not treated as a terminal either, although its environment asks for
+    colours, because each move of a bar would print a line.
     """
     if find_spec("ipywidgets") is not None:
         return Console(stderr=True)
@@ -51,7 +51,7 @@ def _console() -> Console:
     return Console(stderr=True, force_jupyter=False, force_terminal=forced)
 
 
-CONSOLE = _console()  # one for all bars: an inner bar is drawn below an outer one
+CONSOLE = _console()  # a single console, so that an inner bar is drawn below an outer one
 
 
 def live() -> bool:
@@ -60,8 +60,8 @@ def live() -> bool:
 
 
 def lines() -> Callable[[str], None]:
-    """Return a function that writes a text once a minute where no bar can move, as in a log."""
-    # An executed page is a notebook without widgets.
+    """Return a function that prints a text at most once a minute, if no bar can move."""
+    # A kernel without widgets, such as that of an executed page, prints nothing.
     silent = live() or _hidden.get() or _in_kernel()
     last = time.perf_counter()
 
@@ -90,8 +90,8 @@ def shown(visible: bool) -> Iterator[bool]:
 def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str], None]]:
     """Yield a function of (newly done, note) that shows a bar, called ``name``, for long work.
 
-    The bar appears when two seconds are expected; without a ``total``, after two seconds. Where no
-    bar can move there is a line each minute.
+    The bar appears if more than two seconds are expected; without a ``total``, after two seconds.
+    If no bar can move, a line is printed each minute.
     """
     of_total = "" if total is None else "/{task.total}"
     bar = Progress(
@@ -106,7 +106,7 @@ def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str
     clock = time.perf_counter()
     completed = 0
     write = lines()
-    is_settled = _hidden.get() or not live()  # whether there is a bar, or never will be
+    is_settled = _hidden.get() or not live()  # whether the bar is shown, or never will be
 
     def advance(n: int, note: str) -> None:
         nonlocal completed, is_settled
@@ -125,10 +125,10 @@ def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str
     try:
         yield advance
     finally:
-        if bar.live.is_started:  # stopping would print a line where there is no terminal
+        if bar.live.is_started:  # stopping a hidden bar would print a line
             bar.stop()
 
 
 def _expected(elapsed: float, completed: int, total: int | None) -> float:
-    """Return the remaining seconds at the pace so far; the elapsed ones without a total."""
+    """Return the remaining seconds at the pace so far; without a total the elapsed ones."""
     return elapsed if total is None else elapsed * (total / max(completed, 1) - 1)

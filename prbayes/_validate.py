@@ -22,23 +22,25 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-# Numbers in memory at a time where work is done in blocks: 32 MiB. Where the blocks leave a trace
-# in an answer, that place says so.
+# Largest number of values in memory if work is done in blocks: 32 MiB. A comment says so where the
+# size of the blocks changes results.
 AT_ONCE = 1 << 22
 
-# Advice where a problem has no specimens.
+# Advice for problems without specimens, which need another package.
 NO_POPULATION = (
     "for one time series, which is one specimen, or parameters common to all specimens, use "
     "pm.Simulator or a pm.Normal likelihood"
 )
-# Numbers of arrays that stay in the cache of a processor: 2 MiB.
+# Number of values that stay in the cache of a processor: 2 MiB.
 IN_CACHE = 1 << 18
-# Squares of measured values, and sums of them, are finite up to here.
+# Largest measured value, so that sums of squares stay finite.
 _LARGEST = 1e152
+
+Shape = tuple[int, ...]  # sizes of the axes of an array
 
 
 def called(value: object) -> str:
-    """Return type and value of an argument for a message, on one line."""
+    """Return type and value of an argument in one line, for a message."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
@@ -77,18 +79,21 @@ def real_array(values: ArrayLike, name: str) -> Floats:
         raise TypeError(
             f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
         )
-    # NumPy would read numbers out of texts, and NaN out of None; None in a list is a missing value.
+    # NumPy would convert texts to numbers, and None to NaN. A None inside a list is a missing
+    # value.
     is_convertible = array.dtype.kind == "O" and values is not None
     if is_convertible and not any(isinstance(x, bool | np.bool_ | str | bytes) for x in array.flat):
         with suppress(TypeError, ValueError, OverflowError):
-            return np.where(pd.isna(array), np.nan, array).astype(np.float64)  # pd.NA among them
+            return np.where(pd.isna(array), np.nan, array).astype(
+                np.float64
+            )  # isna finds pd.NA, too
     got = f"an array of dtype {array.dtype}" if array.ndim else called(values)
     text = first_text(array) if array.ndim else ""
     raise TypeError(f"{name}: got {got}, expected real numbers{text and '; '}{text}")
 
 
 def first_text(array: NDArray[Any]) -> str:
-    """Return a clause on the first text of an array, if possible on one that is no number."""
+    """Describe the first text of an array for a message, preferably one that is not numeric."""
     texts = [(i, x) for i, x in enumerate(array.flat) if isinstance(x, str | bytes)]
     for i, text in texts:
         try:
@@ -132,24 +137,24 @@ def observed_sample(
     return array
 
 
-def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
+def observed_outputs(values: ArrayLike) -> Floats:
     """Return measured responses of several outputs, shape (N, m), or raise.
 
     NaN, or a mask, is an output that was not measured; +inf a specimen that failed there. Every
     specimen needs an output, and every output a finite value.
     """
-    array = real_array(values, name)
+    array = real_array(values, "observed")
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
-            f"{name}: got an array of shape {array.shape}, expected (N, m), a row for each "
+            f"observed: got an array of shape {array.shape}, expected (N, m), a row for each "
             f"specimen and a column for each output; {NO_POPULATION}"
         )
     if np.isneginf(array).any():
         raise ValueError(
-            f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
+            "observed: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
             "specimen that failed"
         )
-    refuse_huge(array, name)
+    refuse_huge(array, "observed")
     missing = np.isnan(array)
     for empty, problem, line in (
         (missing.all(axis=1), "specimens without any output", "row"),
@@ -158,14 +163,14 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     ):
         if empty.any():
             raise ValueError(
-                f"{name}: got {empty.sum()} {problem} ({line} {empty.argmax()} is one, counted "
+                f"observed: got {empty.sum()} {problem} ({line} {empty.argmax()} is one, counted "
                 "from 0), expected a number in each; leave them out"
             )
     return array
 
 
 def refuse_huge(array: Floats, name: str) -> None:
-    """Raise if the squares of values overflow: rather a mistake than a unit."""
+    """Raise if squares of values overflow, which is probably a mistake in the data."""
     largest = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
     if largest > _LARGEST:
         raise ValueError(
@@ -174,10 +179,8 @@ def refuse_huge(array: Floats, name: str) -> None:
         )
 
 
-def simulated_sample(
-    values: ArrayLike, name: str = "simulated", *, event: tuple[int, ...] = ()
-) -> Floats:
-    """Return simulated responses, (..., n, *event), or raise if NaN or -inf; +inf has failed."""
+def simulated_sample(values: ArrayLike, name: str = "simulated", *, event: Shape = ()) -> Floats:
+    """Return simulated responses, (..., n, *event), or raise for NaN or -inf; +inf is a failure."""
     array = real_array(values, name)
     batch = array.shape[: max(0, array.ndim - len(event))]
     if not batch or batch[-1] == 0 or array.shape[len(batch) :] != event:
@@ -212,7 +215,7 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
 
 def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:
     """Return labels of n specimens, shape (n,): texts or numbers, none of them missing."""
-    # As objects: NumPy would make the text 'nan' of a label that is missing.
+    # The dtype is object, because NumPy would turn a missing label into the text 'nan'.
     labels = np.asarray(values, dtype=object)
     if labels.shape != (n,):
         raise ValueError(
@@ -250,7 +253,7 @@ def number(
     closed: bool = True,
     whole: bool = False,
 ) -> float:
-    """Return a finite number between two ends, themselves if ``closed``, or raise."""
+    """Return a finite number between two ends, which are allowed if ``closed``, or raise."""
     if whole:
         expected = f"an integer >= {low:g}"
     elif high < math.inf:
@@ -277,12 +280,12 @@ def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     return int(number(value, name, low=minimum, whole=True))
 
 
-# What PyMC accepts as a seed.
+# Types that PyMC accepts as a seed.
 type Seed = int | Sequence[int] | np.random.Generator | np.random.RandomState | None
 
 
 def seed_number(random_seed: object, name: str = "random_seed") -> int:
-    """Return an integer for anything that PyMC accepts as a seed, or raise; a new one for None."""
+    """Return an integer for any seed that PyMC accepts, a random one for None, or raise."""
     match random_seed:
         case None:
             return int(np.random.SeedSequence().generate_state(1)[0])
@@ -314,7 +317,7 @@ def flag(value: object, name: str) -> bool:
 
 
 def plain_text(value: object, name: str, *, empty: bool = False) -> str:
-    """Return ``value``, or raise if it is no text, or blank unless ``empty`` is allowed."""
+    """Return ``value``, or raise if it is no text, or if it is blank and not allowed to be."""
     if not isinstance(value, str):
         raise TypeError(f"{name}: got {called(value)}, expected a text")
     if not empty and not value.strip():
@@ -361,7 +364,7 @@ def executes(value: object) -> None:
     """Raise if ``value`` is neither None nor an executor of futures of the standard library."""
     if value is None or isinstance(value, Executor):
         return
-    # A Dask client has futures of another kind, and an executor.
+    # A Dask client has futures of another kind, but can return an executor.
     is_dask = hasattr(value, "get_executor") and not isinstance(value, type)
     advice = "its get_executor(pure=False)" if is_dask else "ProcessPoolExecutor(4)"
     raise TypeError(

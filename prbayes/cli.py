@@ -1,6 +1,6 @@
 """The command line: ``python -m prbayes report results.nc``."""
 
-# Heavy modules are imported where they are used: help and mistakes are answered at once.
+# Heavy modules are imported in functions, so that help and errors appear at once.
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _report(options: argparse.Namespace) -> list[Path]:
         raise
     except (TypeError, ValueError, KeyError) as error:
         raise UserError(f"{files}: {_line(error)}") from error
-    except Exception as error:  # a crafted file may raise anything in a part of a report
+    except Exception as error:  # a manipulated file may cause any exception in a report
         raise UserError(
             f"{files}: got contents that cannot be reported ({type(error).__name__}: "
             f"{_line(error)}), expected files as prbayes writes them"
@@ -118,7 +118,7 @@ def _report(options: argparse.Namespace) -> list[Path]:
 
 
 def _refuse_to_replace(options: argparse.Namespace, html: Path | None) -> None:
-    """Raise if the documents would replace results, or without --force any file."""
+    """Raise if the documents would replace the results, or (without --force) any other file."""
     if html is not None and any(html.resolve() == path.resolve() for path in options.files):
         raise UserError(f"{html}: got the path of results, expected another path for the report")
     if options.force:
@@ -146,15 +146,17 @@ def _results(files: Sequence[Path]) -> dict[str, Any]:
         dataset = tree.to_dataset()
         value: Any
         if "posterior" in tree or "optimum" in tree:
-            kind, value = "posterior" if "posterior" in tree else "optimum", tree
+            kind = "posterior" if "posterior" in tree else "optimum"
+            value = tree
         elif kind_of_decision(dataset) is not None:
             kind, value = "decision", dataset
         else:
-            kind, value = "validity", _validity_test(path, dataset)
+            kind = "validity"
+            value = _validity_test(path, dataset)
         label = path.stem if stems.count(path.stem) == 1 else str(path)
         results.setdefault(kind, {})[label] = value
-    # A decision keeps the name of its file, which says what was asked; any other single result is
-    # called by its kind.
+    # A decision keeps the name of its file, because that describes it. Any other single result is
+    # named by its kind.
     for kind, by_label in results.items():
         if len(by_label) == 1 and kind != "decision":
             results[kind] = {kind: next(iter(by_label.values()))}
@@ -172,7 +174,7 @@ def _opened(path: Path) -> xr.DataTree:
     try:
         with xr.open_datatree(path, engine="h5netcdf") as stored:
             tree: xr.DataTree = stored.load()
-    except Exception as error:  # a reader may raise anything for bytes that are no netCDF
+    except Exception as error:  # a reader may raise anything for a file that is no netCDF
         raise UserError(
             f"{path}: got no netCDF file that can be read ({_line(error):.100})"
         ) from error

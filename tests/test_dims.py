@@ -12,8 +12,8 @@ from pytensor.graph.traversal import ancestors
 
 import prbayes as prb
 from prbayes.model.parameters import Hyperparameters
-from prbayes.response.dims import without_dims
 from prbayes.response.inputs import read_inputs
+from prbayes.response.pymc_dims import without_dims
 
 RNG = np.random.default_rng(1)
 Y = np.exp(RNG.normal(1, 0.3, 20))

@@ -35,19 +35,18 @@ def test_what_there_is_not_is_told_by_the_package_s_own_name() -> None:
     assert not hasattr(prb, "Nothing")
 
 
-def test_type_checkers_see_the_names_of_the_table() -> None:
-    tree = ast.parse(Path(str(prb.__file__)).read_text(encoding="utf-8"))
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
-    imports = {
-        alias.name: str(node.module)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert set(imports) == set(prb.__all__)
-    for name, module in imports.items():
+def test_type_checkers_see_the_public_names_and_no_others() -> None:
+    stub = Path(str(prb.__file__)).with_suffix(".pyi")
+    body = ast.parse(stub.read_text(encoding="utf-8")).body
+    imports = [node for node in body if isinstance(node, ast.ImportFrom)]
+    aliases = [(alias, node.module) for node in imports for alias in node.names]
+    assert sorted(alias.name for alias, _ in aliases) == prb.__all__
+    for alias, module in aliases:
+        assert alias.asname == alias.name  # else a type checker takes it for private
         if module != "prbayes":
-            assert getattr(prb, name).__module__ == module
+            assert getattr(prb, alias.name).__module__ == module
+    # A function `__getattr__` would make every misspelled name valid.
+    assert not any(isinstance(node, ast.FunctionDef) for node in body)
 
 
 # Results, which no user constructs.

@@ -93,7 +93,8 @@ def test_points_of_subjects() -> None:
         for k in range(2):
             mean = np.array([v["log_ka"][k], v["log_cl"][k], v["log_v"][k] + shift[k]])
             x = np.exp(mean + z * [v["sd_ka"][k], v["sd_cl"][k], v["sd_v"][k]])
-            f = cases.concentration(*x.T, data["dose"][i], data["time"][i])
+            ka, cl, volume = x.T
+            f = cases.concentration(ka, cl, volume, data["dose"][i], data["time"][i])
             density = norm.pdf(data["readings"][i], f, 0.3 * f).prod(axis=1)
             right[k] += np.log(density.mean())
     assert log_l == pytest.approx(right, abs=0.08)

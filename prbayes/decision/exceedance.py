@@ -362,7 +362,7 @@ class _Question:
         by_draw = sample.evaluate(quantity.of, self.populations.thetas)
         error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
-        kind = "stored" if sample.emulator is None else "emulated"
+        kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
         count, n_runs = sample.responses.count, sample.n_runs
         return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)

@@ -21,7 +21,6 @@ from prbayes.model.fingerprint import identity_from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
 from prbayes.model.parameters import element_name, variable_of, variables_at
 from prbayes.optimize.optimum import identity_in
-from prbayes.response.dims import is_random
 from prbayes.response.inputs import (
     Groups,
     event_shape,
@@ -30,6 +29,7 @@ from prbayes.response.inputs import (
 )
 from prbayes.response.moments import InputMoments
 from prbayes.response.outputs import SINGLE_OUTPUT
+from prbayes.response.pymc_dims import is_random
 from prbayes.results.predict import covariate_values
 
 

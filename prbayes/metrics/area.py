@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Indices
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -69,13 +69,13 @@ class AreaMetric(Metric):
 class AreaDiscrepancy(Discrepancy):
     """The area metric against fixed observed values."""
 
-    specimens: int = 0  # N of the correction for few specimens; zero for the area itself
+    specimens: int = 0  # N in the correction for few specimens; zero for the area itself
 
     @property
     def scale(self) -> float:
         """Mean absolute deviation of observed values from their mean, or one if they are equal."""
         values, weights = finite_sample(self.observed, self.weights)
-        values = values - values.min()  # equal values give exactly zero
+        values = values - values.min()  # so that equal values give exactly zero
         mean_deviation = float(weights @ np.abs(values - weights @ values))
         return mean_deviation if mean_deviation > 0 else 1.0
 
@@ -93,21 +93,21 @@ class AreaDiscrepancy(Discrepancy):
         # F goes up by the weight at each simulated value, S_N by that at each observed one.
         steps = xp.concatenate([weights, -observed_weights], axis=-1)
         steps = xp.take_along_axis(steps, order, axis=-1)
-        del order  # room for a population of ten million
+        del order  # frees memory, for populations of ten million
         # The last interval begins at the largest value and has no end.
         gap = xp.cumsum(steps, axis=-1)[..., :-1]
         heights = xp.abs(gap)
         if self.specimens:
             below = xp.cumsum(xp.maximum(steps, 0.0), axis=-1)[..., :-1]
             heights = _heights(below, below - gap, correction_table(self.specimens), xp)
-        # Intervals without an end have the length zero.
+        # Intervals that end at infinity are left out: their length is set to zero.
         is_finite = xp.abs(pooled[..., 1:]) < np.inf
         upper = xp.where(is_finite, pooled[..., 1:], 0.0)
         lower = xp.where(is_finite, pooled[..., :-1], 0.0)
         return ((heights * (upper - lower)).sum(axis=-1)[..., None],)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
-        """Return the ranks of the values among all finite values, the knots, and S_N there."""
+        """Return ranks of the values among the knots, all finite values, and S_N at the knots."""
         pooled = np.concatenate([simulated, self.observed])
         knots = np.unique(pooled[np.isfinite(pooled)])
         starts = knots[:-1]
@@ -122,12 +122,12 @@ class AreaDiscrepancy(Discrepancy):
         return areas[..., 0]
 
     def together(self, parts: tuple[Part, ...]) -> PartSum:
-        """Return areas side by side."""
+        """Combine the area metrics of several projections into one vectorised metric."""
         return AreaSum(parts)
 
 
 class AreaSum(PartSum):
-    """Areas of several projections, whose features are their values, (..., K)."""
+    """Sum of the areas of several projections; its feature is the vector of areas, (..., K)."""
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the areas, (..., K)."""
@@ -153,15 +153,15 @@ class RankedBasis(Basis):
 
     The arrays, with a row for each projection, are the order of the values, the number of values up
     to each knot, S_N at the knots, (K, m) or (K, ..., m) for several data sets, and the lengths of
-    the intervals between knots. Intervals without length fill shorter rows: the graph of many
-    projections is no larger than that of one.
+    the intervals between knots. Intervals of zero length fill shorter rows, so that the graph of
+    many projections is no larger than that of one.
     """
 
-    specimens: tuple[int, ...]  # N of each projection's correction, or zero
+    specimens: tuple[int, ...]  # N in the correction of each projection, or zero
 
     def features(self, weights: Any, xp: Any = np) -> Features:
         """Return the areas, (..., K)."""
-        if xp is np or len(self.specimens) == 1:  # one after another takes less memory
+        if xp is np or len(self.specimens) == 1:  # a loop takes less memory than one array
             areas = []
             for k, n in enumerate(self.specimens):
                 order, below, observed, lengths = [a[k] for a in self.arrays]
@@ -169,7 +169,7 @@ class RankedBasis(Basis):
                 if xp is np and observed.ndim == 1 and lengths.size > 16 * order.size:
                     areas.append(self._integrals[k].areas(weights, table))
                     continue
-                if xp is np and weights.size > 1 << 16:  # where a compiled loop repays its loading
+                if xp is np and weights.size > 1 << 16:  # a compiled loop repays its import
                     rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
                     simulated = np.empty((len(rows), len(below)))
                     sum_below(rows, order, below, simulated)
@@ -186,7 +186,7 @@ class RankedBasis(Basis):
 
     @cached_property
     def _integrals(self) -> list[_Integral]:
-        """The observed side of each projection."""
+        """The integral of S_N for each projection."""
         return [_Integral.of(*row) for row in zip(*self.arrays, strict=True)]
 
     def rows(self, index: Any) -> Self:
@@ -199,20 +199,20 @@ class RankedBasis(Basis):
 class _Integral:
     """The integral of the observed distribution function, for areas in few steps.
 
-    Between two simulated values F is constant, and S_N rises through it once.
+    Between two simulated values F is constant, so that S_N, which increases, crosses it once.
     """
 
-    order: NDArray[np.intp]  # (n,): of the simulated values
-    edges: NDArray[np.intp]  # (n + 2,): first knots of the intervals in which F is constant
-    observed: Floats  # (m,): S_N at the knots
-    positions: Floats  # (m + 1,): of the knots, from the first one
-    integral: Floats  # (m + 1,): of S_N up to each knot
+    order: Indices  # order of the simulated values, (n,)
+    edges: Indices  # first knots of the intervals in which F is constant, and the end, (n + 2,)
+    observed: Floats  # S_N at the knots, (m,)
+    positions: Floats  # distances of the knots from the first one, (m + 1,)
+    integral: Floats  # integral of S_N up to each knot, (m + 1,)
 
     @classmethod
     def of(
         cls,
-        order: NDArray[np.intp],
-        below: NDArray[np.intp],
+        order: Indices,
+        below: Indices,
         observed: Floats,
         lengths: Floats,
     ) -> _Integral:
@@ -227,7 +227,8 @@ class _Integral:
     def areas(self, weights: Floats, correction: Floats) -> Floats:
         """Return the areas for weights of the simulated values, (..., n) -> (...)."""
         simulated = cumulated(weights, self.order)
-        first, last = self.edges[:-1], self.edges[1:]
+        first = self.edges[:-1]
+        last = self.edges[1:]
         crossing = np.searchsorted(self.observed, simulated).clip(first, last)
         below, above = (
             simulated * (self.positions[end] - self.positions[start])
@@ -243,9 +244,9 @@ class _Integral:
 
 
 def with_unbiased_areas(target: Discrepancy) -> Discrepancy:
-    """Return a discrepancy whose areas, of few specimens, have no bias in a sum of several.
+    """Return a discrepancy in which areas have the correction for few specimens; see `AreaMetric`.
 
-    Observed weights count as their effective number. It is the same object without areas.
+    N is the effective number of observed weights. A discrepancy without areas is returned as it is.
     """
     if isinstance(target, AreaDiscrepancy):
         n = max(1, round(target.n_effective))
@@ -269,7 +270,8 @@ def correction_table(n: int) -> Floats:
         return np.zeros(levels.size)
     from scipy.special import betainc
 
-    # Between two steps k / n the binomial is above n q with P(K > k), else below.
+    # For q between k / n and (k + 1) / n, K exceeds n q with probability P(K > k), else it is
+    # below.
     q = np.union1d(levels, np.arange(n) / n)
     k = np.floor(n * (q[1:] + q[:-1]) / 2)
 
@@ -283,10 +285,10 @@ def correction_table(n: int) -> Floats:
 
 
 def bias_and_density(n: int, p: Floats) -> tuple[Floats, Floats]:
-    """Return the mean of sign(p - K / n), the derivative of g_n, and twice the density of its jump.
+    """Return the derivative of g_n at p, and the mean curvature in p of a corrected area.
 
-    The second one is the mean curvature of a corrected area of n specimens in p, where K has a
-    binomial distribution with n and p.
+    The derivative is the mean of sign(p - K / n) for a binomial K with n and p, the curvature is
+    twice a beta density.
     """
     from scipy.special import betainc
     from scipy.stats import beta
@@ -297,7 +299,7 @@ def bias_and_density(n: int, p: Floats) -> tuple[Floats, Floats]:
 
 
 def interpolated(tables: Floats, p: Any, xp: Any = np) -> Any:
-    """Return values between those at equal steps of p from 0 to 1, (m,) or (K, m), linearly."""
+    """Interpolate tables at equal steps of p from 0 to 1, (m,) or (K, m), linearly."""
     last = tables.shape[-1] - 1
     place = p * last
     cell = xp.where(place < last - 1, xp.maximum(xp.floor(place), 0.0), last - 1.0)
@@ -317,7 +319,7 @@ def _heights(simulated: Any, observed: Any, tables: Floats, xp: Any) -> Any:
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return arrays as rows of one array, with zeros behind those whose last axis is shorter."""
+    """Stack arrays as rows of one array; append zeros to those whose last axis is shorter."""
     sizes = [array.shape[-1] for array in arrays]
     out = np.zeros((len(arrays), *arrays[0].shape[:-1], max(sizes)), dtype=arrays[0].dtype)
     for row, array, size in zip(out, arrays, sizes, strict=True):
@@ -326,19 +328,17 @@ def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _rows_summed_below(ordered: Any, below: Any, xp: Any) -> Any:
-    """Return for each row the sums of its first ``below`` numbers, (K, n), (K, m) -> (K, m)."""
+    """Return sums of the first ``below`` numbers of each row, (K, n), (K, m) -> (K, m)."""
     total = xp.cumsum(ordered, axis=-1)
     last = xp.maximum(below - 1, 0)
     return xp.where(below > 0, xp.take_along_axis(total, last, axis=-1), 0.0)
 
 
 @compiled
-def sum_below(
-    weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp], out: Floats
-) -> None:
-    """Put the sums of the first ``below`` weights in an order, shape (rows, m), into ``out``.
+def sum_below(weights: Floats, order: Indices, below: Indices, out: Floats) -> None:
+    """Write sums of the first ``below`` weights in a given order into ``out``, (rows, m).
 
-    The weights have shape (rows, n), the order (n,), ``below`` (m,).
+    The weights have the shape (rows, n), the order (n,), and ``below`` (m,).
     """
     sums = np.zeros(len(order) + 1)
     for r in range(len(weights)):

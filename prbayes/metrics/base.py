@@ -18,11 +18,13 @@ from enum import Enum
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from prbayes._validate import (
     AT_ONCE,
     Floats,
+    Indices,
+    Shape,
     observed_outputs,
     observed_sample,
     sample_weights,
@@ -34,15 +36,17 @@ from prbayes.numerics.mixtures import effective_sample_size
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A linear combination of some of the outputs less a center."""
+    """A linear combination of some of the outputs after subtraction of a center."""
 
-    outputs: NDArray[np.intp]  # (p,): indices
-    caps: Floats  # (p,): the value of a specimen that failed
-    center: Floats  # (p,); projections with the same array have the same outputs and caps
-    direction: Floats  # (p,): coefficients of the combination
+    outputs: Indices  # indices of the outputs, (p,)
+    caps: Floats  # values that stand for a failed specimen, (p,)
+    # Values that are subtracted, (p,). Projections of the same outputs share the array, so that
+    # these outputs are centred once for all of them.
+    center: Floats
+    direction: Floats  # coefficients of the combination, (p,)
 
     def centered(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the outputs less the center, (..., n, p), a failure as the cap; NaN stays."""
+        """Return centred outputs, (..., n, p), in which caps replace failures; NaN stays."""
         outputs = simulated[..., self.outputs]
         return xp.where(outputs >= np.inf, self.caps, outputs) - self.center
 
@@ -50,7 +54,7 @@ class Projection:
         """Return the combination, (..., n, m) -> (..., n)."""
         return self.centered(simulated, xp) @ self.direction
 
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Indices]:
         """Return the projection of observed values, and the rows that have all its outputs."""
         index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
         return self.of(values[index]), index
@@ -83,16 +87,16 @@ class Minimum(Enum):
 class Part:
     """A component of a discrepancy: ``share`` times the discrepancy ``target`` of a projection."""
 
-    target: Discrepancy  # of one number of each specimen, unless its event is not empty
+    target: Discrepancy  # discrepancy of the projection, or of all outputs without one
     share: float  # factor in the sum
     label: str  # name for messages and plots
-    projection: Projection | None = None  # of a response; None for the response itself
+    projection: Projection | None = None  # projection of outputs; None for the response itself
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
         return simulated if self.projection is None else self.projection.of(simulated, xp)
 
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    def observed_of(self, values: Floats) -> tuple[Floats, Indices]:
         """Return the projection of observed values, (n, m) -> (n',), and the rows that have it."""
         if self.projection is None:
             return values, np.arange(len(values))
@@ -162,7 +166,7 @@ class Discrepancy(ABC):
     metric: Metric
     observed: Floats
     weights: Floats
-    # The fields that have a row for each data set.
+    # Names of the fields that have a row for each data set.
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights",)
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
@@ -178,7 +182,7 @@ class Discrepancy(ABC):
         return replace(self, **{name: getattr(self, name)[index] for name in self._by_data_set})
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """The shape of one specimen's response: () for one output, (m,) for several."""
         return self.observed.shape[1:]
 
@@ -271,12 +275,15 @@ class Discrepancy(ABC):
 
 
 def is_additive(target: Discrepancy) -> bool:
-    """Return whether the gradient is a mean over specimens: not where specimens lack outputs."""
+    """Return whether the gradient is a mean over specimens: never if specimens lack outputs."""
     return target.metric.additive and not np.isnan(target.observed).any()
 
 
 def is_likelihood(target: Discrepancy) -> bool:
-    """Return whether N times it is on the scale of a log-likelihood: not a mean over directions."""
+    """Return whether N times the discrepancy is on the scale of a log-likelihood.
+
+    A mean over directions is not, whatever its metric.
+    """
     return len(target.parts) == 1 and target.parts[0].target.metric.likelihood
 
 
@@ -291,7 +298,7 @@ def projected(
         if view is None:
             yield part.target, simulated
             continue
-        if view.center is not center:  # outputs are centred once for many directions
+        if view.center is not center:  # centre outputs once for all directions of a set
             center = view.center
             outputs = view.centered(simulated, xp)
         yield part.target, outputs @ view.direction
@@ -299,7 +306,7 @@ def projected(
 
 @dataclass(frozen=True, eq=False)
 class PartSum:
-    """Components of a sum that are evaluated together: here one after another."""
+    """Components of a sum that are evaluated in one call, by default one after another."""
 
     parts: tuple[Part, ...]
 
@@ -313,7 +320,9 @@ class PartSum:
 
     def basis(self, simulated: Floats, most: float) -> Basis:
         """Return the map from weights to the features."""
-        return joined([target.basis(y, most) for target, y in projected(self.parts, simulated)])
+        return concatenated(
+            [target.basis(y, most) for target, y in projected(self.parts, simulated)]
+        )
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the components times their shares, shape (..., K)."""
@@ -327,7 +336,7 @@ class PartSum:
 
 @dataclass(frozen=True, eq=False)
 class JoinedBasis(Basis):
-    """Several maps, whose features follow one another."""
+    """Concatenation of several bases."""
 
     bases: tuple[Basis, ...]
 
@@ -347,8 +356,8 @@ class JoinedBasis(Basis):
         return replace(self, arrays=sum((basis.arrays for basis in bases), ()), bases=bases)
 
 
-def joined(bases: Sequence[Basis]) -> Basis:
-    """Return several maps as one."""
+def concatenated(bases: Sequence[Basis]) -> Basis:
+    """Concatenate bases; a single one is returned as it is."""
     if len(bases) == 1:
         return bases[0]
     return JoinedBasis(sum((basis.arrays for basis in bases), ()), tuple(bases))

@@ -74,7 +74,7 @@ class FunctionDiscrepancy(Discrepancy):
     """
 
     metric: FunctionMetric
-    size: int  # number of values in such a sample
+    size: int  # number of values in a sample that is made from weights
 
     @property
     def scale(self) -> float:
@@ -132,7 +132,7 @@ class FunctionDiscrepancy(Discrepancy):
         """
         for counts in (weights * self.size, weights / weights[weights > 0].min()):
             whole = np.round(counts)
-            # Weights that are not counts differ from integers by far more.
+            # Weights that are no counts differ from integers by far more than rounding does.
             if np.abs(counts - whole).max() < 1e-6:
                 return np.repeat(self.observed, whole.astype(int))
         raise ValueError(

@@ -30,15 +30,15 @@ from prbayes.metrics.base import (
 )
 from prbayes.metrics.grid import BinCells, Cells, KernelCells, product
 
-# Grid nodes per bandwidth: the density is exact to 3e-5 of a kernel's peak (test).
+# Number of grid nodes per bandwidth. The density is exact to 3e-5 of a kernel's peak (test).
 _PER_BANDWIDTH = 4
 
-# A limit to memory, 64 kB for the density of one population.
+# Largest number of cells, which limits the memory of one population's density to 64 kB.
 _MAX_CELLS = 8192
 
 # Weight of the uniform density that is mixed into densities before a logarithm is taken. Any value
 # up to 1e-6 gives the same minimum on normal data; 1e-7 lets a forward divergence leave out an
-# outlier that 1e-9 keeps in (tests). A kernel has 1e-9 of its mass where grids end.
+# outlier that 1e-9 keeps in (tests). Grids end where a kernel has 1e-9 of its mass left.
 _FLOOR = 1e-9
 
 BandwidthRule = Callable[[Floats, Floats], float]
@@ -49,7 +49,7 @@ def spread(sample: Floats, weights: Floats) -> float:
 
     1.34 is the interquartile range of the standard normal distribution.
     """
-    sample = sample - sample.min()  # equal values give exactly zero
+    sample = sample - sample.min()  # so that equal values give exactly zero
     mean = weights @ sample
     sd = float(np.sqrt(weights @ (sample - mean) ** 2))
     low, high = quantile(sample, weights, [0.25, 0.75])
@@ -144,7 +144,7 @@ class GaussianKDE(DensityEstimator):
                 f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
                 "in units of the response, or use AreaMetric, which needs none"
             )
-        # The grid ends where kernels of the observed values have at most `_FLOOR` of their mass.
+        # The grid ends where kernels of observed values have at most `_FLOOR` of their mass left.
         step = h / _PER_BANDWIDTH
         length = float(np.ptp(observed))
         margin = max(6.0 * h, length / 2)
@@ -157,13 +157,14 @@ class GaussianKDE(DensityEstimator):
                 f"below {allowed:g} bandwidths; look for outliers, pass a larger "
                 "GaussianKDE(bandwidth=...), or use AreaMetric"
             )
-        # The kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline, up to where it
-        # is 2e-11 of its peak.
+        # The kernel at the nodes, up to 2e-11 of its peak. Its variance is reduced by that of a
+        # cubic B-spline, step^2 / 3, which binning adds.
         s = np.sqrt(h**2 - step**2 / 3)
         reach = int(np.ceil(7 * s / step))
         u = step * np.arange(-reach, reach + 1) / s
         kernel = np.exp(-0.5 * u**2) / (s * np.sqrt(2 * np.pi))
-        # The mass of a kernel up to each of its nodes, and beyond either end of the grid.
+        # The mass of a kernel at each node that is beyond the lower end of the grid; reversed, it
+        # is the mass beyond the upper end.
         mass = np.concatenate([[0.0], np.cumsum(kernel * step)])
         nodes = np.arange(n_nodes + 2 * (reach + 2)) - (reach + 2)
         below = mass[np.clip(reach - nodes, 0, mass.size - 1)]
@@ -230,7 +231,7 @@ class Histogram(DensityEstimator):
         bins = self.bins
         if bins is None:
             bin_width = 2 * 1.34 * spread(observed, weights) * float((weights**2).sum()) ** (1 / 3)
-            # At least five bins show the shape of few observations.
+            # There are at least five bins, so that few observations show some shape.
             n_bins = np.ceil((high - low) / bin_width) if bin_width > 0 else _MAX_CELLS
             bins = int(np.clip(n_bins, 5, _MAX_CELLS))
         width = (high - low) / bins
@@ -312,7 +313,7 @@ class DensityDiscrepancy(Discrepancy):
         return DenseBasis((self.cells.basis(simulated),))
 
     def together(self, parts: tuple[Part, ...]) -> PartSum:
-        """Return densities side by side."""
+        """Combine discrepancies of several projections into one, with all cells in one array."""
         return DensitySum(parts)
 
     @property
@@ -337,24 +338,24 @@ class CellwiseDiscrepancy(DensityDiscrepancy):
     @property
     @abstractmethod
     def constants(self) -> tuple[Any, ...]:
-        """Arguments of `terms` beside the density: by cell, (m,) or (..., m), or one number."""
+        """Arguments of `terms` besides the density: arrays (m,) or (..., m) by cell, or numbers."""
 
     @abstractmethod
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
-        """Return the term of each cell, shape (..., m); it reads nothing but the metric and these.
+        """Return the term of each cell, shape (..., m), from these arguments and the metric only.
 
-        The constants may be those of several records side by side.
+        The constants may be concatenated from several discrepancies.
         """
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum over the cells."""
-        # Arrays, so that a graph has the same structure for other data.
+        # Numbers become arrays, so that graphs of other data have the same structure.
         constants = tuple(map(np.atleast_1d, self.constants))
         return self.terms(features[0], constants, xp).sum(axis=-1)
 
 
 class DensitySum(PartSum):
-    """Components that compare densities, side by side: one product gives all densities."""
+    """Sum of components that compare densities; one matrix product gives all densities."""
 
     @cached_property
     def cells(self) -> list[Cells]:
@@ -363,7 +364,7 @@ class DensitySum(PartSum):
 
     @cached_property
     def _slices(self) -> list[slice]:
-        """The place of each component's cells."""
+        """The slice of each component's cells in the array of all cells."""
         ends = np.cumsum([0, *(cells.widths.size for cells in self.cells)]).tolist()
         return [slice(start, end) for start, end in pairwise(ends)]
 
@@ -374,25 +375,27 @@ class DensitySum(PartSum):
 
     @cached_property
     def _constants(self) -> tuple[Floats, ...] | None:
-        """The constants of one sum over all cells; None unless each component is such a sum."""
+        """Constants of one sum over all cells; None unless all components are sums over cells."""
         targets = [part.target for part in self.parts]
         if not all(isinstance(target, CellwiseDiscrepancy) for target in targets):
             return None
         by_part = [cast(CellwiseDiscrepancy, target).constants for target in targets]
-        side_by_side = []
-        for numbers in zip(*by_part, strict=True):  # by cell, or one for all of a component
+        concatenated = []
+        for numbers in zip(
+            *by_part, strict=True
+        ):  # an array by cell, or one number for a component
             batch = np.broadcast_shapes(*(np.shape(x)[:-1] for x in numbers))
             shapes = [(*batch, cells.widths.size) for cells in self.cells]
             columns = map(np.broadcast_to, numbers, shapes)
-            side_by_side.append(np.concatenate(list(columns), axis=-1))
-        return tuple(side_by_side)
+            concatenated.append(np.concatenate(list(columns), axis=-1))
+        return tuple(concatenated)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
-        """Return the densities side by side, (..., cells)."""
+        """Return the densities on all cells, (..., cells)."""
         return (xp.concatenate(super().features(simulated, weights, xp), axis=-1),)
 
     def basis(self, simulated: Floats, most: float) -> Basis:
-        """Return one matrix, (n, cells), or the projections where they are smaller."""
+        """Return one matrix, (n, cells), or the projections if the matrix would be too large."""
         if len(self.parts) > 1 and len(simulated) * self.n_cells > most:
             projections = np.stack(
                 [values for _, values in projected(self.parts, simulated)], axis=-1
@@ -405,7 +408,7 @@ class DensitySum(PartSum):
         return DenseBasis((matrix,))
 
     def binned(self, projections: Floats, weights: Floats) -> Floats:
-        """Return the densities side by side, (n, K), (..., n) -> (..., cells)."""
+        """Return the densities on all cells, (n, K), (..., n) -> (..., cells)."""
         densities = [
             cells.density(np.broadcast_to(values, weights.shape), weights)
             for values, cells in zip(projections.T, self.cells, strict=True)
@@ -413,7 +416,7 @@ class DensitySum(PartSum):
         return np.concatenate(densities, axis=-1)
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
-        """Return the sum of the components, in one pass over all cells where possible."""
+        """Return the sum of the components, if possible in one pass over all cells."""
         (densities,) = features
         if self._constants is None:
             by_part = tuple(densities[..., place] for place in self._slices)
@@ -431,7 +434,7 @@ class BinnedBasis(Basis):
     densities: DensitySum
 
     def features(self, weights: Any, xp: Any = np) -> Features:
-        """Return the densities side by side, (..., n) -> (..., cells)."""
+        """Return the densities on all cells, (..., n) -> (..., cells)."""
         (projections,) = self.arrays
         return (self.densities.binned(projections, weights),)
 
@@ -452,8 +455,8 @@ def is_differentiable(target: Discrepancy) -> bool:
 def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
     """Return the smallest cosine of a simulated and an observed density, (..., n) -> (...).
 
-    One if they are equal, or components compare no densities; zero if they are disjoint. Mass
-    outside the inner cells does not count.
+    The cosine is one if the densities are equal, or if no component compares densities, and zero if
+    they are disjoint. Mass outside the inner cells does not count.
     """
     batch = np.shape(simulated)[: np.ndim(simulated) - 1 - len(target.event)]
     cosines = [np.ones(batch)]
@@ -475,14 +478,14 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
 def with_common_bandwidths(
     targets: Sequence[Discrepancy], responses: Sequence[int], conditions: Sequence[int]
 ) -> list[Discrepancy]:
-    """Return discrepancies where one bandwidth serves all data of a response, if it has a rule.
+    """Return discrepancies in which a bandwidth rule is applied to all data of a response together.
 
-    Bandwidths of few data each would let the simulators that happen to scatter little weigh most,
-    so that a spread in common is underestimated. This concerns metrics on the scale of a
-    likelihood. Targets with equal numbers in ``responses`` have the same units, those with equal
-    numbers in ``conditions`` the same population. Data of one condition are pooled as they are;
-    those of several, as deviations from their means, unless Bartlett's test finds that their
-    spreads differ.
+    With a bandwidth for each few data, simulators that happen to scatter little would count most,
+    and a common spread would be underestimated. This concerns metrics on the scale of a likelihood.
+    Targets with equal numbers in ``responses`` have the same units, and those with equal numbers in
+    ``conditions`` the same population. Data of one condition are pooled as they are. Data of
+    several conditions are pooled as deviations from their means, unless Bartlett's test finds that
+    their spreads differ.
     """
     from scipy.stats import bartlett  # takes a third of the import of the package
 
@@ -525,7 +528,7 @@ def _has_bandwidth_rule(target: Discrepancy) -> bool:
 
 
 def _pooled(targets: Sequence[Discrepancy]) -> tuple[Floats, Floats]:
-    """Return the finite observed values of all targets, with weights that count specimens."""
+    """Return the finite observed values of all targets, with weights in units of specimens."""
     values = np.concatenate([target.observed for target in targets])
     counts = np.concatenate([target.weights * target.n_effective for target in targets])
     is_counted = np.isfinite(values)
@@ -534,7 +537,7 @@ def _pooled(targets: Sequence[Discrepancy]) -> tuple[Floats, Floats]:
 
 
 def _with_bandwidth(target: Any, width: float) -> Discrepancy:
-    """Return the discrepancy with a kernel of another width, itself if it is the same."""
+    """Return the discrepancy with a kernel of another width, unchanged if the width is the same."""
     if np.isclose(target.cells.bandwidth, width, rtol=1e-9, atol=0.0):
         return cast(Discrepancy, target)
     metric = replace(target.metric, density=GaussianKDE(width))

@@ -167,8 +167,7 @@ class KullbackLeibler(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         cells = self.density.cells(observed, weights)
-        density = cells.density(observed, weights)
-        return DivergenceDiscrepancy(self, observed, weights, cells, density)
+        return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
 
 
 class DivergenceDiscrepancy(CellwiseDiscrepancy):

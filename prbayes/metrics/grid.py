@@ -14,12 +14,11 @@ from functools import update_wrapper
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Indices, Shape
 
-# The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
-# of 1, t, t^2, t^3.
+# Coefficients of 1, t, t^2, t^3 of the four uniform cubic B-splines that are not zero at fraction t
+# between two nodes.
 _SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 
 
@@ -29,18 +28,25 @@ def product(weights: Floats, matrix: Floats) -> Floats:
     NumPy multiplies a batch of vectors one after another, many times slower.
     """
     *batch, n = weights.shape
-    rows = weights.reshape(int(np.prod(batch, dtype=int)), n)
+    rows = weights.reshape(math.prod(batch), n)
     return (rows @ matrix).reshape(*batch, matrix.shape[-1])
+
+
+def as_rows(values: Floats, shape: Shape) -> Floats:
+    """Return values, broadcast to a shape (..., n), as contiguous rows (rows, n) for a loop."""
+    *batch, n = shape
+    rows = np.broadcast_to(values, shape).reshape(math.prod(batch), n)
+    return np.ascontiguousarray(rows, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Cells(ABC):
-    """Cells on which densities are compared, the last two for the mass below and above all else."""
+    """Cells on which densities are compared; the last two are for the mass below and above."""
 
-    widths: Floats  # (m,): length of each cell; of the outer two, as documented by the estimator
-    centers: Floats  # (m - 2,): positions of the inner cells, in units of the response
+    widths: Floats  # length of each cell, (m,); the estimator chooses that of the outer two
+    centers: Floats  # positions of the inner cells, (m - 2,), in units of the response
     smooth: bool  # whether the density has derivatives with respect to the sample's values
-    floor: float  # the density of a small share of the mass, spread evenly over all cells
+    floor: float  # density of a small share of the mass that is spread evenly over all cells
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
@@ -52,17 +58,17 @@ class Cells(ABC):
 
     @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
+        """Return r such that ``r @ g`` is the weighted mean of a function g of the cells at points.
 
         Shapes (n,), (..., n) -> (..., m).
         """
 
     @abstractmethod
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
-        """Return the derivatives of ``(density(sample, weights) * cotangent).sum()`` for weights.
+        """Return derivatives of ``(density(sample, weights) * cotangent).sum()`` by the weights.
 
-        Or those for the sample, where all weights are one. Shapes (..., n), (..., m) -> (..., n),
-        with as many leading axes in both.
+        With ``for_sample`` they are those by the sample, for weights of one. Shapes (..., n),
+        (..., m) -> (..., n), with as many leading axes in both.
         """
 
 
@@ -70,34 +76,35 @@ class Cells(ABC):
 class KernelCells(Cells):
     """Nodes of a regular grid; mass outside counts as one tight cluster on either side.
 
-    The cluster is a single kernel, where that mass is most conspicuous. A value's kernel is divided
-    between grid and cluster at the end of the grid, so that all is smooth in the values there as
-    well. The sample is binned on more nodes than the grid has: those whose kernels reach it.
+    The cluster has the density of a single kernel, so that mass outside counts as much as possible.
+    The kernel of a value near the end of the grid is divided between grid and cluster, so that the
+    density is smooth in the values there, too. The sample is binned on more nodes than the grid
+    has: all nodes whose kernels reach the grid.
     """
 
     bandwidth: float  # standard deviation of the kernel, in units of the response
     step: float  # distance of two nodes
-    kernel: Floats  # (2 k + 1,): the kernel that smooths counts at nodes into densities
+    kernel: Floats  # kernel that smooths counts at nodes into densities, (2 k + 1,)
     low: float  # position of the first node, in steps
-    # Additional nodes on either side on which values are binned: from farther out a kernel reaches
-    # no node, whichever of four its spline brings it to.
+    # Number of additional nodes on either side on which values are binned. The kernel of a value
+    # farther out reaches no node of the grid, also after its spline has spread it to four nodes.
     margin: int
-    mass_outside: Floats  # (2, g + 2 margin): of a kernel at each of these nodes, below and above
+    # Mass below and above the grid of a kernel at each node and additional node, (2, g + 2 margin).
+    mass_outside: Floats
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return densities at the nodes, then mass below and above divided by a cluster's width."""
-        *batch, n = sample.shape
-        rows = int(np.prod(batch, dtype=int))
+        """Return densities at the nodes, then mass below and above over the width of a cluster."""
+        *batch, _ = sample.shape
         nodes = self.centers.size
-        # Bin the sample on the grid.
-        values = np.ascontiguousarray(sample.reshape(rows, n), dtype=np.float64)
-        rows_of_weights = np.broadcast_to(weights, sample.shape).reshape(rows, n)
-        rows_of_weights = np.ascontiguousarray(rows_of_weights, dtype=np.float64)
-        counts = np.zeros((rows, nodes + 2 * self.margin))
-        outside = np.zeros((rows, 2))
-        count(values, rows_of_weights, self.low, 1 / self.step, self.margin, counts, outside)
-        # Smooth the counts, within the grid and beyond its ends.
-        inner = np.zeros((rows, nodes))
+        # Bin the sample on the grid and the additional nodes.
+        values = as_rows(sample, sample.shape)
+        counts = np.zeros((len(values), nodes + 2 * self.margin))
+        outside = np.zeros((len(values), 2))
+        scale = 1 / self.step
+        rows_of_weights = as_rows(weights, sample.shape)
+        count(values, rows_of_weights, self.low, scale, self.margin, counts, outside)
+        # Smooth the counts into densities on the grid, and into mass beyond its ends.
+        inner = np.zeros((len(values), nodes))
         smooth(counts, self.kernel, -self.margin, inner)
         for side, mass in enumerate(self.mass_outside):
             reached = np.flatnonzero(mass)
@@ -109,18 +116,19 @@ class KernelCells(Cells):
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return cubic convolution weights (Keys 1981), which are exact for parabolas.
 
-        Points off the grid are read at the cell of the mass on their side.
+        Points off the grid take the value of the outer cell on their side.
         """
         last = self.centers.size - 2
         total: Any = 0.0
-        # Blocks of points whose matrices fit into memory.
+        # Work in blocks of points, so that their matrices fit into memory.
         size = max(1, AT_ONCE // self.widths.size)
         for start in range(0, max(1, points.size), size):
             block = slice(start, start + size)
             # A point is a node and a fraction of a step beyond it.
             t = points[block] / self.step - self.low
             inside = (t >= 1) & (t < last)
-            below, above = t < 1, t >= last
+            below = t < 1
+            above = t >= last
             t = np.where(inside, t, 1.0)
             node = t.astype(np.intp)
             t -= node
@@ -143,31 +151,28 @@ class KernelCells(Cells):
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
         """Return the smoothed cotangent at the sample, or its derivative there."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        rows = int(np.prod(batch, dtype=int))
         n = sample.shape[-1]
         inner = self.centers.size
         nodes = inner + 2 * self.margin
-        # Smooth the cotangent; the kernel is its own transpose.
-        flat = np.ascontiguousarray(cotangent[..., :inner]).reshape(-1, inner)
+        # Smooth the cotangent with the same kernel, because it is symmetric.
+        flat = as_rows(cotangent[..., :inner], (*cotangent.shape[:-1], inner))
         smoothed = np.zeros((len(flat), nodes))
         smooth(flat, self.kernel, self.margin, smoothed)
         ends = cotangent[..., -2:] / self.widths[-1]
         smoothed = smoothed.reshape(*cotangent.shape[:-1], nodes)
         for side, mass in enumerate(self.mass_outside):
             smoothed = smoothed + ends[..., side, None] * mass
-        # The cubic beyond each node, from the splines around: (rows, g, 4).
+        # The coefficients of the cubic beyond each node, (rows, g, 4), from the splines around it.
         spline = _SPLINE
         if for_sample:
             spline = np.pad(_SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
             ends = np.zeros(2)
-        smoothed = np.broadcast_to(smoothed, (*batch, nodes)).reshape(rows, nodes)
-        padded = np.pad(smoothed, [(0, 0), (1, 2)])
+        padded = np.pad(as_rows(smoothed, (*batch, nodes)), [(0, 0), (1, 2)])
         cubics = np.stack([padded[:, k : k + nodes] for k in range(4)], axis=-1) @ spline
-        values = np.broadcast_to(sample, (*batch, n)).reshape(rows, n)
-        values = np.ascontiguousarray(values, dtype=np.float64)
-        ends = np.ascontiguousarray(np.broadcast_to(ends, (*batch, 2)).reshape(rows, 2))
-        out = np.empty((rows, n))
-        read(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
+        values = as_rows(sample, (*batch, n))
+        ends = as_rows(ends, (*batch, 2))
+        out = np.empty(values.shape)
+        evaluate_cubics(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)
 
 
@@ -178,8 +183,8 @@ class BinCells(Cells):
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return the normalised frequency per unit length of each bin, then of the outer two."""
         *batch, n = sample.shape
-        rows = int(np.prod(batch, dtype=int))
-        # The cells of all rows are counted at once: the bins, below, above, and NaN.
+        rows = math.prod(batch)
+        # Count the cells of all rows at once. Each row has its bins, below, above, and NaN.
         cells = self.centers.size + 3
         first = cells * np.arange(rows)
         cell = self._cell(sample).reshape(rows, n) + first[:, None]
@@ -192,7 +197,7 @@ class BinCells(Cells):
         """Return the weight of the points in each bin."""
         return self.density(np.broadcast_to(points, weights.shape), weights) * self.widths
 
-    def _cell(self, sample: Floats) -> NDArray[np.intp]:
+    def _cell(self, sample: Floats) -> Indices:
         """Return cell numbers: bins, then below, above, and NaN."""
         bins = self.centers.size
         # Positions in widths from the lower edge.
@@ -200,15 +205,15 @@ class BinCells(Cells):
         low = self.centers[0] - width / 2
         position = (sample - low) / width
         finite = np.where(np.isfinite(position), position, 0.0)
-        # The upper edge belongs to the last bin, also after rounding in low + bins * width.
+        # The upper edge belongs to the last bin, also if low + bins * width is rounded.
         cell = np.clip(finite, 0, bins - 1).astype(np.intp)
-        # The margin is above the rounding of edges of some thousand bins.
+        # The tolerance exceeds the rounding of the edges of some thousand bins.
         cell = np.where(position > bins + 1e-9, bins + 1, cell)
         cell = np.where(position < -1e-9, bins, cell)
         return np.where(np.isnan(position), bins + 2, cell)
 
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
-        """Return the cell's cotangent, or zero for the sample: a step function."""
+        """Return the cotangent of the cell of each value; zero by the sample: steps are flat."""
         if for_sample:
             batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
             return np.zeros((*batch, sample.shape[-1]))
@@ -219,7 +224,7 @@ class BinCells(Cells):
 
 
 def compiled(loop: Callable[..., None]) -> Callable[..., None]:
-    """Compile with Numba at the first call, as it takes long to import, with a cache on disk."""
+    """Compile a loop with Numba at its first call, since Numba takes long to import."""
     function: Callable[..., None] | None = None
 
     def call(*args: Any) -> None:
@@ -229,7 +234,7 @@ def compiled(loop: Callable[..., None]) -> Callable[..., None]:
 
             try:
                 function = njit(cache=True, nogil=True)(loop)
-            except RuntimeError:  # no folder for the cache
+            except RuntimeError:  # there is no folder for the cache on disk
                 function = njit(nogil=True)(loop)
         function(*args)
 
@@ -248,14 +253,14 @@ def count(
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k - margin) / inverse``. Sample and weights have shape (rows, n), the
-    counts (rows, g), ``outside`` (rows, 2). NaN counts nowhere.
+    Node k is at ``(low + k - margin) / inverse``. Sample and weights have the shape (rows, n),
+    counts (rows, g), and ``outside`` (rows, 2). NaN counts nowhere.
     """
     rows, n = sample.shape
     g = counts.shape[1]
     moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
     for r in range(rows):
-        # Sum the powers of the fractions of all values beyond a node.
+        # For each node sum the powers of the fractions t of all values beyond it.
         for i in range(n):
             t = sample[r, i] * inverse - low
             w = weights[r, i]
@@ -269,7 +274,7 @@ def count(
                 outside[r, 0] += w
             elif t >= g - 2 - margin:
                 outside[r, 1] += w
-        # Four splines reach these values: their weights go to the nodes around them.
+        # Four splines are not zero at these values: distribute the weights to their nodes.
         for node in range(1, g - 2):
             m = moments[node]
             if m.any():
@@ -283,8 +288,8 @@ def count(
 def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
     """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``.
 
-    The rows have shape (rows, g), ``out`` (rows, m); the first of g is at place ``first_at``
-    of the m, which may be outside them.
+    The rows have the shape (rows, g), and ``out`` (rows, m). The first of the g numbers is at index
+    ``first_at`` of the m, which may be outside them.
     """
     rows, g = values.shape
     m = out.shape[1]
@@ -303,7 +308,7 @@ def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
 
 
 @compiled
-def read(
+def evaluate_cubics(
     sample: Floats,
     coefficients: Floats,
     outside: Floats,
@@ -312,11 +317,10 @@ def read(
     margin: int,
     out: Floats,
 ) -> None:
-    """Evaluate piecewise cubics at a sample, shape (rows, n), into ``out`` of the same shape.
+    """Evaluate piecewise cubics at a sample, (rows, n), into ``out`` of the same shape.
 
-    The coefficients of 1, t, t^2, t^3 beyond each node, which are those of `count`, have shape
-    (rows, g, 4); values below and above the grid get those of ``outside``, shape (rows, 2), and NaN
-    gets zero.
+    The coefficients of 1, t, t^2, t^3 beyond each node of `count` have the shape (rows, g, 4).
+    Values below and above the grid get the numbers of ``outside``, (rows, 2), and NaN gets zero.
     """
     rows, n = out.shape
     g = coefficients.shape[1]

@@ -6,9 +6,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, flag, real_array
+from prbayes._validate import Floats, Indices, Shape, flag, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import (
     CellwiseDiscrepancy,
@@ -93,9 +92,9 @@ class LogLikelihood(Metric):
     counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
     distance: ClassVar[bool] = False
-    # Arrays with an index, to be compared with that of observed.
+    # Arguments with an index, which is compared with that of the observed values.
     _labelled: ClassVar[tuple[Any, ...]] = ()
-    tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
+    tail_responses: ClassVar[int] = 300  # enough for standard errors that are right to a tenth
 
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
@@ -148,10 +147,10 @@ class LogLikelihood(Metric):
         """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
 
-    def of_frequencies(self, rows: NDArray[np.intp], n: int) -> LogLikelihood:
-        """Return the likelihood of specimens that are rows of n readings, by their frequencies.
+    def of_frequencies(self, rows: Indices, n: int) -> LogLikelihood:
+        """Return the likelihood of data with frequencies: specimen i has row ``rows[i]`` of n.
 
-        Arrays by reading become those of the specimens.
+        Arrays with an element for each row get one for each specimen.
         """
 
         def of_specimens(value: Any) -> Any:
@@ -162,7 +161,7 @@ class LogLikelihood(Metric):
         censored = self.censored and tuple(map(of_specimens, self.censored))
         return replace(self, error=error, rounded=of_specimens(self.rounded), censored=censored)
 
-    def readings(self, values: Floats, error: Any = None, event: tuple[int, ...] = ()) -> Readings:
+    def readings(self, values: Floats, error: Any = None, event: Shape = ()) -> Readings:
         """Return measured outputs, (N, m), with their errors, limits and rounding.
 
         ``error`` replaces an error that is a model variable; ``event`` is () for one output without
@@ -172,7 +171,7 @@ class LogLikelihood(Metric):
 
         def full(value: Any, name: str) -> Floats:
             array = np.asarray(value, dtype=np.float64)
-            # One output: an array by reading has the shape (N,).
+            # With one output an array with a number for each reading has the shape (N,).
             array = array[:, None] if not event and array.ndim == 1 else array
             try:
                 return np.array(np.broadcast_to(array, values.shape))
@@ -188,7 +187,8 @@ class LogLikelihood(Metric):
         low, high = self.censored or (None, None)
         lowest = full(-np.inf if low is None else low, "censored")
         highest = full(np.inf if high is None else high, "censored")
-        is_low, is_high = values <= lowest, values >= highest
+        is_low = values <= lowest
+        is_high = values >= highest
         lower = np.where(is_high, highest, np.where(is_low, -np.inf, np.nan))
         upper = np.where(is_high, np.inf, np.where(is_low, lowest, np.nan))
         return Readings(
@@ -208,7 +208,8 @@ class LogLikelihood(Metric):
                 "prb.LogLikelihood(density=prb.GaussianKDE())"
             )
         cells = self.density.cells(observed, weights)
-        density, reading = cells.density(observed, weights), cells.reading(observed, weights)
+        density = cells.density(observed, weights)
+        reading = cells.reading(observed, weights)
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 
@@ -231,7 +232,8 @@ def _as_tuples(array: Floats) -> Any:
 class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     """The mean log-likelihood of fixed observed values."""
 
-    # (m,) or (..., m): ``reading @ g`` is the mean at the observed values of g, given on the cells.
+    # Weights of the cells, (m,) or (..., m): ``reading @ g`` is the mean at the observed values of
+    # a function g of the cells.
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 

@@ -7,9 +7,18 @@ from functools import cache, cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from prbayes._validate import AT_ONCE, Floats, called, positive_integer, real_array, sample_weights
+from prbayes._validate import (
+    AT_ONCE,
+    Bools,
+    Floats,
+    Indices,
+    called,
+    positive_integer,
+    real_array,
+    sample_weights,
+)
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -29,7 +38,7 @@ from prbayes.metrics.whitening import (
     whitening,
 )
 
-type _Coordinates = tuple[Floats, Floats]  # center and axes, see `whitening`
+type _Coordinates = tuple[Floats, Floats]  # center and axes; see `whitening`
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +46,10 @@ class CompositeDiscrepancy(Discrepancy):
     """A sum of discrepancies of projections against fixed observed values of several outputs."""
 
     members: tuple[Part, ...]
-    # (K,) or (..., K): by component and data set, which may lack all specimens of a component.
+    # Shares of the components, (K,) or (..., K). They differ between data sets, since a data set
+    # may have no specimen of a component.
     shares: Floats
-    # Of sets of outputs that are compared by principal components.
+    # Principal components of each set of outputs that is compared by them.
     components: tuple[Components, ...] = ()
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
 
@@ -67,7 +77,7 @@ class CompositeDiscrepancy(Discrepancy):
             values, index = part.observed_of(observed)
             part_weights = w[..., index]
             has_specimens[..., k] = part_weights.sum(axis=-1) > 0
-            if not index.size:  # any values do, as they do not count
+            if not index.size:  # values without weight, which do not count
                 values = part.target.observed
                 part_weights = np.zeros((*batch, len(values)))
             part_weights = np.where(has_specimens[..., k, None], part_weights, 1.0)
@@ -117,12 +127,12 @@ def components_of(target: Discrepancy) -> tuple[Components, ...]:
 
 
 def components_summary(target: Discrepancy) -> str:
-    """Return what principal components leave out."""
+    """Return sentences about the variance that principal components leave out."""
     return "; ".join(c.summary for c in components_of(target))
 
 
 def failure_caps(observed: Floats) -> Floats:
-    """Return the value of a failure in each output: the largest one plus the range."""
+    """Return the value of a failure in each output: the largest observed one plus the range."""
     finite = np.where(np.isfinite(observed), observed, np.nan)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)
@@ -141,8 +151,8 @@ def sufficient_directions(m: int) -> int:
 def directions(m: int, number: int, seed: int) -> Floats:
     """Return well-spread unit vectors, shape (number, m), the same for the same arguments.
 
-    In the plane they are at equal angles. With more outputs they start from random places, and
-    each repels the others and their opposites.
+    In the plane they are at equal angles. In more dimensions they start at random, and each vector
+    repels the others and their opposites.
     """
     if m == 1:
         return np.ones((number, 1))
@@ -163,12 +173,12 @@ def repelled(u: Floats, steps: int = 2000) -> Floats:
 
     u = normalized(u)
     number, m = u.shape
-    # A fraction of the distance between neighbours: after longer steps rounding decides.
+    # Steps are a fraction of the distance between neighbours, since longer ones amplify rounding.
     longest = 0.2 * number ** (-1 / (m - 1))
     for step in range(steps):
         cosine = u @ u.T
         np.fill_diagonal(cosine, 0.0)
-        # The constant lets all vectors move, where two start close together.
+        # The constant bounds the force between two vectors that start close together.
         force = (cosine / (1 - cosine**2 + 1e-3)) @ u
         force -= (force * u).sum(axis=-1, keepdims=True) * u
         largest = np.linalg.norm(force, axis=-1).max()
@@ -179,7 +189,7 @@ def repelled(u: Floats, steps: int = 2000) -> Floats:
     return u
 
 
-# Attributes of a metric of one output that are those of its `Joint` metric too.
+# Attributes that a `Joint` metric takes over from its metric of one output.
 _DECLARED = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
 
 
@@ -349,20 +359,22 @@ class Joint(Metric):
         self,
         sample: Floats,
         weights: Floats,
-        outputs: NDArray[np.intp],
+        outputs: Indices,
         caps: Floats,
         n_inputs: int | None,
     ) -> tuple[_Coordinates, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
         if outputs.size > 1 and (outputs.size > MOST_OUTPUTS or self.components is not None):
             is_complete = ~np.isnan(sample).any(axis=-1)
-            sample, weights = sample[is_complete], weights[is_complete]
+            sample = sample[is_complete]
+            weights = weights[is_complete]
             sample = np.where(np.isposinf(sample), caps, sample)
             weights = weights / weights.sum()
             principal = principal_components(sample, weights, outputs, self.components)
             return _whitened_scores(principal, sample, weights), [principal]
         is_finite = np.isfinite(sample).all(axis=-1)
-        sample, weights = sample[is_finite], weights[is_finite]
+        sample = sample[is_finite]
+        weights = weights[is_finite]
         white = whitening(sample, weights, outputs)
         if n_inputs is not None and n_inputs < outputs.size:
             white = _flat(sample, weights, outputs, n_inputs) or white
@@ -376,13 +388,11 @@ def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> 
     return principal.center + principal.axes @ center, principal.axes @ axes
 
 
-def _flat(
-    sample: Floats, weights: Floats, outputs: NDArray[np.intp], n_inputs: int
-) -> _Coordinates | None:
-    """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
+def _flat(sample: Floats, weights: Floats, outputs: Indices, n_inputs: int) -> _Coordinates | None:
+    """Return white coordinates of the surface on which outputs of fewer inputs lie.
 
-    Whitening weights the bend of a surface as much as the places of specimens on it, which say more
-    about the population.
+    Whitening of all outputs would give the bend of the surface the same weight as the positions of
+    specimens on it, which depend on the population more. None if the surface is too bent.
     """
     weights = weights / weights.sum()
     center, unit = units(sample, weights, outputs)
@@ -395,11 +405,11 @@ def _flat(
     return None
 
 
-def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], float]]:
+def patterns(observed: Floats, weights: Floats) -> list[tuple[Indices, float]]:
     """Return the sets of outputs that are compared, and the share of each, (N, m), (N,).
 
-    They are those of the specimens, or their intersections where there are too many sets, or too
-    few specimens with a set.
+    Specimens with the same measured outputs form a set. Sets are replaced by their intersections if
+    there are too many of them, or too few specimens with the outputs of a set.
     """
     counted = weights > 0
     has = ~np.isnan(observed[counted])
@@ -411,20 +421,20 @@ def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], 
         rare = [key for key in shares if len(key) > 1 and _is_rare(key, has)]
         if rare:
             _divide(shares, min(rare, key=_order))
-        elif len(shares) <= 8 or not _merge(shares):  # each set has its own directions
+        elif len(shares) <= 8 or not _merge(shares):  # each set costs directions of its own
             break
     return [(np.array(sorted(key)), shares[key]) for key in sorted(shares, key=_order)]
 
 
 def _order(key: frozenset[int]) -> tuple[int, list[int]]:
-    """Return a key that sorts sets of outputs: the largest first."""
+    """Return a key by which sets of outputs are sorted, the largest first."""
     return -len(key), sorted(key)
 
 
-def _is_rare(key: frozenset[int], has: NDArray[np.bool_], fewest: int = 10) -> bool:
+def _is_rare(key: frozenset[int], has: Bools, fewest: int = 10) -> bool:
     """Return whether too few specimens have these outputs to whiten them, or their components.
 
-    The fewest for two components are five each: scatters of fewer are uncertain.
+    Two principal components need ten specimens, because scatters of fewer are uncertain.
     """
     needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else fewest
     return int(has[:, list(key)].all(axis=-1).sum()) < needed
@@ -443,7 +453,7 @@ def _divide(shares: dict[frozenset[int], float], rare: frozenset[int]) -> None:
 
 
 def _merge(shares: dict[frozenset[int], float]) -> bool:
-    """Replace the rarest set and its nearest by their intersection; return whether there is one."""
+    """Replace the rarest set and the nearest one by their intersection; False if it is empty."""
     rarest = min(shares, key=lambda key: (shares[key], _order(key)))
     candidates = sorted((key for key in shares if key != rarest), key=_order)
     nearest = max(candidates, key=lambda key: (len(key & rarest), shares[key]))

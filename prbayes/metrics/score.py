@@ -21,30 +21,31 @@ from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """Options of scores."""
+    """Options for the computation of scores."""
 
-    # Default bandwidths beyond the ends of the data, farther than which the score of a log-density
-    # is constant. It would grow without bound, and the tail of the population would decide on the
-    # posterior. The extremes expected of all specimens of the model count as data.
+    # Distance from the ends of the data, in default bandwidths, beyond which the score of a
+    # log-density is constant. Otherwise it would grow without bound, and the tail of the population
+    # would decide on the posterior. The extremes that all specimens of the model are expected to
+    # have count as data.
     reach: float = 2.0
     step: float = 1e-4  # relative step of central differences
-    block: int = 128  # specimens that are evaluated at once
-    nodes: int = 1024  # of the tables of scores as functions of a response
-    margin: float = 10.0  # default bandwidths beyond all responses where the tables end
+    block: int = 128  # number of specimens that are evaluated at once
+    nodes: int = 1024  # number of nodes in tables of scores as functions of a response
+    margin: float = 10.0  # distance of the ends of these tables from all responses, in bandwidths
 
 
 @dataclass(frozen=True, eq=False)
 class WeightSlopes:
     """Stored responses with their weights at one theta, and the derivatives of the weights."""
 
-    responses: Floats  # (M,) or (M, m)
-    weights: Floats  # (M,)
-    slopes: Floats  # (d, M): derivatives with respect to the elements of theta
+    responses: Floats  # stored responses, (M,) or (M, m)
+    weights: Floats  # weights at theta, (M,)
+    slopes: Floats  # derivatives of the weights with respect to the elements of theta, (d, M)
 
     @property
     def spread(self) -> Floats:
         """Standard deviations of the derivatives of the log weights, (d,)."""
-        # At an edge of the support weights are zero and their derivatives are not.
+        # At an edge of the support a weight may be zero although its derivative is not.
         positive = np.maximum(self.weights, 1e-3 * self.weights.mean())
         return np.asarray(np.sqrt((self.slopes**2 / positive).sum(axis=1)))
 
@@ -68,10 +69,10 @@ class WeightSlopes:
 class ShiftedResponses:
     """Responses at theta plus and minus a step along each element, from common random numbers."""
 
-    responses: Floats  # (M,) or (M, m): at theta itself
-    upper: Floats  # (d, M) or (d, M, m)
-    lower: Floats
-    steps: Floats  # (d,)
+    responses: Floats  # responses at theta itself, (M,) or (M, m)
+    upper: Floats  # responses at theta plus a step, (d, M) or (d, M, m)
+    lower: Floats  # responses at theta minus a step
+    steps: Floats  # steps, (d,)
 
     @property
     def weights(self) -> Floats:
@@ -102,13 +103,13 @@ class ShiftedResponses:
 def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floats) -> Discrepancy:
     """Return the discrepancy from the same data with the whitening of a population.
 
-    The whitening by few data depends on them, and the minimiser with it. That of the population at
-    an estimate is about the same for all data sets with this estimate. The bandwidth is that of as
-    many specimens as are observed. Data with gaps keep their whitening. Responses, (M, m), that
-    lack a number are left out.
+    A whitening by few data depends on these data, and so does the minimiser. The whitening by the
+    population at an estimate is about the same for all data sets with this estimate. The bandwidth
+    is for as many specimens as are observed. Data with gaps keep their whitening. Responses,
+    (M, m), with a missing number are left out.
     """
     if np.isnan(target.observed).any():
-        # Outputs that no specimen has together may depend on each other linearly.
+        # If no specimen has two outputs together, they may depend on each other linearly.
         return target
     metric = target.metric
     inner: Any = getattr(metric, "metric", metric)
@@ -117,7 +118,7 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
         rule = partial(_bandwidth_of_fewer, rule=density.bandwidth, size=len(target.observed))
         inner = replace(inner, density=GaussianKDE(rule))
     rows = responses.reshape(len(responses), -1)
-    # Remote responses without weight would stretch the grid.
+    # Leave out remote responses without weight, because they would stretch the grid.
     is_used = np.isfinite(rows).all(axis=1) & (weights > 1e-8 * weights.max())
     used_weights = weights[is_used] / weights[is_used].sum()
     prepared = metric.like(inner).against(responses[is_used], used_weights)
@@ -125,7 +126,7 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
 
 
 def _bandwidth_of_fewer(sample: Floats, weights: Floats, rule: BandwidthRule, size: int) -> float:
-    """Return the bandwidth of a number of specimens, by a rule in proportion to n^(-1/5)."""
+    """Return the bandwidth for ``size`` specimens, by a rule that is proportional to n^(-1/5)."""
     factor = ((weights**2).sum() * size) ** -0.2
     return float(factor * rule(sample, weights))
 
@@ -203,19 +204,23 @@ def _part_scores(
     """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
     if target.metric.likelihood:
-        # Limit the values to the reach of the data, or of as many specimens as all simulators have.
+        # Limit the values to the range of the data and a margin. With several simulators the range
+        # is that expected of as many specimens as all simulators have together.
         observed, weights = finite_sample(target.observed, target.weights)
-        lowest, highest = observed.min(), observed.max()
+        lowest = observed.min()
+        highest = observed.max()
         if total > len(target.observed):
-            simulated, mass = np.asarray(part.of(population.responses)), population.weights
+            simulated = np.asarray(part.of(population.responses))
+            mass = population.weights
             is_finite = np.isfinite(simulated)
             prob = 1 / (total + 1)
             extremes = quantile(simulated[is_finite], mass[is_finite], [prob, 1 - prob])
-            lowest, highest = min(lowest, extremes[0]), max(highest, extremes[1])
+            lowest = min(lowest, extremes[0])
+            highest = max(highest, extremes[1])
         margin = options.reach * twice_silverman(observed, weights)
         limited = np.clip(values, lowest - margin, highest + margin)
         values = np.where(np.isfinite(values), limited, values)
-    # Central differences of the discrepancy from each specimen.
+    # Take central differences of the discrepancy between population and each specimen.
     upper, lower, steps = population.neighbours(part, options)
     blocks = []
     for start in range(0, len(values), options.block):

@@ -105,7 +105,7 @@ class Summary:
 
     @property
     def values(self) -> Floats:
-        """Mean, order statistics, and one standard deviation below and above the first of these."""
+        """Mean, order statistics, and the first of them minus and plus one standard deviation."""
         places = [] if self.mean is None else [self.mean]
         places += [*self.order_statistics[:, 1]]
         if self.sd is not None:
@@ -124,19 +124,20 @@ class Summary:
 
     @property
     def center(self) -> float:
-        """The middle of the sample, from which responses are measured."""
+        """The center of the sample, which is subtracted from responses."""
         return float(self.values.mean()) if self.mean is None else float(self.mean)
 
     @property
     def unit(self) -> float:
-        """The standard deviation, or that of a normal sample with these locations; else zero."""
+        """The standard deviation, or that of a normal sample with these statistics; else zero."""
         if self.sd is not None:
             return float(self.sd)
         rank, value = self.order_statistics.T
         score = ndtri((rank - 0.375) / (self.n + 0.25))  # Blom's expected normal order statistics
         if self.mean is not None:
-            score, value = np.append(score, 0.0), np.append(value, self.mean)
-        score, value = score - score.mean() if score.size else score, value
+            score = np.append(score, 0.0)
+            value = np.append(value, self.mean)
+        score = score - score.mean() if score.size else score
         square = float(score @ score)
         return float(score @ value) / square if square > 1e-12 else 0.0
 
@@ -149,8 +150,9 @@ class Summary:
                 "that increase; leave one of two equal ones out"
             )
         lower, upper = self._limits()
-        low, high = float(lower.mean()), float(upper.mean())
-        # The statistics are rounded.
+        low = float(lower.mean())
+        high = float(upper.mean())
+        # Allow for the rounding of the statistics.
         spread = values[-1] - values[0] if values.size else 0.0
         rounding = 0.01 * max(spread, self.sd or 0.0)
         if self.mean is not None and not low - rounding <= self.mean <= high + rounding:
@@ -161,7 +163,8 @@ class Summary:
             )
         smallest, largest = _range_of_sd(lower, upper, self.mean)
         rounding = 5e-4 * np.abs(self.values).max()
-        low, high = 0.99 * smallest - rounding, 1.01 * largest + rounding
+        low = 0.99 * smallest - rounding
+        high = 1.01 * largest + rounding
         if self.sd is not None and not low <= self.sd <= high:
             raise ValueError(
                 f"Summary: sd: got {self.sd}, expected from {smallest:.4g} to {largest:.4g}, which "
@@ -185,12 +188,12 @@ class Summary:
         n p + 1 - p, and others between these.
         """
         rank, value = self.order_statistics.T
-        other = (self.n + 1) * (rank - 1) / (self.n - 1)
-        other = np.where((rank == 1) | (rank == self.n), rank, other)
+        second_rank = (self.n + 1) * (rank - 1) / (self.n - 1)
+        second_rank = np.where((rank == 1) | (rank == self.n), rank, second_rank)
         number = np.arange(1, self.n + 1)
-        before = np.searchsorted(np.maximum(rank, other) - 1e-9, number, side="right")
-        after = np.searchsorted(np.minimum(rank, other) + 1e-9, number, side="left")
-        return np.append(-np.inf, value)[before], np.append(value, np.inf)[after]
+        n_below = np.searchsorted(np.maximum(rank, second_rank) - 1e-9, number, side="right")
+        n_not_above = np.searchsorted(np.minimum(rank, second_rank) + 1e-9, number, side="left")
+        return np.append(-np.inf, value)[n_below], np.append(value, np.inf)[n_not_above]
 
 
 def _range_of_sd(lower: Floats, upper: Floats, mean: float | None) -> tuple[float, float]:

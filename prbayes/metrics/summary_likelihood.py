@@ -46,7 +46,7 @@ class SummaryLikelihood(Metric):
     additive = False
 
     def __post_init__(self) -> None:
-        if self.summary.order_statistics.size:  # as many as the kernel log-likelihood needs
+        if self.summary.order_statistics.size:  # densities at them have a kernel, too
             object.__setattr__(self, "tail_responses", LogLikelihood.tail_responses)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
@@ -73,13 +73,13 @@ def data_sheet(metric: Metric) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SummaryDiscrepancy(Discrepancy):
-    """Minus log-likelihood over n; features are moments of strata and densities, in units of sd.
+    """Minus log-likelihood over n. Features are moments of strata, and densities at the knots.
 
     Attributes
     ----------
     summary : Summary
     knots : ndarray, shape (I,)
-        The order statistics.
+        The order statistics, standardised.
     counts : ndarray, shape (I + 1,)
         Numbers of other specimens between them.
     """
@@ -102,7 +102,7 @@ class SummaryDiscrepancy(Discrepancy):
         return float(self.summary.n)
 
     def replicate(self, specimens: Floats) -> Floats:
-        """Return the statistics of as many specimens, (..., n) -> (..., statistics)."""
+        """Return the same statistics of other specimens, (..., n) -> (..., statistics)."""
         return self.summary.values_of(specimens)
 
     @property
@@ -112,19 +112,20 @@ class SummaryDiscrepancy(Discrepancy):
 
     @property
     def _powers(self) -> int:
-        """The highest moment that the statistics need, plus one."""
+        """The number of moments of each stratum that the statistics need, from order zero."""
         return 5 if self.summary.sd is not None else 3 if self.summary.mean is not None else 1
 
     def _columns(self, simulated: Any, xp: Any) -> list[Any]:
         """Return the features of single responses, (..., n) each.
 
-        Strata by power, then densities. The kernel smooths the ends of the strata too.
+        For each power the terms of the strata, then densities at the knots. The kernel of the
+        densities also smooths the ends of the strata.
         """
-        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is beyond all others
+        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is above all other values
         z = (xp.where(is_known, simulated, self.summary.center) - self.summary.center) / self._unit
         z = xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
-        # In standard deviations. Half the width of `LogLikelihood`: the scale of a tail may be a
-        # fraction of the standard deviation.
+        # Width of the kernel in standard deviations. It is half of that in `LogLikelihood`, because
+        # the scale of a tail may be a fraction of the standard deviation.
         width = 0.175 * self.summary.n**-0.25
         steps = [(knot - z) / width for knot in self.knots]
         below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
@@ -140,7 +141,7 @@ class SummaryDiscrepancy(Discrepancy):
 
     @cached_property
     def _reference(self) -> Floats:
-        """The features of a normal population like the sample."""
+        """The features of a normal population with center and unit of the sample."""
         score = ndtri((np.arange(1001) + 0.5) / 1001)
         columns = self._columns(self.summary.center + self._unit * score, np)
         return np.array([np.mean(column) for column in columns])
@@ -157,9 +158,12 @@ class SummaryDiscrepancy(Discrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return minus the log-likelihood over n."""
         (sums,) = features
-        n, size = self.summary.n, self.counts.size
-        total = xp.maximum(sums[..., :size].sum(axis=-1), 1e-300)  # less than one without response
-        # A little of the normal population, so that logarithms and ratios are finite.
+        n = self.summary.n
+        size = self.counts.size
+        total = xp.maximum(
+            sums[..., :size].sum(axis=-1), 1e-300
+        )  # less than one if points have no response
+        # Mix in a little of the normal population, so that logarithms and ratios are finite.
         shares = (1 - 1e-9) * sums / total[..., None] + 1e-9 * self._reference
         positive = xp.maximum(shares, 1e-300)
         mass = [positive[..., j] for j in range(size)]
@@ -178,52 +182,66 @@ class SummaryDiscrepancy(Discrepancy):
 
     def _log_sums(self, moments: list[list[Any]], xp: Any) -> Any:
         """Return the log-density of mean and standard deviation, given the moments of strata."""
-        summary, counts, n = self.summary, self.counts, self.summary.n
-        strata = [(c, m) for c, m in zip(counts, moments, strict=True) if c]
-        mean_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
+        summary = self.summary
+        n = self.summary.n
+        strata = [(c, m) for c, m in zip(self.counts, moments, strict=True) if c]
+        expected_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
         variance = xp.maximum(sum(c * (m[2] - m[1] ** 2) for c, m in strata), 1e-12)
         log_l, sum_score = 0.0, 0.0
         if summary.mean is not None:
-            observed = n * (summary.mean - summary.center) / self._unit
-            sum_score = (observed - mean_sum) / xp.sqrt(variance)
+            observed_sum = n * (summary.mean - summary.center) / self._unit
+            sum_score = (observed_sum - expected_sum) / xp.sqrt(variance)
             log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
-        is_known = summary.mean is not None and counts.sum() <= 1  # by the mean
-        if summary.sd is None or is_known:
+        # With at most one other specimen the standard deviation follows from the mean.
+        follows_from_mean = summary.mean is not None and self.counts.sum() <= 1
+        if summary.sd is None or follows_from_mean:
             return log_l
-        squares = sum(c * m[2] for c, m in strata) + (self.knots**2).sum()
-        expected = xp.maximum(squares - (variance + mean_sum**2) / n, 1e-12)
-        # Influence of a specimen: its squared distance from the mean.
-        middle = mean_sum / n
-        square_variance, covariance = 0.0, 0.0
-        for count, (_, first, second, third, fourth) in strata:
-            distance = second - 2 * middle * first + middle**2
-            power = (
-                fourth - 4 * middle * third + 6 * middle**2 * second
-                - 4 * middle**3 * first + middle**4
-            )  # fmt: skip
-            square_variance += count * (power - distance**2)
-            covariance += count * (third - 2 * middle * second + middle**2 * first)
-            covariance -= count * first * distance
-        if not self.knots.size:  # exact for independent specimens, as is the covariance
-            square_variance = (n - 1) / n * square_variance + 2 * (variance / n) ** 2
-        square_variance, covariance = ((n - 1) / n * v for v in (square_variance, covariance))
-        square_variance = xp.maximum(square_variance, 1e-12)
-        relative = square_variance / expected**2
-        freedom = xp.maximum(2 / relative, n - 1.0)
-        excess = xp.log((1 + relative) / (1 + 2 / freedom))  # v of (2)
-        spread = 2 / (9 * freedom)
-        center = (1 - spread) * xp.exp(-excess / 9)
-        scatter = ((1 - spread) ** 2 + spread) * xp.exp(-excess / 9) - center**2
+        expected, w_variance, covariance = self._sum_of_squares(strata, expected_sum, variance, xp)
+        center, scatter = _cube_root(w_variance / expected**2, n, xp)
         ratio = (n - 1) * (summary.sd / self._unit) ** 2 / expected
         square_score = (ratio ** (1 / 3) - center) / xp.sqrt(scatter)
         log_l = log_l - 0.5 * xp.log(scatter) - xp.log(expected) / 3
         if summary.mean is None:
             return log_l - 0.5 * square_score**2
-        # Given the mean.
-        correlation = covariance / xp.sqrt(variance * square_variance)
+        # The standard deviation given the mean: two normal scores with a correlation.
+        correlation = covariance / xp.sqrt(variance * w_variance)
         rest = xp.maximum(1 - correlation**2, 1e-6)
         residual = (square_score - correlation * sum_score) ** 2 / rest
         return log_l - 0.5 * residual - 0.5 * xp.log(rest)
+
+    def _sum_of_squares(
+        self, strata: list[tuple[float, list[Any]]], expected_sum: Any, variance: Any, xp: Any
+    ) -> tuple[Any, Any, Any]:
+        """Return mean and variance of W, and its covariance with A.
+
+        The influence of a specimen on W is its squared distance from the mean of all specimens.
+        """
+        n = self.summary.n
+        squares = sum(c * m[2] for c, m in strata) + (self.knots**2).sum()
+        expected = xp.maximum(squares - (variance + expected_sum**2) / n, 1e-12)
+        mean = expected_sum / n
+        w_variance, covariance = 0.0, 0.0
+        for count, (_, m1, m2, m3, m4) in strata:
+            # Moments of (x - mean)^2 in the stratum, and of its product with x.
+            square = m2 - 2 * mean * m1 + mean**2
+            fourth = m4 - 4 * mean * m3 + 6 * mean**2 * m2 - 4 * mean**3 * m1 + mean**4
+            w_variance += count * (fourth - square**2)
+            covariance += count * (m3 - 2 * mean * m2 + mean**2 * m1)
+            covariance -= count * m1 * square
+        if not self.knots.size:  # for independent specimens variance and covariance are exact
+            w_variance = (n - 1) / n * w_variance + 2 * (variance / n) ** 2
+        w_variance, covariance = ((n - 1) / n * moment for moment in (w_variance, covariance))
+        return expected, xp.maximum(w_variance, 1e-12), covariance
+
+
+def _cube_root(relative_variance: Any, n: int, xp: Any) -> tuple[Any, Any]:
+    """Return mean and variance of the cube root of W / E W, by (2)."""
+    freedom = xp.maximum(2 / relative_variance, n - 1.0)
+    log_variance = xp.log((1 + relative_variance) / (1 + 2 / freedom))  # v of (2)
+    spread = 2 / (9 * freedom)
+    center = (1 - spread) * xp.exp(-log_variance / 9)
+    scatter = ((1 - spread) ** 2 + spread) * xp.exp(-log_variance / 9) - center**2
+    return center, scatter
 
 
 def _normal_cdf(x: Any, xp: Any) -> Any:

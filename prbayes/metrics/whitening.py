@@ -8,17 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from prbayes._finding import counted
 from prbayes._stats import quantile
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.metrics.density import spread
 
-# More outputs than this are compared by their principal components: eight need seventy directions.
+# Largest number of outputs that are compared without principal components. Eight outputs need
+# seventy directions.
 MOST_OUTPUTS = 8
-# Share of the variance of the data that components may leave out.
+# Largest share of the variance of the data that components may leave out.
 LEFT_OUT = 0.01
 
 
@@ -26,11 +26,13 @@ LEFT_OUT = 0.01
 class Components:
     """Scores ``(y - center) @ axes`` of outputs y, and the variance that they leave out."""
 
-    center: Floats  # (m,)
-    axes: Floats  # (m, r): orthonormal
-    left_out: float  # share of the observed variance
-    rest_correlation: float  # of neighbours in the remainder of the data: near zero for noise
-    outputs: NDArray[np.intp]  # (m,): which of the outputs of a specimen
+    center: Floats  # center of the outputs, (m,)
+    axes: Floats  # orthonormal axes, (m, r)
+    left_out: float  # share of the observed variance that is left out
+    # Correlation of neighbouring outputs in the remainder of the data, which is near zero for
+    # noise.
+    rest_correlation: float
+    outputs: Indices  # indices of the outputs of a specimen, (m,)
 
     @property
     def number(self) -> int:
@@ -51,18 +53,19 @@ class Components:
         """Return the share of the variance of a population, (n, m), that they leave out."""
         values = values[:, self.outputs]
         is_usable = np.isfinite(values).all(axis=1) & (weights > 0)
-        values, weights = values[is_usable], weights[is_usable]
+        values = values[is_usable]
+        weights = weights[is_usable]
         deviations = values - np.average(values, axis=0, weights=weights)
         rest = deviations - deviations @ self.axes @ self.axes.T
         variance = float(weights @ (deviations**2).sum(axis=1))
         return float(weights @ (rest**2).sum(axis=1)) / variance if variance > 0 else 0.0
 
     def missed(self, population: float) -> str:
-        """Return a clause about what is left out; empty if it is noise that no model has.
+        """Return a clause about what is left out; empty if that is only noise of the data.
 
-        Argument is the share of the variance of the best population that they leave out.
+        ``population`` is the share of the variance of the best population that is left out.
         """
-        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # white noise has .1
+        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # that of white noise is .1
             return (
                 f"{self.summary}: this is not noise, and the metric does not compare it; pass more "
                 "components= to prb.Joint, or measure more specimens"
@@ -72,7 +75,8 @@ class Components:
                 f"{self.summary}: noise that the model also has, whose size is estimated from few "
                 "directions; leave metric= out, for the log-likelihood by specimen"
             )
-        # Components of few data leave out more of a population than of the data.
+        # Components of few data leave out more of the variance of a population than of the data, so
+        # that up to three times as much is normal.
         if population > 3 * LEFT_OUT:
             return (
                 f"{self.summary}, but {population:.2g} of that of the best population, which the "
@@ -81,20 +85,26 @@ class Components:
         return ""
 
 
+def medians(sample: Floats, weights: Floats) -> Floats:
+    """Return the weighted median of each output, (n, m) -> (m,)."""
+    return np.array([quantile(y, weights, 0.5) for y in sample.T])
+
+
 def principal_components(
-    sample: Floats, weights: Floats, outputs: NDArray[np.intp], number: int | None = None
+    sample: Floats, weights: Floats, outputs: Indices, number: int | None = None
 ) -> Components:
     """Return principal components of observed outputs, (n, m).
 
     The weight of a specimen falls with its distance from the middle of the data. Components that
-    vary no more than white noise follow the others. By default their ``number`` is the fewest
-    that leave out a hundredth of the variance, at most eight, or one for five specimens.
+    vary no more than white noise come last. By default ``number`` is the smallest number of
+    components that leave out at most a hundredth of the variance, but at most eight, and at most
+    one for every five specimens.
     """
     n, m = sample.shape
-    middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
+    middle = medians(sample, weights)
     squares = ((sample - middle) ** 2).sum(axis=1)
     typical = float(quantile(squares, weights, 0.5))
-    # Weights that fall with the fourth power of the distance from the middle.
+    # The weights fall with the fourth power of the distance from the middle.
     w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
     w = w / w.sum()
     center = w @ sample
@@ -102,26 +112,30 @@ def principal_components(
     scatter = (w[:, None] * deviations).T @ deviations
     variances, axes = np.linalg.eigh(scatter)
     variances = np.maximum(variances[::-1], np.finfo(float).tiny)
-    # White noise starts below the largest variance that it has by chance (Marchenko and Pastur). Of
-    # its components the most typical are compared: those that vary most have too large a variance.
-    # The largest one precedes them where there is room, as it may be no noise.
+    # Components with variances below the Marchenko-Pastur edge are noise. Noise components are
+    # sorted by how near their variance is to the mean, because the largest ones overstate the
+    # noise. The first of them stays in front if there is room for another one, because it may be
+    # signal.
     most = max(1, min(m, MOST_OUTPUTS, n // 5)) if number is None else min(number, m)
     remaining = np.arange(m, 0, -1)
     means = np.cumsum(variances[::-1])[::-1] / remaining
-    is_noise = variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2  # so is the last
+    is_noise = (
+        variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2
+    )  # the last component always counts as noise
     first = int(np.argmax(is_noise))
     first += most - first > 1
     atypical = np.abs(np.log(variances[first:] / means[first]))
     order = np.concatenate([np.arange(first), first + np.argsort(atypical)])
-    variances, axes = variances[order], axes[:, ::-1][:, order]
+    variances = variances[order]
+    axes = axes[:, ::-1][:, order]
     explained = np.cumsum(variances) / variances.sum()
     if number is None:
         is_sufficient = explained >= 1 - LEFT_OUT
         number = min(int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m, most)
-    # Signs that do not depend on the algorithm.
+    # Choose signs that do not depend on the algorithm: the largest coefficient is positive.
     largest = np.abs(axes).argmax(axis=0)
     axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
-    # The correlation of neighbours in the remainder.
+    # Correlation of neighbouring outputs in the remainder.
     rest = deviations - deviations @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
     variance = float((rest**2).mean())
@@ -137,19 +151,20 @@ def principal_components(
     )
 
 
-# Degrees of freedom of the t distribution of the scatter. One is the most robust, up to a share of
-# 1 / (m + 1) of gross outliers, but does not exist where many specimens have equal outputs.
+# Degrees of freedom of the t distribution of the scatter, in the order in which they are tried.
+# With one degree the scatter is the most robust, up to a share of 1 / (m + 1) of gross outliers,
+# but it does not exist if many specimens have equal outputs.
 _DEGREES = (1.0, 3.0, np.inf)
 
 
-def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def whitening(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
     """Return center and axes of invariant coordinates ``(y - center) @ axes`` of a sample, (n, m).
 
     They are the same, to rounding, after any invertible affine map of the outputs: location and
     scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
     scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
-    With fewer specimens than `sufficient_specimens` the scatter is shrunk, and only changes of
-    units and of the order of outputs change nothing.
+    With fewer specimens than `sufficient_specimens` the scatter is shrunk, and the coordinates are
+    invariant only under changes of units and of the order of outputs.
     Messages use the numbers of the ``outputs``, (m,). Raises ValueError if an output has equal
     values, outputs depend on each other linearly, or the specimens are fewer than m + 2.
 
@@ -187,7 +202,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
             "others; leave one of them out"
         )
     root = _shrunk(root, 1 / float(weights @ weights))
-    # Rotate to the axes of a second scatter, with signs by a third moment.
+    # Rotate to the axes of a second scatter; a third moment determines the signs.
     x = (z - location) @ root
     squares = (x**2).sum(axis=-1)
     _, axes = _singular(x, weights / (1 + squares) ** 2)
@@ -211,13 +226,14 @@ def sufficient_specimens(m: int) -> int:
 def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     """Return a root of the inverse scatter whose principal variances differ less, for few data.
 
-    A combination of outputs that happens to scatter little would count as much as all others. The
-    ratio of neighbouring variances shrinks, at most to one, by the ratio that two equal variances
-    of n normal values exceed by chance, ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. This shrinkage
-    falls to zero at a sufficient number of specimens.
+    Without shrinkage a combination of outputs that happens to scatter little would count as much as
+    all others. The ratio of neighbouring variances is reduced, at most to one, by the ratio that
+    two equal variances of n normal values exceed with probability ``chance``:
+    ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. The shrinkage falls to zero at a sufficient number of
+    specimens.
     """
     deficit = 1 - n / sufficient_specimens(len(root))
-    if deficit < 1e-9:  # rounding of weights
+    if deficit < 1e-9:  # a margin for the rounding of weights
         return root
     _, size, axes = np.linalg.svd(np.linalg.inv(root))
     log_size = np.log(size)
@@ -227,13 +243,13 @@ def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     return np.asarray(axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean()))
 
 
-def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def units(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
     """Return a median and a robust spread of each output, or raise for one without spread.
 
     Arguments are those of `whitening`.
     """
-    center = np.array([quantile(y, weights, 0.5) for y in sample.T])
-    # In parts of the range, whose squares do not overflow in any unit.
+    center = medians(sample, weights)
+    # Scale by the range first, so that squares do not overflow in any unit.
     length = np.ptp(sample, axis=0)
     constant = outputs[~(length > 0)]
     if constant.size:
@@ -248,8 +264,8 @@ def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[F
 def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats, Floats | None]:
     """Return location and a root of the inverse scatter of a t distribution, by iteration.
 
-    It starts with mean and covariance, so that an affine map changes no step. Last comes a linear
-    combination of outputs without scatter, or None.
+    The iteration starts with mean and covariance, so that all steps are affine equivariant. The
+    third item is a linear combination of outputs without scatter, or None.
     """
     location = np.zeros(z.shape[1])
     root = np.eye(z.shape[1])
@@ -260,7 +276,7 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
         shift = w @ x
         size, axes = _singular(x - shift, w)
         largest = max(size[0], np.abs(root).max())
-        if not size[-1] > 1e-13 * largest:  # rounding alone
+        if not size[-1] > 1e-13 * largest:  # a combination has no scatter but rounding
             return location, root, root @ axes[-1]
         location = location + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)
@@ -271,8 +287,8 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
         squares = (white**2).sum(axis=-1)
         w = weights / (1 + squares / degrees)
         w = w / w.sum()
-    # The least variance of a combination of outputs in units of their spread: below 1e-10, the
-    # rounding of measurements decides.
+    # Smallest variance of a combination of outputs, in units of their spread. Below 1e-10 it is the
+    # rounding of measurements.
     inverse = np.linalg.inv(root)
     _, least, combinations = np.linalg.svd(inverse / np.sqrt((inverse**2).sum(axis=0)))
     is_dependent = least[-1] ** 2 < 1e-10 or stretch > 1e-9
@@ -280,11 +296,11 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
 
 
 def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the roots of the eigenvalues of a second moment, and its eigenvectors as rows."""
+    """Return square roots of the eigenvalues of a second moment, and eigenvectors as rows."""
     _, size, axes = np.linalg.svd(x * np.sqrt(weights)[:, None], full_matrices=False)
     return size, axes
 
 
-def _listed(outputs: NDArray[np.intp]) -> str:
+def _listed(outputs: Indices) -> str:
     """Return the numbers of outputs for a message."""
     return ", ".join(map(str, outputs.tolist()))

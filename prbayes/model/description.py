@@ -24,9 +24,9 @@ from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.response.dims import is_random
 from prbayes.response.inputs import argument_names, unit_of
 from prbayes.response.outputs import Outputs
+from prbayes.response.pymc_dims import is_random
 
 # Fields of the description of a variable, and of a simulator.
 _VARIABLE = ("name", "role", "distribution")

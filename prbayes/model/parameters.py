@@ -31,9 +31,9 @@ from prbayes.response.compile import (
     with_leading_axis,
 )
 from prbayes.response.condition import is_condition
-from prbayes.response.dims import values_of, with_dims, without_dims
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
+from prbayes.response.pymc_dims import values_of, with_dims, without_dims
 
 # Size of a sample of thetas from a prior or a posterior; thetas cost time, but no response.
 THETAS = 256

@@ -58,7 +58,6 @@ from prbayes.model.specimen_likelihood import (
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.condition import refuse_covariates, refuse_vectors_of_specimens
-from prbayes.response.dims import values_of
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -69,6 +68,7 @@ from prbayes.response.inputs import (
     set_units,
 )
 from prbayes.response.outputs import Outputs
+from prbayes.response.pymc_dims import values_of
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
 # Options of a propagation that concern the calls of the response.

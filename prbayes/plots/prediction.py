@@ -30,7 +30,7 @@ from prbayes.plots.curves import (
     staircase,
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select
-from prbayes.validation.conditions import comparables
+from prbayes.validation.pit import comparables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,7 +22,7 @@ from prbayes.plots.canvas import (
 )
 from prbayes.plots.curves import staircase, with_gaps
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.conditions import DIRECTION
+from prbayes.validation.pit import DIRECTION
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

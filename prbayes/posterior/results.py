@@ -143,12 +143,16 @@ def _calibration(
             records[k]["required_ess"] = node.reweighted.required_ess
     if evaluator.measurements:
         failing = failing_share(evaluator, rows.mean(axis=0))
-        if by_specimen is None:
-            by_specimen = _log_likelihood_by_specimen(evaluator, chains)
+        log_likelihoods = (
+            _log_likelihood_by_specimen(evaluator, chains) if by_specimen is None else by_specimen
+        )
     for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
         name = measurement.name
         # Of simulators that share specimens the last one has their log-likelihood.
-        discrepancies[:, :, k] = -by_specimen[name].sum(axis=-1) if name in by_specimen else 0.0
+        if name in log_likelihoods:
+            discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=-1)
+        else:
+            discrepancies[:, :, k] = 0.0
         records[k] |= unknown | {
             "epsilon": 1.0,
             "failing_share": failing.get(name, np.nan),

@@ -33,8 +33,8 @@ from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
-from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.conditions import Comparable, comparables
+from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.pit import Comparable, comparables, u_values
 
 
 @dataclass(frozen=True, eq=False)

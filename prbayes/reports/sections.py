@@ -59,8 +59,8 @@ from prbayes.reports.numbers import (
 )
 from prbayes.reports.section import Section
 from prbayes.results.compare import Comparison, estimates_of
-from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.conditions import DIRECTION
+from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.pit import DIRECTION, u_values
 
 
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:

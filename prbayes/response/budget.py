@@ -29,8 +29,8 @@ class Budget:
     max_seconds: float | None = None
     max_runs: int | None = None
     start: float = field(default_factory=time.perf_counter)
-    computed: int = 0  # responses; those found in a store cost nothing
-    spent: str = ""  # why the budget is spent, as a clause; final once it is set
+    computed: int = 0  # number of computed responses; those found in a store cost nothing
+    spent: str = ""  # reason why the budget is spent, as a clause; it never changes again
 
     @property
     def is_limited(self) -> bool:
@@ -84,15 +84,15 @@ unlimited = partial(limited, None, None)
 class RunCost:
     """Runs of the response that a propagation needs."""
 
-    first: int  # at the first use of the model
-    per_theta: int  # for each value of the hyperparameters
-    most: int | None  # in all; None without a limit
+    first: int  # number of runs at the first use of the model
+    per_theta: int  # number of runs for each value of the hyperparameters
+    most: int | None  # largest number of runs in all; None without a limit
     growth: str  # condition for more runs, as a clause
 
 
 @dataclass(frozen=True)
 class SimulatorCost:
-    """Runs of one simulator: those that it needs, and those that are computed."""
+    """Numbers of runs of one simulator: those that it needs, and those already computed."""
 
     name: str
     propagation: str
@@ -164,7 +164,7 @@ class Cost(Shown):
         return pd.DataFrame(rows, columns=columns).set_index("simulator")
 
     def to_view(self) -> View:
-        """Return what a reader sees."""
+        """Return a table of the costs, with a sentence for each simulator."""
         rows = [
             [str(name), *("no limit" if x is None else str(x) for x in numbers)]
             for name, *numbers in self.to_dataframe().astype(object).itertuples(name=None)
@@ -175,8 +175,8 @@ class Cost(Shown):
 
 
 def duration(seconds: float) -> str:
-    """Return a time in the unit in which it reads best."""
+    """Return a time as a text, in seconds, minutes, hours or days."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2 * size:  # below, two digits of the smaller unit are more precise
+        if seconds >= 2 * size:  # shorter times are more precise in the smaller unit
             return f"{seconds / size:.1f} {unit}"
     return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"

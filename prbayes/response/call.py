@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import NO_POPULATION, Floats, unmasked
+from prbayes._validate import NO_POPULATION, Bools, Floats, Indices, Shape, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -35,7 +35,7 @@ from prbayes.response.failures import Abort, Failure, OnFailure, Replace, Respon
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError
 
-Rows = NDArray[np.intp]
+type Function = Callable[..., Any]  # the user's response, or a part of it
 
 
 class scalar:  # noqa: N801 (reads as a function in a model)
@@ -66,7 +66,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
            [ 0., 16.]])
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Function) -> None:
         if not callable(function):
             got = type(function).__name__
             raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
@@ -96,18 +96,23 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         return batch if outputs is None else outputs.by_key(batch)
 
 
+def unwrapped(function: Function) -> Function:
+    """Return the function of one specimen inside a `scalar`; other functions unchanged."""
+    return function.function if isinstance(function, scalar) else function
+
+
 @dataclass(frozen=True)
 class Points:
     """Points at which the response is evaluated."""
 
-    # Arguments of the response: arrays (n, *event) where they vary, constants elsewhere.
+    # Arguments of the response: an array (n, *event) if it varies, else a constant.
     arguments: Sequence[Any]
     varying: Sequence[bool]
 
     def __len__(self) -> int:
         return len(self.arguments[list(self.varying).index(True)])
 
-    def at(self, rows: Rows | int) -> Points:
+    def at(self, rows: Indices | int) -> Points:
         """Return the points at some rows; a number selects one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
@@ -118,17 +123,21 @@ class Points:
         columns = []
         for a, varies in zip(self.arguments, self.varying, strict=True):
             values = a if varies else np.broadcast_to(a, (n, *np.shape(a)))
-            columns.append(values.reshape(n, int(np.prod(values.shape[1:], dtype=int))))
+            columns.append(values.reshape(n, math.prod(values.shape[1:])))
         return np.concatenate(columns, axis=1).astype(np.float64)
 
-    def read_keys(self, keys: Floats) -> tuple[Points, NDArray[np.bool_]]:
-        """Return the points of keys (n, columns), and which have the constants of these, (n,)."""
+    def read_keys(self, keys: Floats) -> tuple[Points, Bools]:
+        """Return the points that keys, (n, columns), stand for, and whether constants agree, (n,).
+
+        The constants of a key are compared with those of these points.
+        """
         have_same_constants = np.ones(len(keys), dtype=bool)
         arguments = []
         stop = 0
         for a, varies in zip(self.arguments, self.varying, strict=True):
             event = np.shape(a)[1:] if varies else np.shape(a)
-            start, stop = stop, stop + int(np.prod(event, dtype=int))
+            start = stop
+            stop = stop + math.prod(event)
             values = keys[:, start:stop]
             if not varies:
                 have_same_constants &= (values == np.ravel(a)).all(axis=1)
@@ -140,24 +149,24 @@ class Points:
 class Chunk:
     """Responses at the points of a chunk, as a worker returns them."""
 
-    # (m, *event): NaN where the response raised, or was not called after an earlier failure.
+    # Responses, (m, *event): NaN where the response raised, or was not called after a failure.
     values: Floats
     raised: dict[int, str]  # reasons of failures by row
-    seconds: float
-    named: Outputs | None = None  # outputs of a mapping, where they were not known
+    seconds: float  # duration of all calls
+    named: Outputs | None = None  # outputs that the first mapping declared, if nobody stated them
 
 
 def compute(
-    function: Callable[..., Any] | bytes,
+    function: Function | bytes,
     points: Points,
     tolerant: bool,
     timeout: float | None = None,
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> Chunk:
-    """Return the responses at points; unless failures are tolerated, up to the first one.
+    """Return the responses at points. Unless failures are tolerated, the first one ends the work.
 
-    A `scalar` is called for each point, another function for all, bisected if it raises. Bytes are
-    a function that was `packed` in another process.
+    A `scalar` is called for each point. Another function is called for all points at once; if it
+    raises, the points are bisected. Bytes are a function that was `packed` in another process.
     """
     if isinstance(function, bytes):
         function = unpacked(function)
@@ -166,12 +175,12 @@ def compute(
     values = np.full((n, *(() if outputs is None else outputs.event)), np.nan)
     raised = {}
     is_scalar = isinstance(function, scalar)
-    call = function.function if isinstance(function, scalar) else function
+    call = unwrapped(function)
     waiting = [np.array([i]) for i in reversed(range(n))] if is_scalar else [np.arange(n)]
     while waiting:
         rows = waiting.pop()
         arguments = points.at(int(rows[0]) if is_scalar else rows).arguments
-        # Copies, which the function may change in place.
+        # Pass copies, because the function may change its arguments in place.
         copies = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
         try:
             with np.errstate(all="ignore"), time_limit(timeout and timeout * rows.size):
@@ -194,8 +203,8 @@ def compute(
     return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
-def assign_rows(values: Floats, rows: Rows, responses: Floats) -> Floats:
-    """Return values with the responses at some rows, with an axis of outputs if these have one."""
+def assign_rows(values: Floats, rows: Indices, responses: Floats) -> Floats:
+    """Replace some rows of values by responses; add an axis of outputs if these have one."""
     if values.ndim == 1 and responses.ndim > 1:
         values = np.repeat(values[:, None], responses.shape[1], axis=1)
     values[rows] = responses
@@ -242,14 +251,14 @@ def _specimen_response(result: Any, outputs: Outputs | None) -> tuple[Floats, Ou
 
 def checked(
     result: Any,
-    batch: tuple[int, ...],
+    batch: Shape,
     arguments: Sequence[Any],
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> tuple[Floats, Outputs | None]:
     """Return a result as floats, (*batch, *event), and its outputs, or raise `ResponseError`."""
     try:
         if hasattr(result, "_fields") and (outputs is None or outputs.keys):
-            result = result._asdict()  # of a named tuple
+            result = result._asdict()  # a named tuple is read as a mapping
         if outputs is None:
             outputs = outputs_of_result(result, len(batch))
         if isinstance(result, Mapping):
@@ -273,14 +282,16 @@ def checked(
     expected = event[:1] if outputs is None else outputs.event
     if array.shape != batch + expected:
         remedy = "return as many numbers as were observed of a specimen"
-        if np.prod(batch, dtype=int) == 1 and not expected:  # a specimen by itself
+        if math.prod(batch) == 1 and not expected:  # a batch of one specimen
             remedy = f"return one number; {PER_SPECIMEN}"
         elif batch:
             remedy = (
                 "reduce over the event axis only (the last one), or wrap a function of one "
                 "specimen in prb.scalar"
             )
-            if len(event) == 1 and not expected:  # values of one specimen, observed as specimens
+            if (
+                len(event) == 1 and not expected
+            ):  # a curve of one specimen was observed as specimens
                 remedy += f"; {NO_POPULATION}"
             if not event and expected:
                 remedy = "return outputs along a last axis, or as a mapping"
@@ -299,7 +310,7 @@ def checked(
             f"{count} per specimen; {remedy}"
         )
     values = array.astype(np.float64)
-    if expected:  # a point with an output that is NaN has no response
+    if expected:  # a point has no response if one of its outputs is NaN
         values[np.isnan(values).any(axis=-1)] = np.nan
     refuse_negative_infinity(values)
     return values, outputs
@@ -316,7 +327,7 @@ def refuse_negative_infinity(values: Floats) -> None:
         )
 
 
-# What to do with an array of values of the measured specimens inside a response.
+# Advice for a response that contains an array with a value for each measured specimen.
 PER_SPECIMEN = (
     "a value that is known for each specimen, such as its load, is no constant: make it an input "
     "with a distribution, such as pm.Uniform.dist(1, 2), return it as an output beside the "
@@ -325,7 +336,7 @@ PER_SPECIMEN = (
 
 
 def array_advice(reason: str) -> str:
-    """Return advice where a response raised since its arrays do not fit together."""
+    """Return advice if a response raised because array shapes do not match, else an empty text."""
     is_size = "broadcast" in reason or "ength of values" in reason
     return f"; {PER_SPECIMEN}; {NO_POPULATION}" if is_size else ""
 
@@ -336,12 +347,12 @@ def shapes(arguments: Sequence[Any]) -> str:
 
 
 def column_names(names: Sequence[str], sizes: Sequence[int]) -> tuple[str, ...]:
-    """Return a name of each number of a point from the names and sizes of the inputs."""
+    """Return a name for each number of a point, from the names and sizes of the inputs."""
     pairs = zip(names, sizes, strict=True)
     return tuple(f"{x}[{i}]" if k > 1 else x for x, k in pairs for i in range(k))
 
 
-def packed(function: Callable[..., Any]) -> bytes:
+def packed(function: Function) -> bytes:
     """Return a function as bytes for another process."""
     import cloudpickle
 
@@ -357,7 +368,7 @@ class _Limited(io.BytesIO):
         return super().write(data)
 
 
-def written_form(function: Callable[..., Any]) -> bytes | None:
+def written_form(function: Function) -> bytes | None:
     """Return a function with the variables that it reads, as bytes; None if it has no such form.
 
     Variables of an imported module are not in it.
@@ -367,13 +378,13 @@ def written_form(function: Callable[..., Any]) -> bytes | None:
     file = _Limited()
     try:
         cloudpickle.dump(function, file)
-    except Exception:  # whatever an object raises that cannot be pickled
+    except Exception:  # an object that cannot be pickled may raise anything
         return None
     return file.getvalue()
 
 
-@lru_cache(maxsize=8)  # for the responses of several simulators
-def unpacked(payload: bytes) -> Callable[..., Any]:
+@lru_cache(maxsize=8)  # a few functions, because a model may have several simulators
+def unpacked(payload: bytes) -> Function:
     """Return a function from its bytes."""
     import cloudpickle
 
@@ -381,21 +392,21 @@ def unpacked(payload: bytes) -> Callable[..., Any]:
 
 
 # A finished chunk, with the rows of its points.
-type Finished = tuple[Rows, Chunk]
+type Finished = tuple[Indices, Chunk]
 
 
 @dataclass(frozen=True)
 class CallSettings:
     """How a response is called."""
 
-    name: str  # of the simulator, for messages
-    function: Callable[..., Any]
-    executor: Executor | None = None  # None computes in this process
+    name: str  # name of the simulator, for messages
+    function: Function
+    executor: Executor | None = None  # executor of the calls; None computes in this process
     store: Store | None = None
     on_failure: OnFailure = field(default_factory=Abort)
     retry_failed: bool = False  # whether points stored as failed, or NaN, are computed again
     timeout: float | None = None  # seconds for one response
-    outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
+    outputs: Outputs | None = SINGLE_OUTPUT  # stated outputs; None takes those of the first run
     columns: tuple[str, ...] = ()  # names of the numbers of a point
     takes_policy: bool = True  # whether the caller of the public function can pass on_failure
 
@@ -404,12 +415,12 @@ class CallSettings:
 class Tally:
     """Counts, time and failures of the calls of a response."""
 
-    computed: int = 0  # responses, with those tried again and without those found in a store
-    failures: int = 0  # points whose response failed in the end and was replaced
-    seconds: float = 0.0  # running mean for one response, which sizes chunks; 0 before the first
+    computed: int = 0  # number of computed responses: repeated ones count, stored ones do not
+    failures: int = 0  # number of points whose response failed at the last try and was replaced
+    seconds: float = 0.0  # running mean for one response, from which chunks are sized; 0 if unknown
     has_succeeded: bool = False  # whether any run gave a response
-    named: Outputs | None = None  # outputs of mappings, where they were not known
-    failed: dict[bytes, Failure] = field(default_factory=dict)  # by inputs
+    named: Outputs | None = None  # outputs that the first mapping declared, if nobody stated them
+    failed: dict[bytes, Failure] = field(default_factory=dict)  # failures by their inputs
 
     def aligned(self, chunk: Chunk) -> Floats:
         """Return the responses of a chunk, with columns in the order of the first chunk."""
@@ -432,7 +443,7 @@ class Tally:
         self.seconds = 0.7 * self.seconds + 0.3 * mean if self.seconds != 0 else mean
 
     def record_failures(self, points: Points, reasons: dict[int, str]) -> None:
-        """Keep inputs and reasons of failures, by row; of ten thousand, about 10 MB."""
+        """Store inputs and reasons of failures, given by row; at most ten thousand, about 10 MB."""
         for row, reason in reasons.items():
             if len(self.failed) == 10_000:
                 break
@@ -440,7 +451,7 @@ class Tally:
             self.failed.setdefault(inputs.tobytes(), Failure(inputs, reason))
 
     def copied(self) -> Tally:
-        """Return a tally that counts on independently."""
+        """Return an independent copy of the tally."""
         return replace(self, failed=dict(self.failed))
 
 
@@ -458,7 +469,8 @@ def respond(
     policy = settings.on_failure
     _verify_store(settings, points, tally)
     event = () if settings.outputs is None else settings.outputs.event
-    values, missing = np.full((len(points), *event), np.nan), np.arange(len(points))
+    values = np.full((len(points), *event), np.nan)
+    missing = np.arange(len(points))
     failed: dict[int, str] = {}
     raised: dict[int, str] = {}
     if settings.store is not None:
@@ -486,7 +498,7 @@ def respond(
                 raised.update({int(rows[i]): reason for i, reason in chunk.raised.items()})
                 tally.has_succeeded |= len(chunk.raised) < len(rows)
             if not tally.has_succeeded and raised and all(map(is_wrong_result, raised.values())):
-                # No run has given a response: the function is another one, whatever the policy.
+                # If no run has given a response, the function is wrong, whatever the policy.
                 raise _failure_error(settings, points, raised)
             if settings.store is not None:
                 _add_to_store(settings.store, keys, finished, is_last=is_last, tolerant=tolerant)
@@ -507,29 +519,33 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
     keys, values = store.known()
     stored_points, is_comparable = points.read_keys(keys)
     is_comparable[list(store.failed(keys))] = False
-    if settings.retry_failed:  # these are computed again in any case
+    if settings.retry_failed:  # a stored NaN is computed again in any case
         is_comparable &= ~is_missing(values)
     usable = np.flatnonzero(is_comparable)
-    rows = usable[revealing_rows(values[usable])]
-    if rows.size:
-        again, raised = computed_again(settings, stored_points.at(rows), tally)
-        # More than the rounding of another machine or version of a library.
-        changed = first_change(values[rows], again, 1e-6 * typical_size(values[usable]))
-        if changed is not None:
-            row = rows[changed]
-            text = numbers_text(again[changed])
-            remedy = "pass"
-            if changed in raised:
-                text = f"nothing ({raised[changed]})"
-            elif np.isnan(values[row]).any():
-                remedy = "after a repair pass retry_failed=True, which computes NaN again, or pass"
-            raise StoreError(
-                f"{settings.name}: store: got a response that gives {text} at "
-                f"({', '.join(f'{x:.6g}' for x in keys[row])}), expected "
-                f"{numbers_text(values[row])}, which is stored in {store.path}: it is another "
-                f"function, or its variables have changed; nothing was changed: {remedy} another "
-                "folder, or version= with a new name, whose runs are stored apart"
-            )
+    reasons: dict[int, str] = {}
+
+    def compute(selected: Indices) -> Floats:
+        again, raised = computed_again(settings, stored_points.at(usable[selected]), tally)
+        reasons.update({int(selected[i]): reason for i, reason in raised.items()})
+        return again
+
+    change = changed_run(values[usable], compute)
+    if change is not None:
+        selected, again = change
+        row = usable[selected]
+        text = numbers_text(again)
+        remedy = "pass"
+        if selected in reasons:
+            text = f"nothing ({reasons[selected]})"
+        elif np.isnan(values[row]).any():
+            remedy = "after a repair pass retry_failed=True, which computes NaN again, or pass"
+        raise StoreError(
+            f"{settings.name}: store: got a response that gives {text} at "
+            f"({', '.join(f'{x:.6g}' for x in keys[row])}), expected "
+            f"{numbers_text(values[row])}, which is stored in {store.path}: it is another "
+            f"function, or its variables have changed; nothing was changed: {remedy} another "
+            "folder, or version= with a new name, whose runs are stored apart"
+        )
     store.verified = True
 
 
@@ -538,7 +554,8 @@ def computed_again(
 ) -> tuple[Floats, dict[int, str]]:
     """Return responses at points, (n, *event), NaN where they raised, and the reasons by row."""
     event = () if settings.outputs is None else settings.outputs.event
-    values, waiting = np.full((len(points), *event), np.nan), np.arange(len(points))
+    values = np.full((len(points), *event), np.nan)
+    waiting = np.arange(len(points))
     raised: dict[int, str] = {}
     for _ in range(settings.on_failure.tries):
         raised = {}
@@ -557,34 +574,46 @@ def by_output(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def revealing_rows(values: Floats) -> Rows:
+def revealing_rows(values: Floats) -> Indices:
     """Return rows of responses, (n,) or (n, m), at which a change of the function can show.
 
     The largest, the middle and the smallest response, one that is NaN and one that is infinite.
     The largest comes first, as the first run of a design may be the smallest.
     """
     columns = by_output(values)
-    is_finite = np.isfinite(columns).all(axis=1)
+    finite = finite_runs(values)
     is_nan = np.isnan(columns).any(axis=1)
-    finite = np.flatnonzero(is_finite)
+    is_infinite = np.isinf(columns).any(axis=1) & ~is_nan
     size = np.abs(columns[finite]).max(axis=0, initial=0.0)
     sums = (columns[finite] / np.where(size > 0, size, 1.0)).sum(axis=1)
     order = finite[np.argsort(sums, kind="stable")]
     selected = [order[-1:], order[len(order) // 2 :][:1], order[:1]]
-    selected += [np.flatnonzero(kind)[:1] for kind in (is_nan, ~is_finite & ~is_nan)]
+    selected += [np.flatnonzero(kind)[:1] for kind in (is_nan, is_infinite)]
     return np.array(list(dict.fromkeys(np.concatenate(selected).tolist())), dtype=np.intp)
 
 
-def typical_size(values: Floats) -> Any:
-    """Return the median size of finite responses, (n,) or (n, m), of each output."""
-    finite = values[np.isfinite(by_output(values)).all(axis=1)]
-    return np.median(np.abs(finite), axis=0) if len(finite) else 0.0
+def finite_runs(values: Floats) -> Indices:
+    """Return the rows of responses, (n,) or (n, m), all outputs of which are finite."""
+    return np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
+
+
+def tolerance_of(values: Floats, share: float = 0.0) -> Any:
+    """Return how much one of the responses, (n,) or (n, m), may change, for each output.
+
+    It is the share of their standard deviation, but at least 1e-6 of their median size: more than
+    the rounding of another machine, or of another version of a library.
+    """
+    finite = values[finite_runs(values)]
+    if not len(finite):
+        return 0.0
+    rounding = 1e-6 * np.median(np.abs(finite), axis=0)
+    return np.maximum(rounding, share * finite.std(axis=0)) if share else rounding
 
 
 def first_change(values: Floats, again: Floats, tolerance: Any) -> int | None:
-    """Return the first row in which responses differ from those computed again; None if none.
+    """Return the first row in which responses differ from those computed again; None if none does.
 
-    The tolerance is for small responses; that of large ones is 1e-6 of them.
+    Large responses may differ by 1e-6 of their size if that is more than the tolerance.
     """
     if again.shape != values.shape:
         return 0
@@ -595,8 +624,28 @@ def first_change(values: Floats, again: Floats, tolerance: Any) -> int | None:
     return int(rows[0]) if rows.size else None
 
 
+def changed_run(
+    values: Floats,
+    compute: Callable[[Indices], Floats],
+    share: float = 0.0,
+    *,
+    may_fail: bool = False,
+) -> tuple[int, Floats] | None:
+    """Return the row of a run that differs when it is computed again, and its response then.
+
+    A few runs, (n,) or (n, m), are computed; see `revealing_rows`. The ``share`` is that of
+    `tolerance_of`. With ``may_fail`` a run that fails now is no change: it may fail by chance.
+    """
+    rows = revealing_rows(values)
+    again = compute(rows) if rows.size else values[rows]
+    if may_fail:
+        again = np.where(np.isnan(again), values[rows], again)
+    changed = first_change(values[rows], again, tolerance_of(values, share))
+    return None if changed is None else (int(rows[changed]), again[changed])
+
+
 def numbers_text(values: Floats, digits: int = 10) -> str:
-    """Return the numbers of a run, () or (m,), as a text of at most six."""
+    """Return at most six numbers of a run, () or (m,), as a text."""
     values = np.ravel(values)
     text = ", ".join(f"{value:.{digits}g}" for value in values[:6])
     if values.size == 1:
@@ -607,10 +656,10 @@ def numbers_text(values: Floats, digits: int = 10) -> str:
 def _add_to_store(
     store: Store, keys: Floats, finished: Sequence[Finished], *, is_last: bool, tolerant: bool
 ) -> None:
-    """Store finished chunks in one transaction, since each waits for the disk."""
+    """Store finished chunks in one transaction, since each transaction waits for the disk."""
     parts = []
     for rows, chunk in finished:
-        # After the last try NaN is a result, too, except in a chunk that a failure ended.
+        # After the last try a NaN is stored as a result, except in a chunk that a failure ended.
         is_complete = tolerant or not chunk.raised
         stored = np.flatnonzero(~is_missing(chunk.values) | (is_last and is_complete))
         if stored.size:
@@ -663,7 +712,7 @@ def named_numbers(names: Sequence[str], numbers: Floats) -> str:
 def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str]) -> ResponseError:
     row, reason = next(iter(raised.items()))
     place = ""
-    if isinstance(settings.function, scalar):  # the point of a batch is not known
+    if isinstance(settings.function, scalar):  # in a batch it is not known which point failed
         place = f", the first with inputs {inputs_text(settings, points, row)}"
     store_text = ""
     if settings.store is not None:
@@ -690,38 +739,42 @@ def chunk_size(settings: CallSettings, tally: Tally, n_left: int, workers: int) 
     """Return the number of points for the next chunk."""
     is_scalar = isinstance(settings.function, scalar)
     if tally.seconds == 0:
-        # The cost is not known yet, and may be minutes for each point.
-        # Never all at once: a function that takes one number of specimens is refused.
+        # The cost is not known yet, and may be minutes for each point. A batch never has all
+        # points, so that a function that takes only one number of specimens is found out.
         return 1 if is_scalar else min(16, max(1, n_left // 3))
-    # From twice the cost of sending a chunk on, no response waits for others to be stored.
+    # If a response takes more than twice the time of sending a chunk, send one per chunk, so that
+    # each is stored at once.
     if is_scalar and tally.seconds >= 0.01:
         return 1
-    # Smaller chunks towards the end keep all workers busy. Otherwise 0.2 s: long against the 4.5 ms
-    # that sending one costs (`python -m benchmarks.scale`), short against the loss of a worker.
+    # Smaller chunks towards the end keep all workers busy. Before that a chunk takes 0.2 s. This is
+    # long compared with the 4.5 ms that sending one takes (`python -m benchmarks.scale`), and short
+    # enough that a lost worker costs little.
     share = n_left if settings.executor is None else max(1, n_left // (2 * workers))
     return int(max(1, min(share, 0.2 / tally.seconds)))
 
 
 def chunks(
-    settings: CallSettings, points: Points, rows: Rows, tolerant: bool, tally: Tally
+    settings: CallSettings, points: Points, rows: Indices, tolerant: bool, tally: Tally
 ) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
     After a failure that is not tolerated, a lost worker, or a spent budget, no chunk begins; those
     that have begun are yielded before the error is raised.
     """
-    # Other processes get the function as bytes.
+    # Other processes get the function as bytes, because pickle does not take lambdas.
     options: dict[str, Any] = {"outputs": settings.outputs}
-    function: Callable[..., Any] | bytes = settings.function
+    function: Function | bytes = settings.function
     if settings.executor is not None and not isinstance(settings.executor, ThreadPoolExecutor):
         function, options["timeout"] = packed(settings.function), settings.timeout
     work = partial(compute, function, **options)
     workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
-    suspects: list[Rows] = []  # chunks at work when a worker was lost, computed one at a time
-    suspect: Rows | None = None  # at work
+    # Chunks in progress when a worker was lost: they are repeated one at a time, so that the point
+    # that ends its worker is found.
+    suspects: list[Indices] = []
+    suspect: Indices | None = None  # the suspected chunk in progress
     loss: BaseException | None = None
-    begun: dict[Future[Chunk], Rows] = {}
+    begun: dict[Future[Chunk], Indices] = {}
     waiting = rows
     error: BaseException | None = None
     with progress(f"responses of {settings.name}", rows.size) as report:
@@ -743,7 +796,8 @@ def chunks(
                     error = error or spent
                     waiting = waiting[:0]
                     break
-                chunk_rows, waiting = waiting[:size], waiting[size:]
+                chunk_rows = waiting[:size]
+                waiting = waiting[size:]
                 begun[pool.submitted(work, points.at(chunk_rows), tolerant)] = chunk_rows
             finished = []
             for future in pool.done(begun):
@@ -762,7 +816,8 @@ def chunks(
                     chunk = Chunk(np.array([np.nan]), {0: reason}, 0.0)
                 elif failure is not None:
                     error = error or failure
-                    waiting, suspects = waiting[:0], []
+                    waiting = waiting[:0]
+                    suspects = []
                     continue
                 else:
                     chunk = future.result()
@@ -773,7 +828,7 @@ def chunks(
                 finished.append((chunk_rows, chunk))
             if finished:
                 yield finished
-    pool.renew(error or loss)  # for the next response that is sent to this executor
+    pool.renew(error or loss)  # so that the executor can compute the next response
     if error is not None:
         _raise_lost(settings.name, error)
 

@@ -133,7 +133,7 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
             f"command: got the program {program!r}, which is missing or not executable, expected "
             "one on the path, or its whole path"
         )
-    return (os.path.abspath(path), *rest)  # it runs in another folder
+    return (os.path.abspath(path), *rest)  # absolute, because it runs in another folder
 
 
 def _checked_names(inputs: object) -> tuple[str, ...]:
@@ -180,7 +180,7 @@ class Program:
 
     arguments: tuple[str, ...]
     inputs: tuple[str, ...]
-    templates: dict[str, str]  # of files, by name
+    templates: dict[str, str]  # templates of the files to write, by the name of the file
     read: Callable[[Path], Any]
     timeout: float | None
     folder: Path | None
@@ -213,7 +213,7 @@ class Program:
         return outputs
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any = None) -> None:
-        """Raise if there are other inputs, of these sizes, than the program has."""
+        """Raise if the number of inputs is not that of the program; sizes are for the message."""
         if len(sizes) == len(self.inputs):
             return
         hint = ""
@@ -229,7 +229,7 @@ class Program:
         )
 
     def _run(self, arguments: list[str], folder: Path) -> None:
-        """Run the program to its end, or end it."""
+        """Run the program to its end; kill it if the wait is interrupted."""
         with (
             (folder / "stdout.txt").open("wb") as stdout,
             (folder / "stderr.txt").open("wb") as stderr,
@@ -250,7 +250,7 @@ class Program:
                     f"{self._last_lines(folder)}"
                 ) from None
             finally:
-                # Whatever ends the wait: the time limit, Ctrl-C, a worker's time limit.
+                # The wait may be ended by the time limit, by Ctrl-C, or by a worker's time limit.
                 if process.returncode is None:
                     _kill_tree(process)
         if code != 0:
@@ -265,7 +265,7 @@ class Program:
             if isinstance(result, Mapping):
                 return {name: _numbers(value) for name, value in result.items()}
             return _numbers(result)
-        except TimeoutError:  # a worker's time limit
+        except TimeoutError:  # raised by a worker's time limit, not by the reader
             raise
         except Exception as error:
             files = sorted(path.name for path in folder.iterdir())
@@ -276,7 +276,7 @@ class Program:
             ) from error
 
     def _last_lines(self, folder: Path) -> str:
-        """Return the end of the program's printed output, and its folder, to add to an error."""
+        """Return the end of the printed output, and the folder of the run, for an error message."""
         printed = "; it wrote nothing"
         for name in ("stderr.txt", "stdout.txt"):
             text = (folder / name).read_text(encoding="utf-8", errors="replace").strip()
@@ -305,7 +305,7 @@ def _filled(text: str, values: Mapping[str, float]) -> str:
 
 
 def _numbers(result: object) -> Any:
-    """Return a result as a number, or an array of numbers with its labels; a text may be one."""
+    """Return a result as a number, or as a labelled array; texts are converted to numbers."""
     array = np.asarray(unmasked(result))
     if array.dtype.kind in "Oc":
         raise TypeError(f"got {called(result)}")
@@ -318,7 +318,7 @@ def _kill_tree(process: subprocess.Popen[bytes]) -> None:
         tree = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
         subprocess.run(tree, capture_output=True, check=False)
     else:
-        # The leader of a session that was not waited for still has its number. A system may refuse
-        # where all processes have ended.
+        # The process leads a session, and keeps its number until it is waited for. The system may
+        # refuse if all processes of the session have ended.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)

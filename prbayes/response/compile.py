@@ -25,12 +25,13 @@ from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 
 def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
-    """Rewrite what NumPy does faster, or not at all, in the form that PyTensor has."""
-    op, terms = node.op, node.inputs
-    if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers
+    """Rewrite elementwise operations that NumPy would compute slowly, or not at all."""
+    op = node.op
+    terms = node.inputs
+    if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers in Python
         (x,) = terms
         return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
-    most = 30  # NumPy takes 32 operands, the result among them
+    most = 30  # NumPy takes at most 32 operands, the result included
     if len(terms) <= most or not op.scalar_op.associative:
         return False
     parts = []
@@ -41,7 +42,7 @@ def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
 
 
 def _index_batches(fgraph: Any, node: Any) -> Any:
-    """Take x[i] in all rows at once, as of hyperparameters of groups: PyTensor would loop."""
+    """Rewrite x[i] in a batch, such as groups' hyperparameters: PyTensor would loop over rows."""
     op = node.op.core_op
     is_element = isinstance(op, Subtensor) and len(op.idx_list) == 1 and len(node.inputs) == 2
     if not is_element or isinstance(op.idx_list[0], slice):
@@ -57,8 +58,8 @@ def _index_batches(fgraph: Any, node: Any) -> Any:
 
 
 def copy_views(fgraph: Any, node: Any) -> Any:
-    """Copy constants that are views of others, which PyTensor may make read-only later."""
-    # NumPy and SciPy raise for a view that may be written if its base may not.
+    """Copy constants that are views of other arrays, which PyTensor may make read-only later."""
+    # NumPy and SciPy raise for a writeable view of a read-only array.
     copies = [
         pt.constant(x.data.copy(), dtype=x.type.dtype)
         if isinstance(x, Constant) and getattr(x.data, "base", None) is not None
@@ -69,8 +70,8 @@ def copy_views(fgraph: Any, node: Any) -> Any:
 
 
 # Batched NumPy calls: a heavy compilation does not pay. Without fusion every elementwise operation
-# is one NumPy ufunc; with it, the Python linker would loop over scalars. Sums are split last, as
-# other rewrites would merge them.
+# is one NumPy ufunc; with it, the Python linker would loop over scalars. Sums are split last,
+# because other rewrites would merge them again.
 PLAIN = (
     Mode(linker="py", optimizer="fast_run")
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
@@ -89,14 +90,14 @@ def interpreted() -> Iterator[None]:
     PyTensor compiles the inside of a loop whatever the mode: ten seconds for a prior of
     correlations, and a warning where there is no BLAS. Traces take a tenth of a short calibration.
     """
-    # The flags are global: one thread at a time may change them.
+    # The flags are global, so that only one thread at a time may change them.
     with _flags_lock, pytensor.config.change_flags(traceback__limit=0, cxx=""):
         yield
 
 
 # -- compiled functions by structure ---------------------------------------------------------------
 
-# Compiled functions by the structure of their graphs, the latest last.
+# Compiled functions by the structure of their graphs, the most recently used last.
 _cache: OrderedDict[Hashable, Any] = OrderedDict()
 _cache_lock = Lock()
 
@@ -141,7 +142,7 @@ def compiled(
     with _cache_lock:
         _cache[key] = cached
         _cache.move_to_end(key)
-        while len(_cache) > 64:  # a model has about ten functions, with 4 MB of constants at most
+        while len(_cache) > 64:  # a model has about ten functions, with constants up to 4 MB
             _cache.popitem(last=False)
         return function.copy(swap=dict(zip(empty_shared, shared, strict=True)))
 
@@ -149,13 +150,13 @@ def compiled(
 def _structure(
     inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable], *options: Hashable
 ) -> tuple[Hashable, ...] | None:
-    """Return options, operations, constants and connections of a graph without names.
+    """Return a key of a graph: options, operations, constants and connections, but no names.
 
-    None for graphs with random numbers, operations outside PyTensor or many constants.
+    Graphs with random numbers, operations outside PyTensor or many constants have no key (None).
     """
     number: dict[Variable, int] = {}
     structure: list[Hashable] = [*options]
-    n_bytes = 0  # of constants
+    n_bytes = 0  # size of all constants
     for variable in inputs:
         number.setdefault(variable, len(number))
         structure.append(variable.type)
@@ -186,7 +187,7 @@ def _structure(
 
 
 def _is_stateless(op: Op) -> bool:
-    """Return whether an operation, with those inside it, is one of PyTensor's, without state."""
+    """Return whether an operation and those inside it are PyTensor's own, without state."""
     if not type(op).__module__.startswith("pytensor."):
         return False
     parts = [getattr(op, name, None) for name in getattr(op, "__props__", None) or ()]
@@ -194,7 +195,7 @@ def _is_stateless(op: Op) -> bool:
 
 
 def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
-    """Replace constant arrays by shared variables: graphs for other data have one structure."""
+    """Replace constant arrays by shared variables, so that other data give the same structure."""
     arrays: dict[Any, Any] = {}
     for variable in ancestors([graph]):
         if not isinstance(variable, TensorConstant):
@@ -211,7 +212,7 @@ def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
 
 
 def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
-    """Replace PyMC's parameter checks by -inf: an invalid theta leaves its batch alone."""
+    """Replace PyMC's parameter checks by -inf, so that one invalid theta spoils no batch."""
     from pymc.logprob.utils import CheckParameterValue
 
     switches: dict[Variable, Variable] = {}

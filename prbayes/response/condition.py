@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
-from prbayes._validate import Floats, plain_text, real_array
+from prbayes._validate import Floats, Indices, plain_text, real_array
 from prbayes.response.outputs import specimen_index
 
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
-    """A condition that is uniformly distributed beyond the range of its values by a tenth."""
+    """A condition: uniform over the range of its values and a tenth of the range on either side."""
 
     is_condition = True
     __props__ = (*UniformRV.__props__, "label", "values")
@@ -35,8 +35,9 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
 
     @property
     def range(self) -> tuple[float, float]:
-        """Lower and upper end of its distribution, with the sign of the values."""
-        low, high = min(self.values), max(self.values)
+        """Lower and upper end of the distribution, which keep the sign of the values."""
+        low = min(self.values)
+        high = max(self.values)
         margin = 0.1 * (high - low)
         lower = low - margin if low < 0 or low > margin else 0.9 * low
         upper = high + margin if high > 0 or high < -margin else 0.9 * high
@@ -44,9 +45,9 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
 
     @property
     def scale(self) -> tuple[bool, float, float]:
-        """Whether its coordinate is a logarithm, and center and half width of the coordinate.
+        """Whether the coordinate is logarithmic, and its center and half width.
 
-        The coordinate of the range is from -1 to 1.
+        In units of the half width the range is from -1 to 1.
         """
         low, high = self.range
         is_log = low > 0 and high > 10 * low
@@ -54,15 +55,15 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
         return is_log, (low + high) / 2, (high - low) / 2
 
     def coordinates(self, values: Floats) -> Floats:
-        """Return values in the units of the coordinate."""
+        """Return the coordinates of values, from -1 to 1 within the range."""
         is_log, center, half_width = self.scale
         return ((np.log(values) if is_log else values) - center) / half_width
 
 
 class ReadingsCondition(TensorConstant):  # type: ignore[misc]
-    """The sorted values of a vector condition, (G,), and where the readings of specimens are."""
+    """The sorted values of a vector condition, (G,), with the value of each reading."""
 
-    columns: NDArray[np.intp]  # (N, T): index of the value of each reading, -1 where there is none
+    columns: Indices  # index of the value of each reading, (N, T); -1 marks a missing reading
 
 
 def condition(name: str, values: ArrayLike) -> TensorVariable:
@@ -131,14 +132,14 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
 
 
 def _labelled(variable: TensorVariable, values: ArrayLike) -> TensorVariable:
-    """Return a condition that keeps values with an index, to be compared with that of observed."""
+    """Attach values with an index to a condition, so that the index is compared with observed."""
     if specimen_index(values) is not None:
         variable.tag.labelled = values
     return variable
 
 
 def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVariable:
-    """Return the different values of specimens with several values, (N, T), as a constant."""
+    """Return all different values of specimens with several values, (N, T), as a constant."""
     is_number = ~np.isnan(array)
     if np.isinf(array).any() or not is_number.any(axis=1).all():
         raise ValueError(
@@ -167,11 +168,11 @@ def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVar
 
 
 def known_covariates(
-    name: str, covariates: Sequence[Any], size: int, rows: NDArray[np.intp] | None
+    name: str, covariates: Sequence[Any], size: int, rows: Indices | None
 ) -> dict[str, Floats]:
-    """Return the covariates of the specimens, (N,), by name, from those of the observed rows.
+    """Return the values of covariates for each specimen, (N,), by name.
 
-    With frequencies, ``rows`` are those of the specimens.
+    With frequencies, ``rows`` is the row of the observed values that each specimen comes from.
     """
     result: dict[str, Floats] = {}
     for variable in covariates:
@@ -192,7 +193,7 @@ def known_covariates(
 
 
 def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
-    """Raise where a metric compares one population with the specimens of many."""
+    """Raise if there are covariates: a metric compares the specimens with one population."""
     if covariates:
         raise TypeError(
             f"{name}: inputs: got a population that depends on {covariates[0].name}, expected one "
@@ -204,9 +205,9 @@ def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
 def refuse_vectors_of_specimens(
     name: str, aleatory: Sequence[Any], parents: Sequence[Variable], size: int
 ) -> None:
-    """Raise where an input is a vector with an element for each specimen, as in PyMC.
+    """Raise if an input is a vector with an element for each specimen, as is usual in PyMC.
 
-    Or where it depends on a condition of which each specimen has several values.
+    Also raise if it depends on a condition that has several values for each specimen.
     """
     for x in aleatory:
         batch = x.type.ndim - getattr(x.owner.op, "ndim_supp", 0)
@@ -234,5 +235,5 @@ def refuse_vectors_of_specimens(
 
 def is_condition(variable: Variable) -> bool:
     """Return whether a variable is a condition of a specimen."""
-    # By an attribute, not by its class: a module may be loaded twice.
+    # Not isinstance: a module may be loaded twice, and then has two classes.
     return variable.owner is not None and getattr(variable.owner.op, "is_condition", False)

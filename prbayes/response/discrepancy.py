@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats, called, real_array, unmasked
-from prbayes.response.call import scalar
+from prbayes.response.call import Function, scalar, unwrapped
 from prbayes.response.outputs import relabelled
 
 
@@ -40,7 +40,7 @@ class ModelDiscrepancy(ABC):
                 f"{label}: shape: got {np.array2string(values, threshold=4)} of two conditions, "
                 "expected finite numbers of shape (2,), or (2, m) for m coefficients"
             )
-        self.event = values.shape[1:]  # of the coefficients: () or (m,)
+        self.event = values.shape[1:]  # shape of the coefficients: () or (m,)
 
     def _line(self, condition: Floats) -> Floats:
         return (condition - self.low) / (self.high - self.low)
@@ -78,7 +78,7 @@ class ModelDiscrepancy(ABC):
     def combined(self, response: Floats, value: Floats) -> Floats:
         """Return a response with its discrepancy."""
 
-    def of(self, response: Callable[..., Any], condition: ArrayLike) -> Callable[..., Any]:
+    def of(self, response: Function, condition: ArrayLike) -> Function:
         """Return a response with the discrepancy under a condition, and one more input.
 
         The last input is the coefficients: a ``.dist()``, whose hyperparameters are the size of the
@@ -221,7 +221,7 @@ class Corrected:
     """A response with its discrepancy under a condition; the last input is the coefficients."""
 
     def __init__(
-        self, response: Callable[..., Any], discrepancy: ModelDiscrepancy, condition: Floats
+        self, response: Function, discrepancy: ModelDiscrepancy, condition: Floats
     ) -> None:
         self.response = response
         self.discrepancy = discrepancy
@@ -241,8 +241,9 @@ class Corrected:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """A warning if the condition is outside the data's."""
-        low, high = self.discrepancy.low, self.discrepancy.high
+        """A warning if the condition is outside the range of the data."""
+        low = self.discrepancy.low
+        high = self.discrepancy.high
         if not ((self.condition < low) | (self.condition > high)).any():
             return ()
         text = (
@@ -260,32 +261,32 @@ class Corrected:
                 f"{self.__name__}: got a mapping, expected an array with an output for each "
                 "condition"
             )
-        labelled, response = response, np.asarray(unmasked(response))
+        labelled = response
+        response = np.asarray(unmasked(response))
         coefficients = np.asarray(coefficients)
         batch_ndim = coefficients.ndim - len(self.discrepancy.event)
         outputs = self.condition.shape
         response_ndim = response.ndim - len(outputs)
         has_outputs = response.shape[response_ndim:] == outputs
-        is_common = batch_ndim == 0 and response_ndim == 1  # of coefficients of all specimens
+        # The coefficients may be a model variable, common to all specimens.
+        is_common = batch_ndim == 0 and response_ndim == 1
         if response.ndim and not (has_outputs and (response_ndim == batch_ndim or is_common)):
             raise ValueError(
                 f"{self.__name__}: got a response of shape {response.shape}, expected "
                 f"{('...', *outputs)}: one output, or one for each condition"
             )
         if self.condition.ndim:
-            # Before the axis of coefficients, one for the outputs.
+            # The axis of the outputs comes before that of the coefficients.
             coefficients = np.expand_dims(coefficients, batch_ndim)
         value = self.discrepancy.value(coefficients, self.condition)
         return relabelled(self.discrepancy.combined(response, value), labelled)
 
 
-def has_discrepancy(function: Callable[..., Any]) -> bool:
+def has_discrepancy(function: Function) -> bool:
     """Return whether the last input of a function is the coefficients of a model discrepancy."""
-    inner = function.function if isinstance(function, scalar) else function
-    return isinstance(inner, Corrected)
+    return isinstance(unwrapped(function), Corrected)
 
 
-def findings_of(function: Callable[..., Any]) -> tuple[Finding, ...]:
+def findings_of(function: Function) -> tuple[Finding, ...]:
     """Return the warnings that a function declares for its users."""
-    inner = function.function if isinstance(function, scalar) else function
-    return tuple(getattr(inner, "findings", ()))
+    return tuple(getattr(unwrapped(function), "findings", ()))

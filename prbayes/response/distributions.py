@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,10 +21,10 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import Floats
 from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
 from prbayes.response.condition import is_condition
-from prbayes.response.dims import is_random, without_dims
 from prbayes.response.inputs import Inputs, event_shape, quiet_logp
+from prbayes.response.pymc_dims import is_random, without_dims
 
-# Operations of distributions, for `isinstance`.
+# Operations of PyMC distributions, for checks by `isinstance`.
 MVNORMAL = type(MvNormal.rv_op)
 ELLIPTICAL = (MVNORMAL, MvStudentT.rv_type)
 RANDOM_WALK = pm.RandomWalk.rv_type
@@ -35,9 +36,9 @@ def log_density(
     values: Sequence[Any],
     instead: Mapping[int, Callable[[TensorVariable, Any], TensorVariable]] | None = None,
 ) -> TensorVariable:
-    """Return log p(x), (n,), of values (n, *event), by ``instead`` for some positions of inputs.
+    """Return log p(x), (n,), of values (n, *event), given the conditions of the specimens.
 
-    It is that given the conditions of specimens.
+    ``instead`` has functions that replace the log-density of inputs at some positions.
     """
     total: Any = 0.0
     triples = zip(aleatory, values, inputs.event_shapes, strict=True)
@@ -53,7 +54,7 @@ def log_density(
             logp = vectorize_graph(quiet_logp(dist, value), {value: x})
         else:
             logp = pm.logp(dist, x, warn_rvs=False)
-        # Elements of a vector of independent inputs.
+        # The log-densities of independent elements add up.
         if logp.type.ndim > 1:
             logp = logp.sum(axis=tuple(range(1, logp.type.ndim)))
         total = total + logp
@@ -62,7 +63,7 @@ def log_density(
 
 @interpreted()
 def compiled_log_density(inputs: Inputs) -> Any:
-    """Return log p(x) as a function of parents (k, *shape), then points (n, *event): (k, n)."""
+    """Return log p(x), (k, n), as a function of parents (k, *shape), then points (n, *event)."""
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory]
@@ -70,7 +71,7 @@ def compiled_log_density(inputs: Inputs) -> Any:
 
 
 def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
-    """Return log p(x) by elementwise substitution: PyMC solves for each theta and point."""
+    """Return log p(x) by elementwise substitution, since PyMC solves for each theta and point."""
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = _cholesky(covariance, size)
     # Solve root z = x - mean.
@@ -97,7 +98,7 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
 
 def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
     """Return the rows of a lower Cholesky factor, NaN if the matrix is not positive definite."""
-    if size > 4:  # below elementwise: PyTensor loops over the matrices of a batch
+    if size > 4:  # small matrices are factorised elementwise, as PyTensor loops over a batch
         root = pt.linalg.cholesky(matrix, on_error="nan")
         return [[root[..., i, j] for j in range(i + 1)] for i in range(size)]
     rows: list[list[Any]] = []
@@ -114,7 +115,7 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
 
 def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
     """Raise if a covariance is not symmetric, at values of the parents, (k, *shape)."""
-    # Density and draws read one half of the matrix only.
+    # Densities and draws would read one triangle of the matrix and ignore the other.
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     covariances = [
@@ -125,7 +126,7 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
     for covariance in compile_batched(symbols, covariances)(*params):
         difference = np.abs(covariance - np.swapaxes(covariance, -1, -2))
         scale = np.abs(covariance).max(axis=(-2, -1), keepdims=True)
-        if np.any(difference > 1e-8 * scale):  # more than rounding
+        if np.any(difference > 1e-8 * scale):  # the difference is more than rounding
             raise ValueError(
                 f"{name}: got an input whose covariance is not symmetric, expected a covariance "
                 "matrix; pm.LKJCorr is no correlation matrix but its Cholesky factor L: "
@@ -134,7 +135,7 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
 
 
 def _scalar_if_infinite(end: TensorVariable) -> Any:
-    """Return a scalar for an infinite end of a vector, which PyMC takes for a finite one."""
+    """Return a scalar for a vector of infinite ends, which PyMC would take for finite ones."""
     value = pt.get_underlying_scalar_constant_value(end, raise_not_constant=False)
     return pt.constant(value) if not isinstance(value, Variable) and np.isinf(value) else end
 
@@ -162,21 +163,21 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
 
 
 def _density(dist: TensorVariable) -> TensorVariable | None:
-    """Return the log-density at zero as a graph, None where PyMC has none, or draws it."""
+    """Return the log-density at zero as a graph; None if PyMC has none, or only a random one."""
     try:
         density = quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
     if isinstance(dist.owner.op, RANDOM_WALK):
-        return density  # which uses only the shapes of its parts
-    # Zero takes its shape from the distribution.
+        return density  # only the shapes of the random parts are used
+    # The zeros depend on the distribution, too, but only by its shape.
     parts = set(ancestors([density], blockers=[dist])) - {dist}
     return None if any(map(is_random, parts)) else density
 
 
 def refuse_without_density(name: str, inputs: Inputs) -> None:
     """Raise if PyMC does not know the density of an input."""
-    # With symbols for the parents: a sum of two random variables has no density that PyMC knows.
+    # Parents are replaced by symbols, since PyMC has no density for a sum of random variables.
     dists, _ = inputs.rebuilt(inputs.placeholders())
     for dist in dists:
         if not isinstance(dist.owner.op, ELLIPTICAL) and _density(dist) is None:
@@ -193,7 +194,7 @@ def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
 
     if inputs.nested:
         return pt.constant(True)
-    # The densities check their parameters, such as sigma > 0.
+    # The densities contain checks of their parameters, such as sigma > 0.
     densities = [density for d in aleatory if (density := _density(d)) is not None]
     conditions = []
     for v in ancestors(densities):
@@ -217,7 +218,7 @@ def resized(dist: TensorVariable, size: tuple[Any, ...]) -> TensorVariable:
     op = dist.owner.op
     if not hasattr(op, "rv_op"):
         return change_dist_size(dist, size, expand=True)
-    # PyMC would forget the axes that come from the parameters of these, such as pm.HalfCauchy.
+    # PyMC would drop the axes that the parameters of such a distribution (pm.HalfCauchy) add.
     shape = event_shape(dist)[: dist.type.ndim - op.ndim_supp]
     return change_dist_size(dist, (*size, *shape))
 
@@ -232,13 +233,13 @@ class PriorSampler:
         is_copied = any(x is not y for x, y in zip(copies, drawn, strict=True))
         drawn = copies
         self._shapes = [event_shape(v) for v in drawn]
-        # PyMC gives a `str_repr` to the variables of a model, which copies do not have.
+        # PyMC marks the variables of a model by a `str_repr`, but not their copies.
         random = list(filter(is_random, ancestors(drawn)))
         parents = [v for v in random if is_copied or hasattr(v, "str_repr")]
         variables = dict.fromkeys([*drawn, *parents])
         n = pt.iscalar("n")
         try:
-            # Variables that depend on no other are drawn n times; the others follow.
+            # Variables that depend on no other variable are drawn n times, the others given them.
             batches = {}
             for v in variables:
                 if variables.keys() & set(ancestors([v])) == {v}:
@@ -247,7 +248,7 @@ class PriorSampler:
             self._function = pm.compile([n], outputs, mode=PLAIN)
             self._is_batched = True
         except (NotImplementedError, ValueError, MissingInputError):
-            # Not vectorized, or not resized: one draw at a time.
+            # PyTensor cannot vectorize the graph, or PyMC cannot resize it: draw one at a time.
             self._function = pm.compile([n], list(drawn), mode=PLAIN, on_unused_input="ignore")
             self._is_batched = False
 
@@ -256,7 +257,7 @@ class PriorSampler:
         _seed(self._function, np.random.default_rng(seed))
         try:
             if self._is_batched:
-                # Samplers of SciPy's drop leading axes of length one.
+                # SciPy's samplers drop leading axes of length one.
                 pairs = zip(self._function(k), self._shapes, strict=True)
                 return [np.asarray(v).reshape(k, *shape) for v, shape in pairs]
             draws = [self._function(k) for _ in range(k)]
@@ -270,13 +271,13 @@ class PriorSampler:
 
 
 class PriorPoints:
-    """Points of the unit cube mapped to the prior, each variable given those that it depends on."""
+    """Map from the unit cube to the prior, each variable given those that it depends on."""
 
     @interpreted()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         variables = without_dims(variables)
         self._shapes = [event_shape(v) for v in variables]
-        self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
+        self._sizes = [math.prod(s) for s in self._shapes]
         self.size = sum(self._sizes)
         symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
         values: dict[Variable, Variable] = {}
@@ -308,12 +309,12 @@ class PopulationSampler:
         aleatory, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
         covariates = {s for s, r in zip(symbols, inputs.parents, strict=True) if is_condition(r)}
-        # Covariates are those of each specimen.
+        # A covariate is a number for each specimen.
         batched = with_leading_axis([pt.dvector() if s in covariates else s for s in symbols])
         common = epistemic
 
-        # n specimens of each theta. Distributions that depend on no parent are not batched by their
-        # parameters: resize them.
+        # Draw n specimens for each theta. Distributions that depend on no parent do not get these
+        # axes from their parameters, and are resized.
         size = (batched[0].shape[0], n)
         per_specimen: dict[Variable, Variable] = {}
         for symbol, batch in zip(symbols, batched, strict=True):
@@ -334,12 +335,12 @@ class PopulationSampler:
         except (NotImplementedError, ValueError, MissingInputError) as error:
             if covariates:
                 raise self.refusal(error) from None
-            # Not vectorized by PyTensor: one population at a time.
+            # PyTensor cannot vectorize the graph: draw one population at a time.
             self._is_batched, batched = False, symbols
-            # Resized before the parents are replaced, since PyMC resizes a CustomDist with its
-            # first parameters.
+            # Resize before the parents are replaced, because PyMC resizes a CustomDist with the
+            # parameters that it was made with.
             try:
-                if inputs.nested:  # parts of an input are drawn for each specimen too
+                if inputs.nested:  # random parts of an input are drawn for each specimen, too
                     parts = set(filter(is_random, ancestors(inputs.aleatory, inputs.parents)))
                     parts -= set(inputs.parents)
                     first = [v for v in parts if parts & set(ancestors([v], inputs.parents)) == {v}]
@@ -364,7 +365,7 @@ class PopulationSampler:
     def refusal(self, error: Exception) -> TypeError:
         """Return the error of inputs that cannot be drawn."""
         remedy = "give a pm.CustomDist its random="
-        if isinstance(error, ValueError):  # of a parameter out of its range
+        if isinstance(error, ValueError):  # a parameter may be out of its range
             remedy = (
                 "keep parameters in their range, such as a standard deviation by pm.HalfNormal, or "
                 + remedy
@@ -380,9 +381,9 @@ class PopulationSampler:
     ) -> tuple[list[Floats], list[Floats]]:
         """Draw n specimens from each of k populations, at parents (k, *shape).
 
-        Covariates, (k, m), are those of specimens, repeated in turn.
-        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without
-        parents.
+        Covariates, (k, m), have a value for each specimen, and are repeated up to n specimens.
+        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) if they have
+        no parents.
         """
         _seed(self._function, rng)
         params = self._inputs.for_specimens(params, n)

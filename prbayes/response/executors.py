@@ -38,22 +38,23 @@ def capacity(executor: Executor | None) -> tuple[int, int]:
     """Return the numbers of workers, and of chunks that are sent to them at a time."""
     if executor is None:
         return 1, 1
-    # Of processes, threads and loky; of MPI; of Dask.
+    # The first attribute is that of process pools, thread pools and loky, the second that of MPI;
+    # Dask has neither.
     workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
     workers = workers or sum((_dask_threads(executor) or {}).values())
     if not workers:
-        return os.cpu_count() or 1, 1024  # as many as the largest clusters in practice
-    return int(workers), 2 * int(workers)  # a worker has its next chunk ready
+        return os.cpu_count() or 1, 1024  # enough chunks for the largest clusters in practice
+    return int(workers), 2 * int(workers)  # so that each worker has its next chunk ready
 
 
 def _dask_threads(executor: Executor | None) -> dict[str, int] | None:
-    """Return the number of threads of each Dask worker by address, None for other executors."""
+    """Return the number of threads of each Dask worker by address; None for other executors."""
     threads = getattr(getattr(executor, "_client", None), "nthreads", None)
     return dict(threads()) if callable(threads) else None
 
 
 def _process_pool_class(executor: Executor | None) -> type[Executor] | None:
-    """Return the class of a pool of processes; loky's has the name of the standard one."""
+    """Return the class of a pool of processes, also of loky, which has the same name; or None."""
     classes = type(executor).__mro__
     return next((c for c in classes if c.__name__ == "ProcessPoolExecutor"), None)
 
@@ -80,20 +81,21 @@ def refuse_timeout(timeout: object, executor: Executor | None) -> None:
 
 
 class _AlarmError(TimeoutError):
-    """Raised inside a late response; different from time limits in the response itself."""
+    """Raised in a response that takes too long; distinct from the response's own TimeoutError."""
 
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
     """Raise `TimeoutError` in the block after some seconds, or end this process a while later."""
-    # A signal interrupts the main thread. Other threads, and code that never returns to Python,
-    # end with their process.
+    # A signal interrupts the main thread only. Other threads, and code that never returns to
+    # Python, can only be ended together with their process.
     if seconds is None:
         yield
         return
     start = time.monotonic()
     message = f"no result within timeout = {seconds:g} s"
-    # Late enough for the signal to come first, also where a busy machine stands still for seconds.
+    # The watchdog is late enough that the signal comes first, even if a busy machine stalls for
+    # seconds.
     with _watchdog(1.5 * seconds + 5):
         try:
             in_main = threading.current_thread() is threading.main_thread()
@@ -105,7 +107,7 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         except _AlarmError:
             raise TimeoutError(message) from None
         except Exception as error:
-            # Compiled code may replace the alarm by another exception.
+            # Compiled code may replace the exception of the alarm by another one.
             if time.monotonic() - start < seconds:
                 raise
             raise TimeoutError(message) from error
@@ -119,13 +121,14 @@ def _alarm(seconds: float) -> Iterator[None]:
     def interrupt(*_: object) -> None:
         nonlocal is_over
         if not is_over:
-            is_over = True  # nothing interrupts the clean-up after it
+            is_over = True  # so that a second alarm does not interrupt the clean-up
             raise _AlarmError
 
     previous = signal.signal(signal.SIGALRM, interrupt)
     try:
         try:
-            # Again each second: another thread may receive a signal, and the main thread sleeps on.
+            # Repeat the alarm each second, because another thread may receive the signal while the
+            # main thread sleeps.
             signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
             yield
         finally:
@@ -135,7 +138,8 @@ def _alarm(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, previous)
 
 
-# Times at which the process ends, one for each block: Python has one watchdog for all threads.
+# Time at which the process ends, for each block. Python has only one watchdog for all threads,
+# which is set to the earliest time.
 _deadlines: dict[object, float] = {}
 _deadlines_lock = threading.Lock()
 
@@ -158,8 +162,10 @@ def _watchdog(seconds: float) -> Iterator[None]:
 def _set_watchdog() -> None:
     faulthandler.cancel_dump_traceback_later()
     if _deadlines:
-        left = max(min(_deadlines.values()) - time.monotonic(), 1e-3)  # it takes no less
-        faulthandler.dump_traceback_later(left, exit=True, file=_devnull())
+        remaining = max(
+            min(_deadlines.values()) - time.monotonic(), 1e-3
+        )  # the watchdog takes no zero
+        faulthandler.dump_traceback_later(remaining, exit=True, file=_devnull())
 
 
 @lru_cache(maxsize=1)
@@ -176,7 +182,7 @@ def failure_of(future: Future[Any]) -> BaseException | None:
 
 
 def is_loss(failure: BaseException | None) -> bool:
-    """Return whether a chunk failed because its worker was lost; Dask has a class for that."""
+    """Return whether a chunk failed because its worker was lost (KilledWorker in Dask)."""
     names = {kind.__name__ for kind in type(failure).__mro__}
     return isinstance(failure, BrokenExecutor) or "KilledWorker" in names
 
@@ -184,7 +190,7 @@ def is_loss(failure: BaseException | None) -> bool:
 def has_slipped(failure: BaseException | None) -> bool:
     """Return whether Dask lost a result at the moment when its worker left.
 
-    Its executor takes the result for an exception if the task is running again by then.
+    Its executor then takes the result for an exception, because the task is already running again.
     """
     if not isinstance(failure, TypeError):
         return False
@@ -194,7 +200,7 @@ def has_slipped(failure: BaseException | None) -> bool:
 
 
 def failure_text(failure: BaseException) -> str:
-    """Return in words why an executor has no result."""
+    """Return the reason why an executor has no result, as a clause."""
     text = f"{type(failure).__name__}: {failure!s:.200}"
     if is_loss(failure):
         return f"a worker was lost ({text})"
@@ -203,22 +209,22 @@ def failure_text(failure: BaseException) -> str:
     return f"the executor failed ({text})"
 
 
-_SILENCE = 60.0  # seconds without a result that are logged; longer than most responses take
+_SILENCE = 60.0  # seconds without a result after which it is logged; most responses take less
 
-# Executors that replace those whose workers were lost.
+# Replacements of executors whose workers were lost, by the original executor.
 _replacements: WeakKeyDictionary[Executor, Executor] = WeakKeyDictionary()
 
 
 @dataclass
 class Pool:
-    """An executor that is replaced by one like it when its workers are lost."""
+    """An executor that is replaced by a similar one when its workers are lost."""
 
-    name: str  # of the simulator, for messages
-    original: Executor | None
+    name: str  # name of the simulator, for messages
+    original: Executor | None  # executor of the user
 
     @property
     def executor(self) -> Executor | None:
-        """The executor at work."""
+        """The executor in use: the original, or its replacement."""
         return None if self.original is None else _replacements.get(self.original, self.original)
 
     def renew(self, failure: BaseException | None) -> None:
@@ -226,7 +232,7 @@ class Pool:
         kind = _process_pool_class(self.original)
         if self.original is None or kind is None or not isinstance(failure, BrokenExecutor):
             return
-        # The standard library and loky store their arguments under the same names.
+        # The standard library and loky store the arguments of their constructors as attributes.
         parameters = signature(kind).parameters
         arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
         for attribute in ("_mp_context", "_context", "_initializer", "_initargs"):
@@ -236,7 +242,7 @@ class Pool:
         _replacements[self.original] = kind(**arguments)
 
     def refuse_dead(self) -> None:
-        """Raise if workers are lost whatever they compute."""
+        """Raise if workers are lost even when they compute no response."""
         future = self.submitted(os.getpid)
         self.done([future])
         failure = failure_of(future)
@@ -249,7 +255,7 @@ class Pool:
             )
 
     def submitted(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Return a future of the work; without an executor it is finished."""
+        """Return a future of the work. Without an executor the work is done here, at once."""
         future: Future[Any] = Future()
         try:
             if self.executor is not None:
@@ -260,11 +266,14 @@ class Pool:
         return future
 
     def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Return finished futures, at least one; ten minutes without any worker are an error."""
+        """Wait for at least one future, and return the finished ones.
+
+        Raises `ResponseError` after ten minutes without any worker.
+        """
         waiting = list(futures)
         silent, absences = 0.0, 0
         while True:
-            # `wait` never returns futures that a pool cancels when it is closed.
+            # A pool that is closed cancels futures, which `wait` never returns.
             finished = {future for future in waiting if future.cancelled()}
             timeout = 0.0 if finished else _SILENCE
             finished |= wait(waiting, timeout=timeout, return_when=FIRST_COMPLETED).done
@@ -276,7 +285,7 @@ class Pool:
             text = f"{self.name}: no response for {silent:.0f} s; {len(waiting)} chunks are at work"
             text += "." if has_workers else ", and there is no worker."
             report(Finding("no-response-yet", text))
-            if absences == 10:  # a worker that starts again on a busy machine is away for minutes
+            if absences == 10:  # on a busy machine a worker may need minutes to start again
                 for future in waiting:
                     future.cancel()
                 raise ResponseError(

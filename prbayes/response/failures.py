@@ -17,12 +17,12 @@ class ResponseError(RuntimeError):
 class Failure:
     """A point whose response failed."""
 
-    inputs: Floats  # (columns,): the arguments of the response, one after the other
+    inputs: Floats  # arguments of the response, one after the other, (columns,)
     reason: str
 
 
 class OnFailure:
-    """What to do with a point whose response raises or is NaN; see `Abort`, `Replace`, `Retry`."""
+    """A policy for points whose response raises or is NaN; see `Abort`, `Replace`, `Retry`."""
 
     @property
     def tries(self) -> int:

@@ -132,7 +132,8 @@ def fmu(
     file = file_path(path, "fmu: path")
     if not file.is_file():
         raise FileNotFoundError(f"fmu: path: got {file}, which is not there, expected an FMU")
-    input_names, output_names = _names("inputs", inputs), _names("outputs", outputs)
+    input_names = _names("inputs", inputs)
+    output_names = _names("outputs", outputs)
     values = _parameter_values(parameters)
     repeated = set(input_names) & set(values)
     if repeated:
@@ -158,25 +159,25 @@ def fmu(
         reset,
     )
     with _opened(unit).instance(reset):
-        pass  # whether it can be instantiated here
+        pass  # raises here if the unit cannot be instantiated on this machine
     return scalar(model)
 
 
 # -- arguments -------------------------------------------------------------------------------------
 
 
-def _names(argument: str, given: object) -> dict[str, str]:
-    """Return variables of the unit by the user's names for them: the same ones in a list."""
+def _names(argument: str, value: object) -> dict[str, str]:
+    """Return variables of the unit by the user's names, which in a list are the same."""
     pairs: list[tuple[Any, Any]] = []
     expected = 'a list of the unit\'s variables, each once, such as ["stiffness", "damping"]'
-    if isinstance(given, Mapping) and argument == "outputs":
-        pairs = list(given.items())
+    if isinstance(value, Mapping) and argument == "outputs":
+        pairs = list(value.items())
         expected += ", or a mapping of names to these"
-    elif isinstance(given, Sequence) and not isinstance(given, str):
-        pairs = [(name, name) for name in given]
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        pairs = [(name, name) for name in value]
     are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
     if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
-        raise TypeError(f"fmu: {argument}: got {called(given)}, expected {expected}")
+        raise TypeError(f"fmu: {argument}: got {called(value)}, expected {expected}")
     return dict(pairs)
 
 
@@ -203,15 +204,15 @@ def _parameter_values(parameters: object) -> dict[str, Value]:
 
 @dataclass(frozen=True)
 class Unit:
-    """The file of a unit, and what its instances need."""
+    """The file of a unit, and the arguments of its instances."""
 
     path: str
-    digest: str
+    digest: str  # SHA-256 of the file
     name: str
     identifier: str
     token: str
-    version: int  # of FMI
-    is_single: bool  # whether a process may have one instance only
+    version: int  # version of the FMI standard
+    is_single: bool  # whether a process may have only one instance
 
 
 def _fmpy() -> Any:
@@ -280,7 +281,7 @@ class Variable:
 
     name: str
     reference: int
-    kind: str  # as in the names of FMI functions
+    kind: str  # type, as it occurs in the names of FMI functions
 
     def converted(self, value: Value, label: str) -> Value:
         """Return a value in the type of the variable, or raise `ValueError`."""
@@ -305,7 +306,7 @@ class Variable:
 
 
 def _variable(description: Any, name: str, argument: str) -> Variable:
-    """Return a variable with one number, which inputs and parameters set; or one text."""
+    """Return a scalar variable, which must be settable unless it is an output, or raise."""
     unit = description.modelName
     described = {v.name: v for v in description.modelVariables}
     if name not in described:
@@ -357,11 +358,11 @@ class _TimeGrid:
     """The points of communication of a simulation."""
 
     start: float
-    times: tuple[float, ...]  # at which outputs are read; the last one is the end
+    times: tuple[float, ...]  # times at which outputs are read; the last one is the end
     has_curves: bool  # whether the user stated the times
-    step: float  # at most
+    step: float  # largest size of a step
     is_even: bool  # whether all steps have this size
-    tolerance: float | None  # of the unit
+    tolerance: float | None  # tolerance that the unit states
 
     def steps(self) -> Iterator[tuple[float, float, bool]]:
         """Yield the begin and size of each step, and whether outputs are read after it."""
@@ -403,7 +404,7 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
         raise ValueError(f"fmu: stop_time: got {got}, expected a time after start_time = {begin:g}")
     else:
         marks = np.array([end])
-    # 500 steps where neither the user nor the unit states a step, as FMPy does.
+    # If neither the user nor the unit states a step there are 500, as in FMPy.
     longest = float(marks[-1] - begin) / 500
     size = default("stepSize") if step is None else float(positive_number(step, "fmu: step"))
     internal = getattr(interface, "fixedInternalStepSize", None)
@@ -437,7 +438,7 @@ class Simulation:
 
     unit: Unit
     inputs: tuple[Variable, ...]
-    outputs: dict[str, Variable]  # by their names
+    outputs: dict[str, Variable]  # outputs by the user's names
     parameters: tuple[tuple[Variable, Value], ...]
     grid: _TimeGrid
     timeout: float | None
@@ -450,8 +451,7 @@ class Simulation:
 
     def __call__(self, *values: float) -> float | Floats | dict[str, Any]:
         """Simulate one specimen: a number, a curve, or a mapping of these."""
-        if len(values) != len(self.inputs):
-            self._refuse_inputs(self.unit.name, [1] * len(values))
+        self._refuse_inputs(self.unit.name, [1] * len(values))
         start_values = [*self.parameters]
         for variable, value in zip(self.inputs, values, strict=True):
             start_values.append((variable, variable.converted(float(value), self.unit.name)))
@@ -482,7 +482,7 @@ class Simulation:
                     f"{begin:g} of {stop:g}{_log_text()}"
                 )
             state = slave.doStep(currentCommunicationPoint=begin, communicationStepSize=size)
-            # In FMI 3: an event, the end, an early return, and the time that was reached.
+            # With FMI 3 the state is: event needed, end requested, early return, and time reached.
             if state is not None and (state[1] or state[2]):
                 raise RuntimeError(
                     f"{self.unit.name}: it ended at time {state[3]:g}, expected {stop:g}"
@@ -533,19 +533,19 @@ class Simulation:
 # -- instances in a process ------------------------------------------------------------------------
 
 
-# The last five messages of the unit at work in a thread.
+# Last five messages of the unit that a thread simulates.
 _messages = threading.local()
 
 
 def _record_message(*arguments: Any) -> None:
-    """Keep a warning or error of a unit of FMI 2 or 3."""
+    """Record a warning or error of a unit; FMI 2 and 3 end their arguments alike."""
     status, _, message = arguments[-3:]
     if status != 0 and message:
         _messages.lines = [*getattr(_messages, "lines", ())[-4:], message]
 
 
 def _log_text() -> str:
-    """Return the last messages of the unit at work in this thread, to add to an error."""
+    """Return the last messages of the unit that this thread simulates, for an error."""
     messages = getattr(_messages, "lines", ())
     lines = [" ".join(message.decode("utf-8", "replace").split()) for message in messages]
     return f"; it logged: {' | '.join(lines)}" if lines else "; it logged nothing"
@@ -553,8 +553,9 @@ def _log_text() -> str:
 
 @cache
 def _callbacks() -> Any:
-    """Return the functions that units of FMI 2 call, for as long as this process lives."""
-    # Without FMPy's proxy, which calls the logger of a unit that is gone; messages keep their %s.
+    """Return the functions that units of FMI 2 call; they live as long as this process."""
+    # FMPy's proxy for the logger is left out, because it may call the logger of a unit that was
+    # freed. Messages therefore keep their %s.
     from fmpy import calloc, fmi2, free
 
     callbacks = fmi2.fmi2CallbackFunctions()
@@ -577,7 +578,7 @@ class _OpenUnit:
             )
         self.unit = unit
         self.folder = tempfile.mkdtemp(prefix="prbayes-fmu-")
-        # Workers end without `atexit`.
+        # Remove the folder by a finalizer, because worker processes end without `atexit`.
         Finalize(None, shutil.rmtree, (self.folder, True), exitpriority=0)
         try:
             _fmpy().extract(unit.path, self.folder)
@@ -594,7 +595,7 @@ class _OpenUnit:
 
     @contextmanager
     def instance(self, reset: bool) -> Iterator[Any]:
-        """Lend an instance at its start; it is freed after an error, and reused otherwise."""
+        """Yield an instance in its initial state; it is freed after an error, else reused."""
         from fmpy.fmi1 import FMICallException
 
         with self.lock:
@@ -603,7 +604,7 @@ class _OpenUnit:
             try:
                 yield slave
             except FMICallException as error:
-                if error.status != 4:  # after a fatal error no function may be called
+                if error.status != 4:  # a unit may not be called again after a fatal error
                     _free(slave)
                 text = f"{self.unit.name}: {str(error).rstrip('.')}{_log_text()}"
                 raise RuntimeError(text) from None
@@ -613,15 +614,15 @@ class _OpenUnit:
             self.idle.append(slave)
 
     def _at_start(self, reset: bool) -> Any:
-        """Return an idle instance, reset or instantiated again, or a new one."""
+        """Return an instance in its initial state: a reset idle one, or a new one."""
         unit = self.unit
         try:
-            slave = self.idle.pop()  # which another thread may have taken
+            slave = self.idle.pop()  # another thread may have taken the last one
         except IndexError:
             slave = self._loaded()
         else:
             if reset:
-                with suppress(Exception):  # not all units have a reset
+                with suppress(Exception):  # some units cannot be reset
                     slave.reset()
                     return slave
             _free(slave)
@@ -638,14 +639,14 @@ class _OpenUnit:
         return slave
 
     def _loaded(self) -> Any:
-        """Return an object of FMPy with the library of the unit."""
+        """Return an FMPy object that has loaded the library of the unit."""
         from fmpy import fmi2, fmi3
 
         unit = self.unit
         self.n_loaded += 1
         kind = fmi2.FMU2Slave if unit.version == 2 else fmi3.FMU3Slave
         with _lock:
-            folder = os.getcwd()  # where FMPy does not return if loading fails
+            folder = os.getcwd()  # FMPy changes it, and does not return if loading fails
             try:
                 return kind(
                     guid=unit.token,
@@ -675,7 +676,7 @@ _lock = threading.RLock()
 
 
 def _opened(unit: Unit) -> _OpenUnit:
-    """Return the unit as it is open in this process."""
+    """Return the unit as it is open in this process; open it at the first call."""
     with _lock:
         if unit not in _open_units:
             _open_units[unit] = _OpenUnit(unit)
@@ -683,9 +684,9 @@ def _opened(unit: Unit) -> _OpenUnit:
 
 
 def _forget_units() -> None:
-    """Start without open units after a fork: instances stay with the parent."""
+    """Start without open units after a fork, because instances belong to the parent process."""
     global _lock
-    _inherited.append(dict(_open_units))  # keeps them from being freed
+    _inherited.append(dict(_open_units))  # so that they are not freed here
     _open_units.clear()
     _lock = threading.RLock()
 

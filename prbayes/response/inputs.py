@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -11,17 +12,16 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import NO_POPULATION, plain_text, real_array
+from prbayes._validate import NO_POPULATION, Indices, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
-from prbayes.response.dims import (
+from prbayes.response.pymc_dims import (
     foreign_variable,
     has_dims,
     input_without_dims,
@@ -40,22 +40,24 @@ class Inputs:
         parents: Sequence[TensorVariable],
         nested: bool,
     ) -> None:
-        # For each argument an int (position in ``aleatory``), a variable (epistemic) or an array.
+        # An argument is an int (its position in ``aleatory``), a variable (epistemic) or an array.
         self.arguments = tuple(arguments)
-        self.aleatory = tuple(aleatory)  # the distinct ``.dist()`` objects
+        self.aleatory = tuple(aleatory)  # distinct ``.dist()`` objects
+        # Sources of the arguments: a ``.dist()``, a variable or an array.
+        self.sources = [aleatory[a] if isinstance(a, int) else a for a in self.arguments]
         self.epistemic: tuple[TensorVariable, ...] = tuple(
             [a for a in self.arguments if isinstance(a, Variable)]
         )
         self.parents = tuple(parents)  # model variables that the inputs depend on
         self.nested = nested  # whether a ``.dist()`` depends on another one
         self.groups = groups_of("", self.parents)
-        # Conditions in the parameters of a ``.dist()``.
+        # Conditions on which the parameters of a ``.dist()`` depend.
         self.covariates = tuple(filter(is_condition, self.parents))
         self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
-        # Positions of aleatory inputs that are conditions, known for each specimen.
+        # Positions of those aleatory inputs that are conditions, with a known value per specimen.
         self.conditions = [i for i, x in enumerate(self.aleatory) if is_condition(x)]
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
-        # Numbers of one specimen in each argument, and those that are aleatory.
+        # Number of values of one specimen in each argument, and in all aleatory inputs.
         self.sizes = []
         for argument in self.arguments:
             if isinstance(argument, int):
@@ -65,9 +67,9 @@ class Inputs:
                 shape = argument.type.shape if is_static else argument.shape.eval()
             else:
                 shape = np.shape(argument)
-            self.sizes.append(int(np.prod(shape, dtype=int)))
-        self.dimensions = sum(int(np.prod(shape)) for shape in self.event_shapes)
-        # Data that can be changed, as `pymc.Data`, by name.
+            self.sizes.append(int(math.prod(shape)))
+        self.dimensions = sum(math.prod(shape) for shape in self.event_shapes)
+        # Data that the user may change, such as `pymc.Data`, by name.
         self.data: dict[str, Any] = {
             str(variable.name or f"shared variable {i}"): variable
             for i, variable in enumerate(_ancestry([*self.aleatory, *self.epistemic]))
@@ -76,12 +78,11 @@ class Inputs:
         }
 
     def parents_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
-        """Return the parents of the arguments at some positions; constants have none."""
+        """Return the model variables on which the arguments at some positions depend."""
         ends: set[Variable] = set(self.parents)
         parents: dict[TensorVariable, None] = {}
         for position in positions:
-            argument = self.arguments[position]
-            x = self.aleatory[argument] if isinstance(argument, int) else argument
+            x = self.sources[position]
             if isinstance(x, Variable):
                 parents.update((v, None) for v in _ancestry([x], ends) if v in ends)
         return tuple(parents)
@@ -97,7 +98,7 @@ class Inputs:
 
         With vectors of covariates, (n,), the distributions are those of n points.
         """
-        # In two steps, because params may themselves depend on the parents.
+        # Replace in two steps, because params may themselves depend on the parents.
         symbols = [r.type() for r in self.parents]
         values = dict(zip(symbols, map(pt.as_tensor, params), strict=True))
         vectors = {s: v for s, v in values.items() if v.type.ndim > s.type.ndim}
@@ -108,14 +109,14 @@ class Inputs:
         new = graph_replace(
             new, {s: v for s, v in values.items() if s not in vectors}, strict=False
         )
-        # A condition that is an input as well stays one.
+        # A condition may also be an input of the response, and then stays a condition.
         aleatory = [x if is_condition(x) else v for x, v in zip(self.aleatory, new, strict=False)]
         return aleatory, new[len(self.aleatory) :]
 
     def for_specimens(self, params: Sequence[Any], n: int) -> list[Any]:
-        """Return values of the parents, (k, *shape), with covariates of n specimens, (k, n).
+        """Return values of the parents, (k, *shape), in which covariates are those of n specimens.
 
-        Given covariates, (k,) or (k, m), are repeated in turn.
+        Covariates, (k,) or (k, m), are repeated cyclically to (k, n).
         """
         return [
             p.reshape(len(p), -1)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
@@ -123,7 +124,7 @@ class Inputs:
         ]
 
     def for_points(self, params: Sequence[Any], count: int) -> list[Any]:
-        """Return values of the parents with covariates of points, as many of each specimen."""
+        """Return values of the parents in which each covariate is repeated ``count`` times."""
         return [
             np.repeat(p, count, axis=1) if is_condition(r) else p
             for r, p in zip(self.parents, params, strict=True)
@@ -145,7 +146,7 @@ class Inputs:
         return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.parents, strict=True)]
 
     def placeholders(self) -> list[TensorVariable]:
-        """Return a new symbol for each parent: a vector for a covariate, by point."""
+        """Return a new symbol for each parent; that of a covariate is a vector over points."""
         return [(pt.dvector if is_condition(r) else r.type)(name=r.name) for r in self.parents]
 
 
@@ -162,8 +163,8 @@ def read_inputs(
 ) -> Inputs:
     """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise.
 
-    ``fixed`` is whether they may depend on no hyperparameter. ``originals`` are variables of a
-    model that this one copies, on which inputs may depend too.
+    With ``fixed`` they need not depend on a hyperparameter. If the model is a copy, ``originals``
+    are the variables of its original, on which inputs may depend as well.
     """
     tensors = {v: values_of(v) for v in (*model.basic_RVs, *originals)}
     model_variables: set[Variable] = {*tensors, *tensors.values()}
@@ -177,7 +178,7 @@ def read_inputs(
         if isinstance(x, Variable):
             x = input_without_dims(x, tensors)
             if all(hasattr(v, "data") for v in _ancestry([x]) if v.owner is None):
-                x = x.eval(mode=PLAIN)  # of constants alone
+                x = x.eval(mode=PLAIN)  # the graph has constants only
         if not isinstance(x, Variable):
             try:
                 array = real_array(x, label)
@@ -190,12 +191,12 @@ def read_inputs(
                 raise ValueError(
                     f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
                 )
-            # Neither the user nor the response may change it between two responses.
+            # Copy it, so that neither the user nor the response changes it between two runs.
             array = array.copy()
             array.setflags(write=False)
             arguments.append(array if array.ndim else float(array))
             continue
-        # A condition is an input itself, or a covariate of other ones.
+        # A condition is an input itself, or a covariate of other inputs.
         ends = model_variables - {x}
         if not is_condition(x):
             of_specimens = list(filter(is_known, _ancestry([x], model_variables)))
@@ -227,7 +228,7 @@ def read_inputs(
             "varies between specimens; pass a distribution made with `.dist()`, such as "
             f"pm.Normal.dist(mu, sigma); {NO_POPULATION}"
         )
-    if not fixed and all(map(is_known, parents)):  # also if there are none
+    if not fixed and all(map(is_known, parents)):  # true also without parents
         raise ValueError(
             f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
@@ -237,7 +238,7 @@ def read_inputs(
 
 
 def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) -> list[Variable]:
-    """Return variables and their ancestors, the nearest first, without those of the ends."""
+    """Return variables and their ancestors, nearest first, up to and including the ends."""
 
     def parents(variable: Variable) -> Any:
         return None if variable in ends or variable.owner is None else variable.owner.inputs
@@ -245,9 +246,11 @@ def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) 
     return list(walk(variables, parents))
 
 
-def _refuse_named_expressions(label: str, known: Sequence[Variable], model: pm.Model) -> None:
-    """Refuse a `pymc.Deterministic` of what is known of each specimen: it has no single value."""
-    for variable in known:
+def _refuse_named_expressions(
+    label: str, of_specimens: Sequence[Variable], model: pm.Model
+) -> None:
+    """Refuse a `pymc.Deterministic` that depends on a specimen: it has no single value."""
+    for variable in of_specimens:
         for expression in model.deterministics:
             if variable in ancestors([expression]):
                 raise TypeError(
@@ -258,7 +261,7 @@ def _refuse_named_expressions(label: str, known: Sequence[Variable], model: pm.M
 
 
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
-    """Return whether the density of an input depends on no value of its parts, as of a mixture."""
+    """Return whether an input, such as a mixture, has a density without its random parts."""
     try:
         density = quiet_logp(x, pt.zeros_like(x))
     except (NotImplementedError, TypeError, ValueError):
@@ -269,14 +272,14 @@ def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
 def _refuse_foreign_variables(
     x: Variable, ancestry: Sequence[Variable], latent: Sequence[Variable], label: str
 ) -> None:
-    """Refuse loose symbols, and variables of another model."""
-    # Constants, shared variables and generators have a value.
+    """Refuse symbols without a value, and variables of another model."""
+    # Constants have data, and shared variables and generators have a value.
     loose = [
         v
         for v in ancestry
         if v.owner is None and not hasattr(v, "data") and not hasattr(v, "get_value")
     ]
-    # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
+    # PyMC marks the variables of a model by a `str_repr`, which a `.dist()` does not have.
     foreign = [v for v in latent if hasattr(v, "str_repr") or has_dims(v)]
     if loose or foreign:
         raise TypeError(
@@ -290,14 +293,14 @@ def _refuse_foreign_variables(
 
 
 def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
-    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
+    """Return PyMC's log p(x), without its warning about random parts of a random walk."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
         return pm.logp(dist, x, warn_rvs=False)
 
 
-def event_shape(dist: TensorVariable) -> tuple[int, ...]:
-    """Return the event shape of an aleatory input, evaluated."""
+def event_shape(dist: TensorVariable) -> Shape:
+    """Return the shape of one draw of an aleatory input, as numbers."""
     if dist.type.ndim == 0:
         return ()
     shape = dist.type.shape
@@ -309,9 +312,9 @@ def event_shape(dist: TensorVariable) -> tuple[int, ...]:
 
 
 def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
-    """Return a name of each input: of its variable, or of the response's argument."""
-    inner: Any = getattr(function, "function", function)  # inside prb.scalar
-    declared = getattr(inner, "inputs", ())  # of a program or unit
+    """Return a name for each input: that of its variable, or of the response's argument."""
+    inner: Any = getattr(function, "function", function)  # the function inside prb.scalar
+    declared = getattr(inner, "inputs", ())  # programs and units declare their inputs
     arguments = [x if isinstance(x, str) else getattr(x, "name", "") for x in declared]
     if not all(arguments) or len(arguments) != len(inputs.arguments):
         try:
@@ -321,15 +324,14 @@ def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         arguments = [p.name for p in parameters if p.kind in positional]
     names = []
-    for place, argument in enumerate(inputs.arguments):
-        x = inputs.aleatory[argument] if isinstance(argument, int) else argument
+    for place, x in enumerate(inputs.sources):
         by_place = arguments[place] if place < len(arguments) else f"input {place + 1}"
         names.append(str(getattr(x, "name", None) or by_place))
     return names
 
 
 def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
-    """Return a name of each aleatory input: of its distribution, or the response's argument."""
+    """Return a name for each aleatory input: of its distribution, or the response's argument."""
     names = argument_names(inputs, function)
     return [names[inputs.arguments.index(position)] for position in range(len(inputs.aleatory))]
 
@@ -351,7 +353,7 @@ def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, 
 
 
 def unit_of(x: Any, index: tuple[int, ...] = ()) -> str:
-    """Return the unit of an aleatory input, or of an element of it; an empty text without one."""
+    """Return the unit of an aleatory input or of one element; an empty text if unknown."""
     units = getattr(x.tag, "units", "")
     if not isinstance(units, dict):
         return str(units)
@@ -359,7 +361,7 @@ def unit_of(x: Any, index: tuple[int, ...] = ()) -> str:
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
-    """Return the model, by default the one on the context; of nested models the outermost."""
+    """Return the model, by default that on the context; with nested models, the outermost."""
     if model is None:
         model = pm.Model.get_context(error_if_none=False)
     if not isinstance(model, pm.Model):
@@ -374,9 +376,7 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
 # -- batches ---------------------------------------------------------------------------------------
 
 
-def broadcast_batch(
-    values: Sequence[Any], event_ndims: Sequence[int]
-) -> tuple[tuple[int, ...], list[Any]]:
+def broadcast_batch(values: Sequence[Any], event_ndims: Sequence[int]) -> tuple[Shape, list[Any]]:
     """Broadcast the leading axes of arrays (..., *event); return their shape, and the arrays."""
     pairs = list(zip(values, event_ndims, strict=True))
     batch = np.broadcast_shapes(*[v.shape[: v.ndim - k] for v, k in pairs])
@@ -399,7 +399,7 @@ class GroupRV(RandomVariable):  # type: ignore[misc]
         self.labels = labels
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Any:
-        """Draw groups; the number of them and the shape are the arguments."""
+        """Draw groups; the arguments are the number of groups and the shape."""
         number, size = arguments
         return rng.integers(number, size=size)
 
@@ -479,7 +479,7 @@ def group(dim: str) -> TensorVariable:
             f"write pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
         )
     names = [str(label) for label in labels]
-    # A slash ends a name in a file.
+    # A slash would separate groups of a netCDF file.
     if len(names) < 2 or len(set(names)) < len(names) or any("/" in name for name in names):
         raise ValueError(
             f"{caller}: coords: got the groups {names} of {dim!r}, expected two or more different "
@@ -494,17 +494,17 @@ def group(dim: str) -> TensorVariable:
 
 def is_group(variable: Variable) -> bool:
     """Return whether a variable is the group of a specimen."""
-    # By an attribute, not by its class: a module may be loaded twice.
+    # Not isinstance: a module may be loaded twice, and then has two classes.
     return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
 
 
 def is_known(variable: Variable) -> bool:
-    """Return whether a variable is known of each specimen: its group or a condition."""
+    """Return whether a variable is known for each specimen: a group or a condition."""
     return is_group(variable) or is_condition(variable)
 
 
 def groups_of(name: str, parents: Iterable[Variable]) -> Groups | None:
-    """Return the groups among parents of inputs, None if there are none; refuse several."""
+    """Return the groups that inputs depend on, or None; refuse several partitions."""
     ops = [variable.owner.op for variable in parents if is_group(variable)]
     if not ops:
         return None
@@ -535,7 +535,7 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
         )
 
 
-def group_indices(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
+def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups."""
     labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]
@@ -552,7 +552,7 @@ def group_indices(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.
 
 
 def _labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
-    """Return the group of each specimen, and the observed values without it."""
+    """Return the group label of each specimen, and the observed values without these labels."""
     if hasattr(observed, "dims") and hasattr(observed, "coords") and dim in observed.coords:
         coordinate = observed.coords[dim]
         if coordinate.dims == observed.dims[:1]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,11 +24,12 @@ class InputMoments:
     def __init__(self, label: str, inputs: Inputs, levels: Sequence[float]) -> None:
         self.inputs = inputs
         self.levels = np.array(levels)
-        # Normal numbers of the trapezoidal rule for moments, exact enough for smooth inverses.
+        # Nodes of the trapezoidal rule for moments, in normal scores, which is exact enough for
+        # smooth inverse distribution functions.
         self.z = np.linspace(-8.0, 8.0, 97)
-        self.n_drawn = 2000  # from a population without an inverse distribution function
+        self.n_drawn = 2000  # draws if a population has no inverse distribution function
         (self.shape,) = inputs.event_shapes
-        self.size = int(np.prod(self.shape, dtype=int))
+        self.size = math.prod(self.shape)
         op = inputs.aleatory[0].owner.op
         self.is_multivariate = len(self.shape) == 1 == getattr(op, "ndim_supp", 0)
         self._inverse: Any = None
@@ -38,7 +40,7 @@ class InputMoments:
             self._sampler = PopulationSampler(inputs) if inputs.parents else None
 
     def _compiled(self, label: str) -> Any:
-        """Return inverse distribution functions; raise TypeError where there is none."""
+        """Return a compiled inverse distribution function; raise TypeError if there is none."""
         u = pt.dvector("u")
         symbols = [pt.dscalar() if is_condition(r) else r.type() for r in self.inputs.parents]
         if self.inputs.nested:
@@ -66,7 +68,7 @@ class InputMoments:
         return np.concatenate(parts)
 
     def _exact(self, parents: Sequence[Floats]) -> Floats:
-        """Return the numbers by inverse distribution functions."""
+        """Return the numbers from inverse distribution functions."""
         values = [
             p[:, 0] if is_condition(r) else p
             for r, p in zip(self.inputs.parents, parents, strict=True)
@@ -75,7 +77,8 @@ class InputMoments:
         placed, *covariance = self._inverse(*values, np.concatenate([ndtr(self.z), self.levels]))
         n = self.z.size + self.levels.size
         x = np.broadcast_to(placed, (k, n, *self.shape)).reshape(k, n, self.size)
-        nodes, levels = x[:, : self.z.size], x[:, self.z.size :]
+        nodes = x[:, : self.z.size]
+        levels = x[:, self.z.size :]
         weights = np.exp(-0.5 * self.z**2)
         weights /= weights.sum()
         with np.errstate(invalid="ignore", over="ignore"):
@@ -85,7 +88,7 @@ class InputMoments:
             for power, moment in ((1, mean), (2, None)):
                 terms = weights[:, None] * deviation**power
                 total = terms.sum(axis=1)
-                # Infinite moments come from the ends.
+                # A moment is infinite if the ends of the range contribute much of the sum.
                 beyond = terms[:, np.abs(self.z) > 7].sum(axis=1)
                 exists = beyond <= 0.01 * total
                 moments.append(
@@ -99,7 +102,7 @@ class InputMoments:
         return self._stacked(moments, levels, correlation)
 
     def _drawn(self, parents: Sequence[Floats]) -> Floats:
-        """Return the numbers of random draws."""
+        """Return the numbers estimated from random draws."""
         (dist,) = self.inputs.aleatory
         if self._sampler is None:
             with interpreted():
@@ -110,7 +113,8 @@ class InputMoments:
         is_discrete = not dist.dtype.startswith("float")
         method: Any = "inverted_cdf" if is_discrete else "linear"
         levels = np.moveaxis(np.quantile(x, self.levels, axis=1, method=method), 0, 1)
-        mean, sd = x.mean(axis=1), x.std(axis=1)
+        mean = x.mean(axis=1)
+        sd = x.std(axis=1)
         correlation = None
         if self.is_multivariate:
             z = (x - mean[:, None]) / sd[:, None]
@@ -120,10 +124,10 @@ class InputMoments:
     def _stacked(
         self, moments: Sequence[Floats], levels: Floats, correlation: Floats | None
     ) -> Floats:
-        """Return all numbers, (k, q, elements); NaN of a population that does not exist."""
+        """Return all numbers, (k, q, elements); NaN for populations that do not exist."""
         numbers = np.concatenate([np.stack(moments, axis=1), levels], axis=1)
         if correlation is not None:
             below = np.tril(np.ones(correlation.shape[1:], dtype=bool), -1)
-            rows = np.where(below, correlation, np.nan)  # by element and earlier element
+            rows = np.where(below, correlation, np.nan)  # a column for each earlier element
             numbers = np.concatenate([numbers, np.swapaxes(rows, 1, 2)[:, :-1]], axis=1)
         return np.where(np.isfinite(numbers), numbers, np.nan)

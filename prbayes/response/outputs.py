@@ -8,25 +8,24 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, first_text, real_array, unmasked
+from prbayes._validate import Bools, Floats, Indices, Shape, first_text, real_array, unmasked
 
 
 @dataclass(frozen=True)
 class Outputs:
     """The outputs of one specimen, in the order of the columns of ``observed``."""
 
-    # Texts, or numbers where the outputs are a curve; none if a run gives one number.
+    # Labels of the outputs: texts, or numbers if the outputs are a curve. No labels: one number.
     labels: tuple[Any, ...] = ()
     dim: str = "output"  # name of their dimension in results
-    # Keys of a response that returns a mapping, and the number of outputs of each, None for one
-    # number without an axis. Empty where outputs have no names.
+    # Keys of a response that returns a mapping, with the number of outputs of each key; None is one
+    # number without an axis. Outputs without names have no keys.
     keys: tuple[tuple[str, int | None], ...] = ()
-    units: tuple[str, ...] = ()  # of each output, or of one number; empty where unknown
+    units: tuple[str, ...] = ()  # unit of each output, or of the one number; empty if unknown
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """The shape of one specimen's outputs: () or (m,)."""
         return (len(self.labels),) if self.labels else ()
 
@@ -59,7 +58,7 @@ class Outputs:
         return arrays
 
     def assembled(self, result: Mapping[str, Any]) -> Any:
-        """Return a mapping's arrays as one, outputs in the last axis; other keys are a KeyError."""
+        """Concatenate a mapping's arrays along the last axis; raise KeyError for other keys."""
         if not self.keys:
             raise KeyError(
                 f"the response returned a mapping with the keys {list(result)}, expected an array; "
@@ -80,13 +79,14 @@ class Outputs:
         return values if self.labels else values[..., 0]
 
     def ordered(self, result: Any, batch_ndim: int) -> Any:
-        """Return a response with its outputs in this order; other labels are a KeyError.
+        """Return a response with its outputs in this order, or raise KeyError for other labels.
 
         Labels are the coordinate of a DataArray, the columns of a DataFrame, and the index of a
         Series of one specimen. Values without labels keep their order.
         """
         if hasattr(result, "columns") and not self.labels and result.shape[-1] == 1:
-            column, values = result.columns[0], result.iloc[:, 0]
+            column = result.columns[0]
+            values = result.iloc[:, 0]
             return self.assembled({column: values}) if self.keys and column != 0 else values
         axis = output_axis(result, batch_ndim, self)
         if axis is None or not self.labels:
@@ -105,7 +105,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def relabelled(values: Any, like: Any) -> Any:
-    """Return values with the labels of a Series, DataFrame, DataArray or named tuple."""
+    """Return values with the labels of ``like``: Series, DataFrame, DataArray, named tuple."""
     if hasattr(like, "_fields"):
         return type(like)(*values)
     if np.shape(values) != getattr(like, "shape", None) or not np.ndim(values):
@@ -118,31 +118,32 @@ def relabelled(values: Any, like: Any) -> Any:
     return type(like)(values, index=like.index, **columns)
 
 
-def output_order(
-    labels: Sequence[Any], expected: Sequence[Any], found: str
-) -> NDArray[np.intp] | None:
-    """Return the places of the expected labels; None if they are equal, or one side has none.
+def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) -> Indices | None:
+    """Return the positions of the expected labels among the labels.
 
-    Numbers are equal up to rounding. Other labels than the expected ones are a KeyError.
+    None if both are equal, or if one of them has no labels but 0, 1, ... Numbers are equal up to
+    rounding. Raises KeyError if other labels than the expected ones are there.
     """
     default = tuple(range(len(expected)))
-    labels, expected = tuple(labels), tuple(expected)
+    labels = tuple(labels)
+    expected = tuple(expected)
     if len(labels) != len(expected) or labels == expected or default in (labels, expected):
         return None
     numbers = [np.asarray(side) for side in (labels, expected)]
     if all(side.dtype.kind in "iuf" for side in numbers):
-        order, rank = np.argsort(numbers[0]), np.argsort(np.argsort(numbers[1]))
+        order = np.argsort(numbers[0])
+        rank = np.argsort(np.argsort(numbers[1]))
         if np.allclose(numbers[0][order], np.sort(numbers[1]), rtol=1e-9, atol=0):
             return np.asarray(order[rank])
     elif set(labels) == set(expected) and len(set(labels)) == len(labels):
         return np.array([labels.index(label) for label in expected], dtype=np.intp)
     raise KeyError(
-        f"{found} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
+        f"{prefix} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
     )
 
 
 def labels_along(result: Any, axis: int) -> tuple[Any, ...]:
-    """Return the labels of a labelled array along an axis; numbers from 0 where it has none."""
+    """Return the labels of a labelled array along an axis, or else numbers from 0."""
     if hasattr(result, "dims"):
         dim = result.dims[axis]
         values = result.coords[dim].values if dim in result.coords else range(result.shape[axis])
@@ -152,9 +153,9 @@ def labels_along(result: Any, axis: int) -> tuple[Any, ...]:
 
 
 def output_axis(result: Any, batch_ndim: int, outputs: Outputs | None) -> int | None:
-    """Return the axis of the outputs of a labelled array, None of other results.
+    """Return the axis of the outputs of a labelled array; None for other results.
 
-    Also raises a KeyError if the specimens are in another order.
+    Raises KeyError if the specimens are in another order.
     """
     axis = batch_ndim
     if hasattr(result, "dims") and hasattr(result, "coords"):
@@ -178,7 +179,7 @@ def output_axis(result: Any, batch_ndim: int, outputs: Outputs | None) -> int | 
 
 
 def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
-    """Return the outputs that a response's mapping or labelled array has, None without labels."""
+    """Return the outputs that a mapping or labelled array declares; None without labels."""
     if not isinstance(result, Mapping):
         axis = output_axis(result, batch_ndim, None)
         if axis is None:
@@ -187,8 +188,7 @@ def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
         if labels == tuple(range(len(labels))):
             return None
         dim = str(result.dims[axis]) if hasattr(result, "dims") else "output"
-        are_names = all(isinstance(label, str) for label in labels)
-        return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else ())
+        return Outputs(labels, dim, _keys_of(labels))
     keys: list[tuple[str, int | None]] = []
     for key, column in result.items():
         array = np.asarray(column)
@@ -197,20 +197,26 @@ def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
 
 
 def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
-    """Return the outputs of a mapping with these keys, and a number of outputs for each."""
+    """Return the outputs of a mapping, from its keys and the number of outputs of each key."""
     labels = []
     for key, size in keys:
         labels += [key] if size is None else [f"{key}[{i}]" for i in range(size)]
     return Outputs(tuple(labels), keys=tuple(keys))
 
 
+def _keys_of(labels: Sequence[Any]) -> tuple[tuple[str, int | None], ...]:
+    """Return a key for each label if all are texts, else no keys."""
+    are_names = all(isinstance(label, str) for label in labels)
+    return tuple((label, None) for label in labels) if are_names else ()
+
+
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
-    """Return observed responses, (N,) or (N, m), and their outputs, with names where they have."""
+    """Return observed responses, (N,) or (N, m), and their outputs, with names if there are any."""
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
         return _from_mapping(label, observed)
     if hasattr(observed, "columns") and hasattr(observed, "dtypes"):
-        # Columns that are no numbers, such as names of groups.
+        # Refuse columns that are not numeric, such as names of groups.
         texts = []
         first = ""
         for place, (column, kind) in enumerate(zip(observed, observed.dtypes, strict=True)):
@@ -239,9 +245,9 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
 
 
 def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
-    """Return the unit of each output that the attributes of a labelled array have.
+    """Return the unit of each output, from the attributes of a labelled array.
 
-    A text is the unit of all outputs; otherwise one by label, or in their order.
+    A text is the unit of all outputs. A mapping has units by label, a list in the order of outputs.
     """
     unit = getattr(observed, "attrs", {}).get("units")
     if isinstance(unit, Mapping):
@@ -269,18 +275,17 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
         dim = str(getattr(observed.columns, "name", None) or dim)
     else:
         return Outputs(labels)
-    are_names = all(isinstance(label, str) for label in labels)
-    keys = tuple((x, None) for x in labels) if are_names else ()
-    return Outputs(labels, dim, keys, units or _units_in(observed, labels))
+    return Outputs(labels, dim, _keys_of(labels), units or _units_in(observed, labels))
 
 
 def in_order_of(values: Any, observed: Any, name: str, *, reference: str = "observed") -> Any:
     """Return values of specimens in the order of the observed ones, where both have an index.
 
-    An index 0, 1, ... is none, unless the other is another order of it. Raises a ValueError if the
-    labels of both are different.
+    An index 0, 1, ... counts as none, unless the other index is a permutation of it. Raises a
+    ValueError if the labels of both differ.
     """
-    index, expected = specimen_index(values), specimen_index(observed)
+    index = specimen_index(values)
+    expected = specimen_index(observed)
     if index is None or expected is None or len(index) != len(expected) or index.equals(expected):
         return values
     if index.is_unique and expected.is_unique and set(index) == set(expected):
@@ -319,7 +324,7 @@ def refuse_other_order(values: Any, observed: Any, name: str) -> None:
 
 def specimen_index(values: Any) -> Any:
     """Return the index of the specimens of a labelled array or a mapping of them, or None."""
-    if isinstance(values, Mapping):  # of outputs, each in the order of the first
+    if isinstance(values, Mapping):  # all outputs are in the order of the first
         return specimen_index(next(iter(values.values()), None))
     if hasattr(values, "dims") and hasattr(values, "indexes"):
         return values.indexes.get(values.dims[0]) if values.dims else None
@@ -355,7 +360,7 @@ def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outp
     )
 
 
-def is_missing(values: Floats) -> NDArray[np.bool_]:
-    """Return which points, (n,) or (n, m) -> (n,), have an output that is NaN: no response."""
+def is_missing(values: Floats) -> Bools:
+    """Return whether points, (n,) or (n, m) -> (n,), have no response: an output that is NaN."""
     nan = np.isnan(values)
     return nan.any(axis=-1) if nan.ndim > 1 else nan

@@ -9,34 +9,37 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, called, executes, folder_path
+from prbayes._validate import Floats, Indices, Shape, called, executes, folder_path
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
     CallSettings,
+    Function,
     Points,
     Tally,
     array_advice,
-    by_output,
+    changed_run,
     checked,
     column_names,
     computed_again,
+    finite_runs,
     first_change,
     inputs_text,
     named_numbers,
     numbers_text,
     respond,
-    revealing_rows,
     scalar,
     shapes,
-    typical_size,
+    tolerance_of,
     unpacked,
+    unwrapped,
     written_form,
 )
 from prbayes.response.discrepancy import findings_of
@@ -61,9 +64,9 @@ def refuse_misfit(
     name: str, function: Any, sizes: Sequence[int], outputs: Outputs | None = None
 ) -> None:
     """Raise if a function takes other arguments than inputs of these sizes, or other outputs."""
-    inner: Any = function.function if isinstance(function, scalar) else function
+    inner: Any = unwrapped(function)
     try:
-        # Of a decorated function its own signature, not that of the function inside.
+        # The signature of a decorated function is that of its wrapper, which is what is called.
         signature = inspect.signature(inner, follow_wrapped=False)
     except (TypeError, ValueError):
         signature = None
@@ -76,7 +79,7 @@ def refuse_misfit(
             f"({error}), expected an input for each argument; a multivariate input is one "
             "argument, an array with an axis for its elements"
         ) from None
-    if hasattr(inner, "refuse_misfit"):  # of a program, unit or server
+    if hasattr(inner, "refuse_misfit"):  # programs, units and servers check more
         inner.refuse_misfit(name, sizes, outputs)
 
 
@@ -103,12 +106,11 @@ def check_call_settings(
 class StoredRuns:
     """Runs of a response that simulators with the same inputs and settings share."""
 
-    # Batches of stored points, (n, *event) for each aleatory input, and their responses, (n,) or
-    # (n, m).
+    # Pairs of points, (n, *event) for each aleatory input, and their responses, (n,) or (n, m).
     stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
     last: tuple[list[Floats], Floats] | None = None  # inputs and responses of the last call
-    is_shared: bool = False
-    # Callers that use the runs, for each of which a few were computed again.
+    is_shared: bool = False  # whether another simulator uses the runs
+    # Names of the callers for which a few runs were computed again, as a check of the response.
     users: set[str] = field(default_factory=set)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -128,7 +130,7 @@ class Responses:
     def __init__(
         self,
         name: str,
-        function: Callable[..., Any],
+        function: Function,
         inputs: Inputs,
         *,
         executor: Executor | None = None,
@@ -137,10 +139,10 @@ class Responses:
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
         timeout: float | None = None,
-        outputs: Outputs | None = SINGLE_OUTPUT,  # None takes those of the first run
-        caller: str = "",  # what uses the responses; by default the name
-        # Largest change of a specimen that is computed again, in standard deviations; None for a
-        # random response.
+        outputs: Outputs | None = SINGLE_OUTPUT,  # stated outputs; None takes those of a run
+        caller: str = "",  # name of the function that uses the responses; by default ``name``
+        # Largest change that a response may have when it is computed again, in standard deviations
+        # of the responses; None for a random response.
         scatter: float | None = 0.01,
     ) -> None:
         refuse_uncallable(name, function)
@@ -153,7 +155,7 @@ class Responses:
             if outputs is not None:
                 n_outputs = max(1, len(outputs.labels))
                 if version is not None and outputs.keys and outputs.labels:
-                    # In another order they are other numbers.
+                    # Stored numbers have no names: outputs in another order are another version.
                     version = f"{version} ({', '.join(outputs.names)})"
             database = Store(
                 store, name, columns=sum(inputs.sizes), version=version, outputs=n_outputs
@@ -163,17 +165,18 @@ class Responses:
         self.outputs = outputs
         self.function = function
         self.inputs = inputs
-        # Without other settings a function of batches is called once for each of them.
+        # A function of batches without other settings is called once for a whole batch.
         self.is_batched = (
             executor is None
             and store is None
             and policy == Abort()
             and not isinstance(function, scalar)
         )
-        self.count = 0  # runs that were needed, whether computed here or found in the store
+        self.count = 0  # number of runs that were needed, computed here or found in the store
         self.caller = caller or name
         self.scatter = scatter
-        # Called with the number of runs of a call, and the seconds of one: NaN before a batch.
+        # Function of the number of runs of a call and the seconds of one run, for progress; the
+        # seconds are NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
         self.runs = StoredRuns()
         self._is_checked = False
@@ -187,14 +190,14 @@ class Responses:
         self._tally = Tally()
 
     def copied(self) -> Responses:
-        """Return the same function with its own counts, and the same executor and store."""
+        """Return a copy with its own counts and the same executor and store."""
         duplicate = copy.copy(self)
         duplicate._tally = self._tally.copied()
         duplicate.runs = StoredRuns(list(self.runs.stored), users=set(self.runs.users))
         return duplicate
 
     def share(self, other: Responses) -> None:
-        """Use the runs of another one with the same response, inputs and settings."""
+        """Use the runs of another record with the same response, inputs and settings."""
         self.runs = other.runs
         self.runs.is_shared = True
 
@@ -215,7 +218,7 @@ class Responses:
 
     @property
     def replacement(self) -> float:
-        """Value in place of a response that failed; NaN if nothing is."""
+        """Value that replaces a failed response; NaN if failures are not replaced."""
         final = self._settings.on_failure.final
         return float(final.value) if isinstance(final, Replace) else np.nan
 
@@ -230,29 +233,23 @@ class Responses:
         return str(getattr(self.function, "remedy", "repair the response"))
 
     def same_as(self, other: Responses) -> bool:
-        """Return whether another has the same function, inputs and constants, and output order."""
-        # A mapping's arrays are concatenated in the order of what was observed.
+        """Return whether function, inputs, constants and order of outputs are the same."""
+        # Arrays of a mapping are concatenated in the order of the observed outputs.
         keys = {r.outputs.keys for r in (self, other) if r.outputs is not None}
-        arguments, other_arguments = self.inputs.arguments, other.inputs.arguments
+        sources = self.inputs.sources
+        other_sources = other.inputs.sources
         if self.function is not other.function or len(keys) > 1:
             return False
-        if len(arguments) != len(other_arguments):
-            return False
-        for x, y in zip(arguments, other_arguments, strict=True):
-            if isinstance(x, int) and isinstance(y, int):
-                x, y = self.inputs.aleatory[x], other.inputs.aleatory[y]
-            if isinstance(x, int | Variable) or isinstance(y, int | Variable):
-                if x is not y:
-                    return False
-            elif not np.array_equal(x, y):
-                return False
-        return True
+        return len(sources) == len(other_sources) and all(
+            x is y if isinstance(x, Variable) or isinstance(y, Variable) else np.array_equal(x, y)
+            for x, y in zip(sources, other_sources, strict=True)
+        )
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         batch, full = broadcast_batch(values, self.inputs.event_ndims)
-        size = int(np.prod(batch, dtype=int))
+        size = math.prod(batch)
         runs = self.runs
         if runs.is_shared and runs.last is not None and _equal(runs.last[0], values):
             self.count_reused(size)
@@ -274,15 +271,15 @@ class Responses:
                 self.outputs = self._tally.named
             responses = responses.reshape(batch + responses.shape[1:])
         if not self._is_checked and size > 1:
-            # Where a store has some of the runs, the first ones were checked.
+            # If a store has some of the runs, they were checked when they were computed.
             if self.computed >= n_computed + size:
                 specimens = [v.reshape(size, *v.shape[len(batch) :]) for v in full]
                 rows = responses.reshape(size, *responses.shape[len(batch) :])
                 self._refuse_state(specimens, rows)
                 self._refuse_late_change(specimens, rows)
             self._is_checked = True
-        # For the next simulator. Before there is one, only the trial at some points of the prior,
-        # which all simulators make.
+        # Keep the call for the next simulator with the same response. Before there is one, keep
+        # only the trial at some points of the prior, because every simulator makes it.
         is_kept = runs.is_shared or responses.size <= 64
         runs.last = ([x.copy() for x in values], responses.copy()) if is_kept else None
         return responses
@@ -297,21 +294,19 @@ class Responses:
         """Raise if stored runs differ when a few of them are computed again, once for each caller.
 
         ``points`` are those of this response's aleatory inputs, ``values`` their runs, (n,) or
-        (n, m). With a version of the store the user answers for the runs.
+        (n, m). Nothing is computed if the store has a version, by which the user vouches for them.
         """
         store = stored._settings.store
         self._is_checked |= stored._is_checked
         if self.caller in stored.runs.users or (store is not None and store.version is not None):
             return
-        rows = revealing_rows(values)
-        selected = [x[rows] for x in points]
-        again = self._again(selected)
-        changed = first_change(values[rows], again, _accuracy(values, self._one_system))
-        if changed is not None:
+        change = changed_run(values, partial(self._again, points), self._one_system)
+        if change is not None:
+            row, again = change
             raise ResponseError(
-                f"{self.caller}: got {numbers_text(again[changed])} from the response of "
-                f"{stored.name} {self._place(selected, changed)}, expected "
-                f"{numbers_text(values[rows[changed]])}, as in its runs: a variable that it reads "
+                f"{self.caller}: got {numbers_text(again)} from the response of {stored.name} "
+                f"{self._place(points, row)}, expected "
+                f"{numbers_text(values[row])}, as in its runs: a variable that it reads "
                 "has changed since; build the model again for the response as it is now, or write "
                 "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
             )
@@ -327,21 +322,19 @@ class Responses:
         self.count += size
         self._n_reused += size
 
-    def _points(self, full: Sequence[Floats], batch: tuple[int, ...]) -> Points:
+    def _points(self, full: Sequence[Floats], batch: Shape) -> Points:
         """Return the points of a batch, each a row, from values of all inputs."""
-        n = int(np.prod(batch, dtype=int))
+        n = math.prod(batch)
         k = len(self.inputs.aleatory)
         rows = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
         return Points(self.inputs.fill(rows[:k], rows[k:]), varying)
 
-    def _called(
-        self, values: Sequence[Floats], batch: tuple[int, ...], *, is_run: bool = True
-    ) -> Floats:
+    def _called(self, values: Sequence[Floats], batch: Shape, *, is_run: bool = True) -> Floats:
         """Call the function once for a batch of any shape."""
         k = len(self.inputs.aleatory)
         arguments = self.inputs.fill(values[:k], values[k:])
-        size = int(np.prod(batch, dtype=int)) if is_run else 0
+        size = math.prod(batch) if is_run else 0
         budget().grant(size, least=size)
         try:
             with np.errstate(all="ignore"):
@@ -359,75 +352,76 @@ class Responses:
             raise ResponseError(f"{self.name}: {error}") from None
         return responses
 
-    def _again(self, values: Sequence[Floats]) -> Floats:
-        """Compute a few specimens again, (n, *event) by input; no runs, and not in the store.
+    def _again(self, values: Sequence[Floats], rows: Indices) -> Floats:
+        """Compute some specimens, (n, *event) by input, again; NaN where the response raises.
 
-        NaN where the response raises.
+        The calls are not counted as runs, and are not stored.
         """
-        n = len(values[0])
+        # Indexing copies, so that the function may change its arguments in place.
+        selected = [x[rows] for x in values]
+        batch = (len(rows),)
         with unlimited():
             if self.is_batched:
-                # Copies, which the function may change in place.
-                return self._called([x.copy() for x in values], (n,), is_run=False)
+                return self._called(selected, batch, is_run=False)
             settings = replace(self._settings, outputs=self.outputs)
-            return computed_again(settings, self._points(values, (n,)), self._tally.copied())[0]
+            return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _by_itself(self, values: Sequence[Floats], copies: int) -> Floats:
-        """Compute specimens again; where a function takes no batch of one, as several copies."""
+    def _by_itself(self, values: Sequence[Floats], rows: Indices, copies: int) -> Floats:
+        """Compute specimens again; if a function takes no batch of one, as several copies."""
         try:
-            return self._again(values)
+            return self._again(values, rows)
         except ResponseError:
-            n = len(values[0])
-            return self._again([np.concatenate([x] * copies) for x in values])[:n]
+            return self._again(values, np.tile(rows, copies))[: len(rows)]
 
     def _place(self, points: Sequence[Floats], row: int) -> str:
         """Return the aleatory inputs of a specimen as a text, with their names."""
-        sizes = [int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes]
+        sizes = [math.prod(shape) for shape in self.inputs.event_shapes]
         names = column_names(aleatory_names(self.inputs, self.function), sizes)
         return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
 
     @property
     def _one_system(self) -> float:
-        """By how many standard deviations a solver that steps a batch as one system differs."""
+        """Tolerance, in standard deviations, for solvers that integrate a batch as one system."""
         return 0.01 if self.is_batched else 0.0
 
     def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if one of three specimens differs when it is computed again, by itself.
 
-        The last one, which depends on the most if the response has a state from specimen to
-        specimen, then one in the middle, and the first one, after all others.
+        They are the last one, on which a state that passes from specimen to specimen has the most
+        influence, then one in the middle, and finally the first one.
         """
-        finite = np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
+        finite = finite_runs(values)
         if finite.size < 2 or (self.scatter is None and not self.is_batched):
             return
         rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
         parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
         copies = 3 if len(values) == 2 else 2
         for part in parts:
-            selected = [x[part] for x in specimens]
             try:
-                again = self._by_itself(selected, copies)
+                again = self._by_itself(specimens, part, copies)
                 again = np.where(np.isnan(again), values[part], again)  # it may fail by chance
-                accuracy = _accuracy(values, 0.01 if self.scatter is None else self.scatter)
-                changed = first_change(values[part], again, accuracy)
+                tolerance = tolerance_of(values, 0.01 if self.scatter is None else self.scatter)
+                changed = first_change(values[part], again, tolerance)
                 if changed is None:
                     continue
-                second = self._by_itself(selected, copies)
-            except ResponseError as error:  # it takes no small batch
+                second = self._by_itself(specimens, part, copies)
+            except ResponseError as error:  # the response takes no small batch
                 if self.is_batched:
                     self._refuse_one_size(specimens, (len(values),), error)
                 return
-            is_random = first_change(again, second, _accuracy(values)) is not None
+            is_random = first_change(again, second, tolerance_of(values)) is not None
             if is_random and self.scatter is None:
                 return
-            tolerance = _accuracy(values, self._one_system)
+            tolerance = tolerance_of(values, self._one_system)
             if not is_random and first_change(values[part], again, tolerance) is None:
                 continue
-            got, expected = again[changed], values[part[changed]]
+            row = part[changed]
+            got = again[changed]
+            expected = values[row]
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
-                    f"response {self._place(selected, changed)}, expected the same: it is random, "
+                    f"response {self._place(specimens, row)}, expected the same: it is random, "
                     "or keeps a state from one specimen to the next; fix its random seed or "
                     "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
                     "prb.AreaMetric() with prb.Fresh() for random responses"
@@ -441,13 +435,14 @@ class Responses:
             )
 
     def _refuse_one_size(
-        self, values: Sequence[Floats], batch: tuple[int, ...], error: ResponseError
+        self, values: Sequence[Floats], batch: Shape, error: ResponseError
     ) -> None:
         """Raise if the response takes no other number of specimens than that of its batch.
 
-        An array of as many values inside it would be paired with points of the population.
+        Such a response contains an array with a value for each specimen, whose values would be
+        paired with points of the population.
         """
-        size = int(np.prod(batch, dtype=int))
+        size = math.prod(batch)
         few = (*[1] * (len(batch) - 1), 3 if size == 2 else 2)
         rows = np.arange(few[-1]) % size
         specimens = [v.reshape(size, *v.shape[len(batch) :])[rows] for v in values]
@@ -464,21 +459,19 @@ class Responses:
         is_unchanged = written_form(self.function) == self._written_form
         if is_unchanged or self._written_form is None or self.scatter is None:
             return
-        rows = revealing_rows(values)
-        selected = [x[rows] for x in specimens]
         written = copy.copy(self)
         try:
             written.function = unpacked(self._written_form)
             written._settings = replace(self._settings, function=written.function)
-            then = written._again(selected)
-            then = np.where(np.isnan(then), values[rows], then)
-        except Exception:  # such as of a function that was not defined yet
+            compute = partial(written._again, specimens)
+            change = changed_run(values, compute, self._one_system, may_fail=True)
+        except Exception:  # for example, a function that it calls was not defined yet
             return
-        changed = first_change(values[rows], then, _accuracy(values, self._one_system))
-        if changed is not None:
+        if change is not None:
+            row, then = change
             raise ResponseError(
-                f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
-                f"{self._place(selected, changed)}, expected {numbers_text(then[changed])}, its "
+                f"{self.name}: got {numbers_text(values[row])} from the response "
+                f"{self._place(specimens, row)}, expected {numbers_text(then)}, its "
                 "value when the simulator was created: a variable that it reads has changed since "
                 "then (runs begin at the first use); write a function without a state, and one "
                 "for each condition, such as functools.partial(response, load=2.0)"
@@ -488,48 +481,44 @@ class Responses:
 def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, tally: Tally) -> None:
     """Raise if a few of the runs, (n,) or (n, m), differ when they are computed again.
 
-    They do if the response has scatter, or depends on other specimens; see `revealing_rows`.
+    They do if the response is random, or if it depends on the other specimens of a call.
     """
-    rows = revealing_rows(values)
-    with unlimited():
-        again, _ = computed_again(settings, points.at(rows), tally.copied())
-    again = np.where(np.isnan(again), values[rows], again)  # it may fail by chance
+
+    def compute(rows: Indices) -> Floats:
+        with unlimited():
+            return computed_again(settings, points.at(rows), tally.copied())[0]
+
     share = 0.0 if isinstance(settings.function, scalar) else 0.01
-    changed = first_change(values[rows], again, _accuracy(values, share))
-    if changed is not None:
-        where = inputs_text(settings, points, int(rows[changed]))
+    change = changed_run(values, compute, share, may_fail=True)
+    if change is not None:
+        row, again = change
         raise ResponseError(
-            f"{settings.name}: got {numbers_text(values[rows[changed]])} and "
-            f"{numbers_text(again[changed])} from the response with inputs {where}, expected the "
+            f"{settings.name}: got {numbers_text(values[row])} and {numbers_text(again)} from the "
+            f"response with inputs {inputs_text(settings, points, row)}, expected the "
             "same: it is random, or depends on the other specimens of a call; fix its random seed "
             "or state, or write it for one specimen, in prb.scalar"
         )
 
 
-def _accuracy(values: Floats, share: float = 0.0) -> Any:
-    """Return how much one of the responses (n,) or (n, m) may change: a share of their spread."""
-    finite = values[np.isfinite(by_output(values)).all(axis=1)]
-    spread = finite.std(axis=0) if len(finite) else 0.0
-    return np.maximum(1e-6 * typical_size(values), share * spread)
-
-
-def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
-    pairs = zip(arrays, others, strict=True)
+def _equal(first: Sequence[Floats], second: Sequence[Floats]) -> bool:
+    pairs = zip(first, second, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def deduplicated_responses(
-    responses: Responses, points: Sequence[Floats], known: tuple[Sequence[Floats], Floats] | None
+    responses: Responses, points: Sequence[Floats], stored: tuple[Sequence[Floats], Floats] | None
 ) -> Floats:
-    """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
+    """Return the responses at points (n, *event), (n,) or (n, m); equal points are computed once.
 
-    ``known`` has points and responses.
+    ``stored`` is a pair of points and their responses, which are not computed again.
     """
     n = len(points[0])
-    known_points, known_values = ([x[:0] for x in points], np.empty(0)) if known is None else known
-    m = len(known_values)
-    # The bits of all numbers of each point as one item; -0.0 becomes 0.0.
-    columns = [np.concatenate([x[:m], y]) for x, y in zip(known_points, points, strict=True)]
+    stored_points, stored_values = (
+        ([x[:0] for x in points], np.empty(0)) if stored is None else stored
+    )
+    m = len(stored_values)
+    # Compare points by the bits of all their numbers; adding zero turns -0.0 into 0.0.
+    columns = [np.concatenate([x[:m], y]) for x, y in zip(stored_points, points, strict=True)]
     columns = [x.reshape(m + n, math.prod(x.shape[1:])) for x in columns]
     bits = np.concatenate(columns, axis=1, dtype=np.float64) + 0.0
     keys = bits.view(np.dtype((np.void, bits.dtype.itemsize * bits.shape[1]))).ravel()
@@ -539,9 +528,9 @@ def deduplicated_responses(
     if is_new.all():
         return responses(points, [])
     new = np.flatnonzero(is_new)
-    computed = responses([x[new] for x in points], []) if new.size else known_values[:0]
+    computed = responses([x[new] for x in points], []) if new.size else stored_values[:0]
     values = np.full((m + n, *computed.shape[1:]), np.nan)
-    values[:m] = known_values.reshape(m, *computed.shape[1:])
+    values[:m] = stored_values.reshape(m, *computed.shape[1:])
     values[m + new] = computed
     responses.count_reused(n - new.size)
     return values[earliest[m:]]

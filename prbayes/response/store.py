@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import Bools, Floats, plain_text, positive_integer, stated_path
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -39,18 +38,19 @@ class _Session:
     """A connection of one thread of one process, and the runs that it has read."""
 
     connection: sqlite3.Connection
-    opened: tuple[int, ...]  # process, device and number of the file
-    response: int  # number of the store's response in the file
-    columns: int  # numbers that make the inputs of one run
-    values: dict[bytes, bytes] = field(default_factory=dict)  # of all outputs by inputs
-    failed: dict[bytes, str] = field(default_factory=dict)  # reasons by inputs
-    n_read: int = 0  # runs of any response
+    opened: tuple[int, ...]  # process, device and inode of the file
+    response: int  # row of the store's response in the file
+    columns: int  # number of values that make the inputs of one run
+    values: dict[bytes, bytes] = field(default_factory=dict)  # outputs of runs by their inputs
+    failed: dict[bytes, str] = field(default_factory=dict)  # reasons of failures by inputs
+    n_read: int = 0  # number of runs that were read, also those of other responses
 
     def __post_init__(self) -> None:
         self.close = weakref.finalize(self, _close, self.connection, os.getpid())
 
 
-# Connections of the parent process after a fork, which must not be closed in the child.
+# Connections of the parent process after a fork. They are kept, since closing them in the child
+# would harm the parent.
 _inherited: list[sqlite3.Connection] = []
 
 
@@ -144,7 +144,7 @@ class Store:
     def __len__(self) -> int:
         return len(self._read().values)
 
-    def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def find(self, inputs: Floats) -> tuple[Floats, Bools]:
         """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
 
         Several outputs have shape (n, m).
@@ -156,7 +156,7 @@ class Store:
         return self._as_array(session, (v or missing for v in values)), is_known
 
     def failed(self, inputs: Floats) -> dict[int, str]:
-        """Return why inputs, (n, columns), are stored as failed, by the rows of those that are."""
+        """Return the reasons of those inputs, (n, columns), that are stored as failed, by row."""
         failed = self._read().failed
         if not failed:
             return {}
@@ -239,8 +239,8 @@ class Store:
         """Return the session of this thread with all runs that are in the file."""
         session: _Session | None = getattr(self._local, "session", None)
         with self._explained():
-            # A session from before a fork, or of another file in this place, is closed first:
-            # closing deletes the log of writes, by name.
+            # A session from before a fork, or of a file that was replaced, is closed before the
+            # file is opened, because closing deletes the log of writes by its name.
             if session is not None and session.opened != self._file_identity():
                 session.close()
                 session = None
@@ -251,7 +251,7 @@ class Store:
         return session
 
     def _file_identity(self) -> tuple[int, ...]:
-        """Return process, device and number of the file; nothing if there is no file."""
+        """Return process, device and inode of the file; an empty tuple without a file."""
         try:
             file = self.path.stat()
         except FileNotFoundError:
@@ -259,7 +259,7 @@ class Store:
         return os.getpid(), file.st_dev, file.st_ino
 
     def _open(self) -> _Session:
-        """Open the file, made if it does not exist, and check it."""
+        """Open the file and check it; create it if it does not exist."""
         if self.folder.exists() and not self.folder.is_dir():
             raise StoreError(
                 f"{self.name}: store: got {self.folder}, which is a file, expected a folder"
@@ -276,8 +276,8 @@ class Store:
             raise
 
     def _response(self, connection: sqlite3.Connection) -> tuple[int, int]:
-        """Return number and columns of the store's response in the file; add it if it is new."""
-        # A row of the table that another process adds first is taken.
+        """Return row and columns of the store's response in the file; add it if it is new."""
+        # If another process adds the same response first, its row is used.
         name = self.name, self.version
         responses = _responses(connection)
         if name not in responses and self.columns is not None:
@@ -307,7 +307,7 @@ class Store:
         return responses[name]
 
     def _read_new_runs(self, session: _Session) -> None:
-        """Read the runs that the session has not read; numbers and checksums have to match."""
+        """Read the runs that the session has not read; check their numbers and checksums."""
         select = (
             "SELECT id, response, key, state, reason, value, checksum FROM run "
             "WHERE id > ? ORDER BY id"
@@ -321,7 +321,7 @@ class Store:
                 response, key, state, reason, value = row
                 if response == session.response:
                     self._refuse_other_outputs(session, value)
-                    # The last run of a point counts: a failed one may have been tried again.
+                    # The last run of a point counts, because a failed one may be repeated.
                     session.values[key] = value
                     session.failed.pop(key, None)
                     if state == "failed":
@@ -368,12 +368,13 @@ def _numbers(values: Iterable[bytes]) -> Floats:
 
 # Distinguishes stores from other databases (https://www.sqlite.org/pragma.html).
 _APPLICATION = int.from_bytes(b"prby")
-_LAYOUT = 2  # version of the tables below: files of other versions are refused
-# Seconds to wait for other writers: a chunk takes 10 ms, so a thousand writers fit.
+_LAYOUT = 2  # version of the tables below; files of other versions are refused
+# Seconds to wait for other writers. A chunk takes 10 ms, so that a thousand writers may queue.
 _PATIENCE = 60.0
 
-# A response has a name and a version. Key and value of a run are float64, little-endian, so every
-# bit survives; a key has the constants, too. Runs are numbered without gaps, which shows losses.
+# A response has a name and a version. Key and value of a run are little-endian float64, so that
+# every bit is kept; the key includes the constants. Runs are numbered without gaps, so that a loss
+# shows.
 _TABLES = (
     "CREATE TABLE response (id INTEGER PRIMARY KEY, name TEXT NOT NULL, columns INTEGER NOT NULL, "
     "version TEXT, checksum INTEGER NOT NULL)",
@@ -391,12 +392,13 @@ def checksum(*row: Any) -> int:
 
 
 def create(path: Path) -> None:
-    """Make an empty store; it appears complete or not at all, and replaces none."""
+    """Create an empty store, complete or not at all; an existing file is not replaced."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = _part_of(path)
     try:
         with closing(connect(part, "rwc")) as connection:
-            # Readers and the writer do not wait for each other, and a commit is one flush.
+            # With a write-ahead log, readers and the writer do not wait for each other, and a
+            # commit is one flush.
             connection.execute("PRAGMA journal_mode = WAL")
             with transaction(connection):
                 for table in _TABLES:
@@ -406,27 +408,27 @@ def create(path: Path) -> None:
         try:
             os.link(part, path)
         except FileExistsError:
-            return  # another process was faster
+            return  # another process has created the store
         except OSError:
-            part.rename(path)  # a file system without links
+            part.rename(path)  # the file system has no hard links
     finally:
         part.unlink(missing_ok=True)
 
 
 def _part_of(path: Path) -> Path:
-    """Return the path of an unfinished file, another one in each process."""
+    """Return a path for an unfinished file that no other process uses."""
     return path.with_name(f"{path.name[:40]}.{uuid.uuid4().hex}.part")
 
 
 def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
-    """Write files whole, or raise an `OSError` that says what is left, and change none of them."""
+    """Write all files completely, or change none of them and raise an `OSError`."""
     parts: dict[Path, Path] = {}
     try:
         for path, content in contents.items():
             if path.exists() and not path.is_file():
                 path.write_bytes(content)  # a device or a pipe
                 continue
-            target = path.resolve()  # a link stays one
+            target = path.resolve()  # a symbolic link stays, and its target is replaced
             part = _part_of(target)
             parts[part] = target
             with part.open("xb") as file:
@@ -451,7 +453,7 @@ def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
 
 @contextmanager
 def only_writer(path: Path, name: str) -> Iterator[None]:
-    """Lock a file until the block or the process ends; remove what killed writers of it left.
+    """Lock a file until the block or the process ends; remove what killed writers left behind.
 
     Raises `StoreError` if it is locked, or cannot be written.
     """
@@ -471,7 +473,7 @@ def only_writer(path: Path, name: str) -> Iterator[None]:
             "wait for its end, or pass another path"
         ) from error
     try:
-        # `_part_of` cuts long names, and their parts may belong to another file.
+        # `_part_of` truncates long names, so that such a part may belong to another file.
         if len(target.name) < 40:
             for part in target.parent.glob("*.part"):
                 if re.fullmatch(re.escape(target.name) + r"\.[0-9a-f]{32}\.part", part.name):
@@ -487,11 +489,11 @@ def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:
         f"{path.absolute().as_uri()}?mode={mode}",
         uri=True,
         timeout=_PATIENCE,
-        isolation_level=None,  # transactions begin where the code says so
+        isolation_level=None,  # transactions are begun explicitly
         check_same_thread=False,  # the garbage collector may close it in another thread
     )
     try:
-        # For files that may be damaged (https://www.sqlite.org/security.html).
+        # Precautions for files that may be damaged (https://www.sqlite.org/security.html).
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA cell_size_check = ON")
         connection.execute("PRAGMA mmap_size = 0")
@@ -504,7 +506,7 @@ def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    """Write all or nothing; it waits for other writers at the beginning, not in the middle."""
+    """Write all or nothing. Waiting for other writers happens at the beginning of the block."""
     connection.execute("BEGIN IMMEDIATE")
     with connection:
         yield
@@ -512,8 +514,8 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 def check_file(path: Path, connection: sqlite3.Connection) -> None:
     """Raise if a file is damaged, or of another program or layout."""
-    # The smallest page (https://www.sqlite.org/fileformat.html): an empty file is a new one to
-    # SQLite.
+    # SQLite takes an empty file for a new one. The smallest page has 512 bytes
+    # (https://www.sqlite.org/fileformat.html).
     if path.stat().st_size < 512:
         raise _damaged("it was cut to less than a page")
     (application,) = connection.execute("PRAGMA application_id").fetchone()
@@ -534,13 +536,13 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
     if tables != [(table,) for table in _TABLES]:
         raise _damaged("its tables are others")
     (result,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    last = result.splitlines()[-1]  # the lines before name the database
+    last = result.splitlines()[-1]  # earlier lines only name the database
     if last != "ok":
         raise _damaged(last)
 
 
 def _responses(connection: sqlite3.Connection) -> dict[tuple[str, str | None], tuple[int, int]]:
-    """Return number and columns of the responses in the file, by name and version."""
+    """Return row and columns of the responses in the file, by name and version."""
     query = "SELECT id, name, columns, version, checksum FROM response ORDER BY id"
     responses = {}
     for number, *row, stored_checksum in connection.execute(query).fetchall():
@@ -555,7 +557,7 @@ def _responses(connection: sqlite3.Connection) -> dict[tuple[str, str | None], t
 
 
 class _FileError(Exception):
-    """A file that is no store for this response: got, expected, what to do."""
+    """A file that is no store for this response; its arguments are got, expected, what to do."""
 
 
 def _damaged(reason: str) -> _FileError:
@@ -567,7 +569,7 @@ def _damaged(reason: str) -> _FileError:
     )
 
 
-# Names of errors of SQLite (https://www.sqlite.org/rescode.html), with got, expected, what to do.
+# Texts (got, expected, what to do) by names of SQLite errors (https://www.sqlite.org/rescode.html).
 _EXPLANATIONS = {
     "FULL|IOERR_(WRITE|FSYNC|TRUNCATE|SHMSIZE)": (
         "which cannot grow",
@@ -588,11 +590,11 @@ _EXPLANATIONS = {
 
 
 def explanation(error: sqlite3.Error | _FileError) -> tuple[str, str, str]:
-    """Return got, expected and what to do; an unknown error of SQLite is damage."""
+    """Return got, expected and what to do; an unknown error of SQLite is reported as damage."""
     if isinstance(error, _FileError):
         return error.args
     name = getattr(error, "sqlite_errorname", "")
     for pattern, (got, expected, action) in _EXPLANATIONS.items():
         if re.match(f"SQLITE_({pattern})", name):
             return f"{got} ({error})", expected, action
-    return _damaged(f"{error!s:.200}").args  # it may quote what is damaged
+    return _damaged(f"{error!s:.200}").args  # cut, since it may quote damaged contents

@@ -150,14 +150,14 @@ def umbridge(
 
 @dataclass(frozen=True)
 class Address:
-    """The address of a server; its name, password and query are sent, and never shown."""
+    """The address of a server; user, password and query are sent, but never shown."""
 
-    shown: str
-    user: str = field(default="", repr=False)  # name and password
+    shown: str  # address without secrets
+    user: str = field(default="", repr=False)  # name and password, with a colon between
     query: str = field(default="", repr=False)
 
     def __str__(self) -> str:
-        """Return the address without what is secret."""
+        """Return the address without user, password and query."""
         return self.shown
 
     @property
@@ -213,9 +213,9 @@ class RemoteModel:
 
     address: Address
     model: str
-    config: str  # as JSON
+    config: str  # settings of the model, as JSON
     inputs: tuple[int, ...]  # sizes of the model's input vectors
-    outputs: tuple[int, ...]
+    outputs: tuple[int, ...]  # sizes of its output vectors
     timeout: float | None
     patience: float
 
@@ -251,7 +251,7 @@ class RemoteModel:
                 status, text = _exchange(
                     self.address, "/Evaluate", request, self.timeout, sum(self.outputs)
                 )
-                if status not in (502, 503):  # of a gateway whose server is away
+                if status not in (502, 503):  # a gateway answers so while its server is away
                     return _read_answer(self.model, "/Evaluate", status, text)
                 reason = f"it answered {status}"
             except TimeoutError:
@@ -260,7 +260,8 @@ class RemoteModel:
                     f"{self.address}"
                 ) from None
             except ProtocolError as error:
-                # Lost after the request was sent: the specimen may be what ends the server.
+                # The connection was lost after the request was sent, so that this specimen may
+                # have ended the server.
                 n_lost, give_up_at, pause, reason = n_lost + 1, 0.0, 0.1, str(error)
                 if n_lost == 3:
                     raise ConnectionError(
@@ -298,7 +299,7 @@ class RemoteModel:
             )
 
     def _refuse_inputs(self, name: str, sizes: Sequence[int]) -> None:
-        """Raise if inputs do not fill the model's vectors, or one would be cut in two."""
+        """Raise if inputs do not fill the model's vectors, or one would be split between two."""
         reason = f"{sum(self.inputs)} in all"
         if sum(sizes) == sum(self.inputs):
             ends = np.cumsum(self.inputs)
@@ -319,7 +320,7 @@ class RemoteModel:
 
 
 class _Until(io.RawIOBase):
-    """The bytes of a socket until a time; a socket's own limit holds for each piece."""
+    """The bytes of a socket with one deadline; a socket's own limit holds for each piece."""
 
     def __init__(self, sock: socket.socket, raw: io.RawIOBase, seconds: float) -> None:
         self.sock, self.raw, self.end = sock, raw, time.monotonic() + seconds
@@ -329,7 +330,7 @@ class _Until(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int | None:
-        """Read a piece; raise `TimeoutError` at the end of the time."""
+        """Read a piece; raise `TimeoutError` after the deadline."""
         seconds = self.end - time.monotonic()
         if seconds <= 0:
             raise TimeoutError
@@ -337,13 +338,13 @@ class _Until(io.RawIOBase):
         return self.raw.readinto(buffer)
 
     def close(self) -> None:
-        """Close the socket's file, too."""
+        """Close the file of the socket as well."""
         self.raw.close()
         super().close()
 
 
 class _TimedResponse(HTTPResponse):
-    """An answer whose time limit, that of the socket, holds for headers and body together."""
+    """A response for whose headers and body together the socket's time limit holds."""
 
     def __init__(self, sock: socket.socket, *arguments: Any, **keywords: Any) -> None:
         super().__init__(sock, *arguments, **keywords)
@@ -369,7 +370,7 @@ class _HttpsPool(urllib3.HTTPSConnectionPool):
 
 
 def _new_pool() -> urllib3.PoolManager:
-    """Return connections that notice within two minutes that a machine is gone."""
+    """Return a pool of connections that detect a dead machine within two minutes."""
     options = [*HTTPConnection.default_socket_options, (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)]
     for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, option):
@@ -384,7 +385,7 @@ _inherited: list[urllib3.PoolManager] = []
 
 
 def _renew_pool() -> None:
-    """Leave the connections to the parent process after a fork."""
+    """Use new connections after a fork, because the old ones belong to the parent process."""
     global _pool
     _inherited.append(_pool)
     _pool = _new_pool()
@@ -395,7 +396,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _known(address: Address, path: str, request: Any) -> list[Any]:
-    """Return the values of an answer for which the server need not compute; it has to be there."""
+    """Return the values of an answer about the model; raise if no such server answers."""
     try:
         return _read_answer(path, path, *_exchange(address, path, request, 60.0))
     except RuntimeError as error:
@@ -414,7 +415,7 @@ def _exchange(
     address: Address, path: str, request: Any, seconds: float | None, n_numbers: int = 0
 ) -> tuple[int, str]:
     """Return status and text of an answer; `ProtocolError` if it is lost after the request."""
-    # Bytes: a number in text takes fewer than 64.
+    # A number takes fewer than 64 bytes of text.
     largest = 1_000_000 + 64 * n_numbers
     text = bytearray()
     try:
@@ -424,7 +425,7 @@ def _exchange(
             json=request,
             headers=address.headers,
             preload_content=False,
-            decode_content=False,  # no encoding was asked for: a few bytes may become gigabytes
+            decode_content=False,  # a few compressed bytes could become gigabytes
             timeout=urllib3.Timeout(connect=10.0, read=seconds),
         )
         while piece := response.read1(1 << 20):
@@ -437,7 +438,7 @@ def _exchange(
                 )
         response.release_conn()
     except ReadTimeoutError as error:
-        # The system's own, of a machine that is gone, has a number.
+        # If the system reports that the machine is gone, the error has a number.
         if getattr(error.__cause__, "errno", None) is not None:
             raise ProtocolError(str(error.__cause__)) from None
         raise TimeoutError(f"not within {seconds:g} s") from None
@@ -466,7 +467,7 @@ def _are_vectors(value: object) -> bool:
     )
 
 
-# What the five answers have to contain: keys, their values in words, and the tests of these.
+# Keys that the five answers must contain, with a description of the value and a check of it.
 _ANSWERS: dict[str, list[tuple[str, str, Callable[[Any], bool]]]] = {
     "/Info": [
         ("protocolVersion", "a number", _is_number),
@@ -502,7 +503,7 @@ def _read_answer(name: str, path: str, status: int, text: str) -> list[Any]:
         real(digits)
         return int(digits)
 
-    words = {"nan": "NaN", "inf": "Infinity"}  # of servers in Python
+    words = {"nan": "NaN", "inf": "Infinity"}  # servers in Python may write nan and inf
     answer = None
     for form in (text, re.sub(r"\b(?:nan|inf)\b", lambda word: words[word[0]], text)):
         try:
@@ -514,7 +515,7 @@ def _read_answer(name: str, path: str, status: int, text: str) -> list[Any]:
     if error is not None:
         if isinstance(error, dict):
             error = f"{error.get('type')}: {error.get('message')}"
-        # JSON may have halves of characters, which no file or terminal takes.
+        # JSON may contain lone surrogates, which no file or terminal accepts.
         reason = str(error).encode("utf-8", "backslashreplace").decode()
         raise RuntimeError(f"{name}: the server answered {reason:.1000}")
     if status != 200 or not isinstance(answer, dict):

@@ -1,7 +1,8 @@
 """Whether the calibrated model holds on data that it has not seen."""
 
-from prbayes.validation.area_test import ValidityTest, u_values
+from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.nulls import ExactModel, JointNull, PosteriorNull
+from prbayes.validation.pit import u_values
 
 __all__ = [
     "ExactModel",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +17,8 @@ from prbayes.model.description import versions
 from prbayes.model.fingerprint import Identity, as_attributes
 from prbayes.model.locking import locked
 from prbayes.results.predict import data_digest
-from prbayes.validation.conditions import DIRECTION, Case, Predicted, read_case
 from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
+from prbayes.validation.pit import DIRECTION, ByCondition, Case, Predicted, read_case
 
 
 @without_constructor
@@ -136,15 +135,12 @@ class ValidityTest(Shown):
 
 @locked
 def area_test(
-    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
-    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
+    observed: ByCondition[ArrayLike],
+    predicted: ByCondition[Predicted],
     *,
     alpha: float = 0.05,
     null: Null | None = None,
-    specimens: ArrayLike
-    | Mapping[str, ArrayLike | None]
-    | Sequence[ArrayLike | None]
-    | None = None,
+    specimens: ByCondition[ArrayLike | None] = None,
     folded: bool = False,
     randomize: bool = False,
     random_seed: Seed = 0,
@@ -260,7 +256,7 @@ def area_test(
 
 
 def _refuse_calibration_specimens(case: Case) -> None:
-    """Raise if the model was calibrated on specimens of the test."""
+    """Raise if specimens of the test were used in the calibration."""
     for condition in case.conditions:
         attributes = condition.attributes
         calibrated = np.atleast_1d(attributes.get("calibration_specimens", [])).tolist()
@@ -280,7 +276,7 @@ def _refuse_calibration_specimens(case: Case) -> None:
 
 
 def _excluded_failures(case: Case) -> list[Finding]:
-    """Report measured failures under conditions in which no predicted specimen fails."""
+    """Return findings of conditions with measured failures but no predicted ones."""
     findings = []
     for condition in case.conditions:
         n_failed = int(np.isposinf(condition.observed).sum())
@@ -295,7 +291,7 @@ def _excluded_failures(case: Case) -> list[Finding]:
 
 
 def _require_same_samples(case: Case) -> None:
-    """Raise if conditions share specimens, but their predictions do not."""
+    """Raise unless sample i of a draw is the same specimen in all predictions."""
     shapes = [c.predicted.shape for c in case.conditions]
     attributes = [c.attributes for c in case.conditions]
     ids = {attrs["specimens_id"] for attrs in attributes if "specimens_id" in attrs}
@@ -307,57 +303,3 @@ def _require_same_samples(case: Case) -> None:
         "same specimens in all; pass the same inputs, n_samples, n_draws and random_seed to "
         "prb.predict, and stored=False if designs differ"
     )
-
-
-def u_values(
-    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
-    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
-    *,
-    randomize: bool = False,
-    random_seed: Seed = 0,
-) -> Floats:
-    r"""Return the probability integral transform of measured responses.
-
-    .. math:: u_i = \tfrac{1}{2} \{ P(Y < y_i) + P(Y \le y_i) \}
-
-    The predictive distribution pools all draws and samples. Several conditions pool their u-values.
-
-    Parameters
-    ----------
-    observed : array_like, shape (n,); or a mapping or list of such, by condition
-        +inf is a specimen that had failed.
-    predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
-        +inf is larger than every number; NaN are left out.
-    randomize : bool
-        Whether u is uniform between P(Y < y) and P(Y <= y) instead of the middle: then u-values of
-        ties, such as failed specimens or discrete responses, are uniform too if the model is right.
-    random_seed : int, sequence of int, numpy.random.Generator or None
-        Of that choice.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In the order of ``observed``, one condition after the other.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not as described.
-
-    Notes
-    -----
-    Rounded measured values have ties, unlike predicted ones: round the predicted ones alike, as in
-    ``u_values(observed, predicted.round(2))``.
-
-    References
-    ----------
-    .. [1] Czado, C., T. Gneiting and L. Held (2009), Predictive model assessment for count data,
-       Biometrics 65, 1254-1261, doi:10.1111/j.1541-0420.2009.01191.x.
-
-    Examples
-    --------
-    >>> import numpy as np, prbayes as prb
-    >>> prb.validation.u_values([0.3, 1.5, 9.0], np.array([0.0, 1.0, 2.0, 3.0]))
-    array([0.25, 0.5 , 1.  ])
-    """
-    return read_case(observed, predicted, randomize=randomize, random_seed=random_seed).u_values()

@@ -7,14 +7,22 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from prbayes._display import Table, View
 from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed_number
+from prbayes._validate import (
+    Bools,
+    Floats,
+    Indices,
+    Seed,
+    called,
+    flag,
+    positive_integer,
+    seed_number,
+)
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets
 from prbayes.metrics.base import Discrepancy, Metric, Part
@@ -128,7 +136,7 @@ def cross_validate(
 
 # Estimates of weighted data sets, weights (S, n_k) -> (S, d), with which of them converged; and
 # losses of estimates, (S, simulators).
-type _Refit = Callable[[list[Floats]], tuple[Floats, NDArray[np.bool_]]]
+type _Refit = Callable[[list[Floats]], tuple[Floats, Bools]]
 type _Loss = Callable[[Evaluator, Floats, list[Floats]], Floats]
 
 
@@ -143,7 +151,7 @@ def _metric_engine(optimum: Optimum) -> tuple[_Refit, _Loss]:
     """Return how metrics of distributions are refitted and judged, or raise if they cannot."""
     require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
 
-    def refitted(weights: list[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+    def refitted(weights: list[Floats]) -> tuple[Floats, Bools]:
         observed = [node.target.observed for node in optimum.evaluator.nodes]
         sampling = optimum.sampling()
         x, converged = refit(sampling, DataSets(observed, weights))
@@ -177,7 +185,8 @@ class CrossValidationTable(Table):
         n_failed = int((~self["converged"]).sum())
         if n_failed:
             sentences.append(f"The minimisations of {n_failed} folds did not converge.")
-        n_folds, n = self.sizes["fold"], self.sizes["specimen"]
+        n_folds = self.sizes["fold"]
+        n = self.sizes["specimen"]
         heading = f"Cross-validation of {n} specimens in {n_folds} folds, mean discrepancies"
         return View(heading, ["", "held out", "calibrated"], rows, sentences)
 
@@ -196,30 +205,32 @@ class Ranking(Table):
             [str(label), *(f"{x:.4g}" for x in numbers[:3]), "yes" if numbers[3] else "no"]
             for label, *numbers in table.itertuples(name=None)
         ]
-        n, folds = self.attrs["n_specimens"], self.attrs["folds"]
+        n = self.attrs["n_specimens"]
+        folds = self.attrs["folds"]
         heading = f"Models by the log score of {n} specimens, {folds} folds"
         header = ["", "score of a specimen", "behind by", "standard error", "beyond chance"]
         return View(heading, header, rows, [f"{v}." for v in self["verdict"].values[1:]])
 
 
 def most_folds(optimum: Optimum, limit: int) -> int:
-    """Return the largest number of folds of two specimens or more, at most a limit."""
+    """Return the largest number of folds with two specimens or more, but at most a limit."""
     _, total = number_specimens(optimum.evaluator.simulators)
     return max(2, min(limit, total // 2))
 
 
 def _folds(
     simulators: Sequence[PopulationSimulator], folds: int, random_seed: int
-) -> tuple[list[Floats], list[Floats], NDArray[np.intp]]:
+) -> tuple[list[Floats], list[Floats], Indices]:
     """Assign specimens to folds at random.
 
-    Return weights of held-out observations and of the other ones, which sum to one, (folds, n_k) by
-    simulator; and numbers of held-out observations, (folds, simulators).
+    Return by simulator the weights of held-out observations, (folds, n_k), and those of the other
+    observations, which sum to one. The last item is the number of held-out observations, (folds,
+    simulators).
     """
     numbers, total = number_specimens(simulators)
     if total < 2 * folds:
         raise ValueError(f"folds: got {folds} for {total} specimens, expected at most {total // 2}")
-    # The 3 makes random numbers differ from others with the same seed.
+    # The number 3 makes this stream of random numbers differ from others with the same seed.
     rng = np.random.default_rng([random_seed, 3])
     fold_of = rng.permutation(np.arange(total) % folds)
     held_out, training, sizes, too_few = [], [], [], []
@@ -240,7 +251,7 @@ def _folds(
 
 
 def _mean_discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
-    """Return discrepancies (folds, simulators) for weights of the data; NaN without any weight."""
+    """Return discrepancies (folds, simulators) for weights of the data; NaN if all are zero."""
     columns = []
     for k, (node, by_fold) in enumerate(zip(evaluator.nodes, data, strict=True)):
         values, weights = evaluator.populations(thetas, k)
@@ -261,10 +272,11 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     by_name = specimen_log_likelihoods(evaluator, thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
-        likelihood, measurement = simulator.likelihood, simulator.measurement
+        likelihood = simulator.likelihood
+        measurement = simulator.measurement
         numbers = specimen_numbers(likelihood, measurement)
         rows = numbers[simulator.rows]
-        weights = weights / np.bincount(numbers)[rows]  # a specimen counts once
+        weights = weights / np.bincount(numbers)[rows]  # so that a specimen counts once
         logs = by_name[likelihood.measurements[-1].name][:, rows]
         if measurement.weights is not None:
             factors = np.where(measurement.weights > 0, measurement.weights, 1.0)
@@ -280,11 +292,12 @@ def _specimen_scores(
 ) -> tuple[Floats, Floats]:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = number_specimens(evaluator.simulators)
-    scores, counts = np.zeros(total), np.zeros(total)
+    scores = np.zeros(total)
+    counts = np.zeros(total)
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
         counts += np.bincount(numbers[k], weights * weights.size, total)
-        # With a condition each specimen has a population of responses of its own.
+        # With a condition each specimen has another population of responses, and no common density.
         inputs = simulator.inputs
         has_conditions = any(map(is_condition, inputs.aleatory))
         if inputs.covariates or has_conditions:
@@ -292,7 +305,7 @@ def _specimen_scores(
             continue
         try:
             target = scoring_target(simulator.observed, weights)
-        except ValueError:  # no density, for example because all observations are equal
+        except ValueError:  # there is no density, for example if all observations are equal
             observation_scores = np.full(len(simulator.observed), np.nan)
         else:
             observation_scores = np.zeros(len(simulator.observed))
@@ -305,7 +318,7 @@ def _specimen_scores(
 
 
 def _data_digest(simulator: PopulationSimulator) -> str:
-    """Return a digest of observed values, weights and labels, in order."""
+    """Return a digest of observed values, weights and labels, in their order."""
     labels = [] if simulator.specimens is None else simulator.specimens.tolist()
     content = simulator.observed.tobytes() + simulator.weights.tobytes() + repr(labels).encode()
     return hashlib.sha256(content).hexdigest()[:16]
@@ -421,7 +434,7 @@ def rank(
 
 
 def _require_candidates(candidates: object) -> None:
-    """Raise unless these are two optima or cross-validations or more, by label."""
+    """Raise unless this is a mapping with two or more optima or cross-validations."""
     if not isinstance(candidates, Mapping):
         raise TypeError(
             f"rank: candidates: got {called(candidates)}, expected a mapping such as "
@@ -472,7 +485,7 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> Ranking:
     n = weights.size
     gaps = scores[0] - scores
     differences = gaps.sum(axis=-1)
-    # Standard errors of sums of differences of weighted specimens.
+    # Standard errors of the sums over specimens of weighted differences.
     means = differences / weights.sum()
     variances = ((gaps - weights * means[:, None]) ** 2).sum(axis=-1) * n / (n - 1)
     errors = np.sqrt(variances)
@@ -529,17 +542,17 @@ def log_scores(
     target: Discrepancy,
     values: Floats,
     weights: Floats,
-    rows: NDArray[np.intp],
+    rows: Indices,
     gross: float = 0.1,
 ) -> Floats:
     """Return scores of observations, (r,), under a population of values (n,) or (n, m).
 
-    A score is the log density, times the observation's weight and the number of observations. Of
-    the population, +inf is a failed specimen, and NaN is left out.
+    A score is the log density times the weight of the observation and the number of observations.
+    In the population +inf is a failed specimen, and NaN is left out.
 
-    The share ``gross`` of the population is spread widely over the data; otherwise a single value
-    in the light tail of a wrong family decides alone. With a hundredth, error bars were too short
-    by half on 30 normal data against a gamma, with a tenth by a third.
+    The share ``gross`` of the population is spread widely over the data. Otherwise a single value
+    in the light tail of a wrong family would decide alone. On 30 normal data against a gamma
+    family, error bars were too short by half with a share of .01, and by a third with .1.
     """
     observed = target.observed
     scores = np.zeros(len(observed))
@@ -557,14 +570,15 @@ def _density(
 ) -> Floats:
     """Return the density of a population at points, (n',)."""
     target = part.target
-    assert isinstance(target, DensityDiscrepancy)  # as a log-likelihood is
+    assert isinstance(target, DensityDiscrepancy)  # scores are those of a log-likelihood
     cells = target.cells
     with_response = np.where(np.isnan(simulated), 0.0, weights)
     density = cells.density(simulated, with_response) / with_response.sum()
     at_points = cells.reading(points, np.eye(points.size)) @ density
-    # Between nodes of the grid rounding may make a density negative.
+    # Interpolation between nodes of the grid may make a density slightly negative.
     at_points = np.where(np.isnan(at_points), np.nan, np.maximum(at_points, 0.0))
-    # Student's t (3) has heavier tails than all common families, but a variance.
+    # Student's t with 3 degrees of freedom has heavier tails than all common families, and a
+    # variance.
     observed, observed_weights = finite_sample(target.observed, target.weights)
     middle = quantile(observed, observed_weights, 0.5)
     wide = student.pdf(points, 3, middle, spread(observed, observed_weights))

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from prbayes._display import Tree, View
 from prbayes._finding import Finding, counted, report
@@ -18,7 +18,9 @@ from prbayes._progress import progress, shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
+    Indices,
     Seed,
+    Shape,
     called,
     executes,
     flag,
@@ -176,7 +178,7 @@ def calibrate_each(
 
 
 def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
-    """Raise if a simulator has numbers of its own observed specimens, or a data sheet."""
+    """Raise if a simulator has weights, labels, groups or conditions, or a data sheet."""
     weights = simulator.weights
     numbers = {
         "weights=": weights is not None and np.ptp(weights) > 0,
@@ -195,7 +197,7 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         )
 
 
-def _read_data(data: object, name: str, minimum: int, event: tuple[int, ...]) -> dict[str, Floats]:
+def _read_data(data: object, name: str, minimum: int, event: Shape) -> dict[str, Floats]:
     """Return the measured responses of each product, or raise."""
     if not isinstance(data, Mapping) or not data:
         raise TypeError(
@@ -223,7 +225,7 @@ class Calibration:
     pareto_k: float = np.nan
     # Statistic, critical value and p-value of the validity test.
     test: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    finding: str = ""  # why it failed, or what a reader should know
+    finding: str = ""  # reason of a failure, or a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +234,7 @@ class Fleet:
 
     evaluator: Evaluator
     observed: Mapping[str, Floats]
-    further: Mapping[str, Floats]  # measured responses for a validity test
+    further: Mapping[str, Floats]  # measured responses for validity tests, by product
     settings: SamplingSettings
     alpha: float
 
@@ -316,7 +318,7 @@ class SpecimenFleet(Fleet):
         rows = np.concatenate([self._rows(name) for name in names])
         return replace(super().part(names), likelihood=_of_rows(self.likelihood, rows))
 
-    def _rows(self, name: str) -> NDArray[np.intp]:
+    def _rows(self, name: str) -> Indices:
         """Return the rows of a product among the specimens of all."""
         names = list(self.observed)
         sizes = [len(values) for values in self.observed.values()]
@@ -362,8 +364,9 @@ def _common_likelihood(
 ) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    The emulator is that of so many evenly spaced specimens. Limits of the errors of the emulator
-    and the points are those of a product: fewer specimens, in a narrower population.
+    The emulator is fitted for ``emulated`` evenly spaced specimens. The limits of the errors of
+    emulator and points are those for one product, which has fewer specimens and a narrower
+    population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
@@ -371,7 +374,8 @@ def _common_likelihood(
     sizes = [len(values) for values in observed.values()]
     within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
     narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
-    inputs, sampler = likelihood.inputs, likelihood.density.sampler
+    inputs = likelihood.inputs
+    sampler = likelihood.density.sampler
     coordinates = Coordinates.of_prior(inputs, max(sizes), sampler=sampler)
 
     def prepared_of(values: Floats, emulation: Emulation | None) -> SpecimenLikelihood:
@@ -394,21 +398,22 @@ def _common_likelihood(
     return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
-def _of_rows(likelihood: SpecimenLikelihood, rows: NDArray[np.intp]) -> SpecimenLikelihood:
-    """Return the likelihood of some specimens, with their points."""
+def _of_rows(likelihood: SpecimenLikelihood, rows: Indices) -> SpecimenLikelihood:
+    """Return the likelihood of some of the specimens, with their points of quadrature."""
     (measurement,) = likelihood.measurements
     part = replace(measurement, observed=measurement.observed[rows])
     result = replace(likelihood, measurements=(part,))
     preparation = prepared(likelihood)
     result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
-    # Compiled functions and coordinates are those of the populations, not of the specimens.
+    # Compiled functions and coordinates depend on the populations only, and are reused.
     vars(result).update(density=likelihood.density, coordinates=likelihood.coordinates)
     return result
 
 
 def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
-    """Return a report of specimens whose readings no point reproduces to so many nats."""
-    preparation, readings = prepared(likelihood), likelihood.readings
+    """Return a sentence about specimens whose readings no point reproduces to so many nats."""
+    preparation = prepared(likelihood)
+    readings = likelihood.readings
     sd = readings.comparison_sd(preparation.emulation.error)[:, None]
     residual = (preparation.points.outputs - readings.values[:, None]) / sd
     misfit = np.where(np.isnan(residual), 0.0, residual**2).sum(axis=-1) / 2

@@ -16,11 +16,18 @@ from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
-from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
+from prbayes._validate import (
+    AT_ONCE,
+    Floats,
+    Indices,
+    called,
+    positive_integer,
+    positive_number,
+    share,
+)
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points
 from prbayes.model.evaluator import read_inputs_of_copy, shortcomings
@@ -32,7 +39,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings, data_digest, in_order, serving, specimen_names
-from prbayes.validation.conditions import Case, Condition, Predictive, between
+from prbayes.validation.pit import Case, Predictive, TestedCondition, between
 
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.
 LEAST_REPLICATES = 19
@@ -40,7 +47,7 @@ LEAST_REPLICATES = 19
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """p-value, critical value and envelope: bounds of the sorted values that are tested, (n,)."""
+    """p-value and critical value, and bounds of the sorted values that are tested, (n,)."""
 
     p_value: float
     critical_value: float
@@ -66,7 +73,7 @@ class Null(ABC):
 def judge_by_replicates(
     replicates: Iterable[Floats], case: Case, statistic: float, alpha: float
 ) -> Judgement:
-    r"""Count the observed data among replicates, blocks of u-values of shapes (r, n).
+    r"""Compare the observed statistic with those of replicates, blocks of u-values (r, n).
 
     .. math:: p = (1 + \#\{A_r \ge A\}) / (1 + r)
     """
@@ -82,14 +89,15 @@ def judge_by_replicates(
     assert enveloped is not None
     areas = np.sort(np.concatenate(blocks))
     total = areas.size + 1
-    # Replicates that may be as large in a rejection; rounding must not make .05 * 20 less than one.
+    # Number of replicates that may be as large in a rejection. The small number is there because
+    # .05 * 20 may be rounded to less than one.
     allowed = int(np.floor(alpha * total + 1e-9)) - 1
     if allowed < 0:
         raise ValueError(
             f"alpha: got {alpha} with {areas.size} replicates, expected at least "
             f"1 / ({areas.size} + 1); pass a null with more replicates"
         )
-    # Rounding must not make a tie a difference.
+    # The factor counts ties that differ by rounding.
     n_as_large = np.sum(areas >= statistic * (1 - 1e-12))
     lower, upper = envelope(enveloped, alpha)
     return Judgement(
@@ -143,14 +151,14 @@ class PosteriorNull(Null):
         """Draw u-values of replicates, in blocks of shapes (r, n)."""
         rng = np.random.default_rng(self.random_seed)
         rng_of_ties = case.rng(1)
-        # By condition, arrays (D, S): whether samples have a response, and P(Y < y) and
-        # P(Y <= y) of each in the pool of all draws.
+        # For each condition arrays (D, S): whether a sample has a response, and its P(Y < y) and
+        # P(Y <= y) in the pool of all draws.
         usable = [~np.isnan(c.predicted) for c in case.conditions]
         if case.shares_specimens:
-            # A specimen has a response under all conditions.
+            # A shared specimen needs a response under all conditions.
             usable = [np.logical_and.reduce(usable)] * len(usable)
         steps = [Predictive(c.predicted).steps(c.predicted) for c in case.conditions]
-        # Samples of each draw, those with a response first, and their number.
+        # Order of the samples of each draw, those with a response first, and the number of these.
         orders = [np.argsort(~is_usable, axis=1, kind="stable") for is_usable in usable]
         counts = [np.count_nonzero(is_usable, axis=1) for is_usable in usable]
         draws = np.flatnonzero(np.min(counts, axis=0) > 0)
@@ -158,14 +166,14 @@ class PosteriorNull(Null):
             raise ValueError(
                 "predicted: got NaN in every draw, expected specimens whose responses are numbers"
             )
-        # Every draw of the posterior equally often, in random order.
+        # Use every draw of the posterior equally often, in random order.
         draw_of = rng.permutation(draws[np.arange(self.replicates) % draws.size])
-        # Results depend on the size of blocks, which come one after another from one generator.
+        # All blocks use one generator, so that results depend on the size of the blocks.
         step = max(1, AT_ONCE // case.size)
         for start in range(0, self.replicates, step):
             draw = draw_of[start : start + step, None]
-            # The place of a specimen in its population, from 0 to 1. The same place in every
-            # condition is the same sample, hence the same specimen.
+            # Place of a specimen in its population, from 0 to 1. It is the same under all
+            # conditions, and selects the same sample, hence the same specimen.
             place = rng.random((draw.size, case.n_specimens))
             u = []
             by_condition = zip(case.conditions, steps, orders, counts, strict=True)
@@ -209,10 +217,10 @@ def _area_quantiles(n: int) -> tuple[Floats, Floats]:
 
 
 def _slope(logs: Floats, quantiles: Floats) -> float:
-    """Return how minus the log of a tail probability grows with the square of a far quantile.
+    """Return the slope of minus the log tail probability in the square of a far quantile.
 
-    It is linear in the square (Brownian bridge: exp(-6 x^2)). From n = 20 on, any of the last
-    twelve quantiles gives a slope within 5%.
+    Far out the relation is linear (Brownian bridge: exp(-6 x^2)). From n = 20 on, slopes by any of
+    the last twelve quantiles agree within 5%.
     """
     return float((logs[-1] - logs[-8]) / (quantiles[-1] ** 2 - quantiles[-8] ** 2))
 
@@ -220,8 +228,8 @@ def _slope(logs: Floats, quantiles: Floats) -> float:
 def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
     """Return the envelope of n sorted uniform numbers, (n,) each.
 
-    For many numbers it is simulated at 2000 ranks, closer together near the ends, and linear
-    between them. Gaps between uniform order statistics are Gamma variables over their sum.
+    For many numbers it is simulated at 2000 ranks, which are closer together near the ends, and
+    interpolated. Gaps between uniform order statistics are Gamma variables over their sum.
     """
     rng = np.random.default_rng(0)
     places = np.sin(np.linspace(0, np.pi / 2, 2000)) ** 2
@@ -282,7 +290,7 @@ class ExactModel(Null):
         return float(np.exp(-(logs[-1] + _slope(logs, quantiles) * farther)))
 
     def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
-        """Look up p-value and critical value, and simulate the envelope; simulate all with ties."""
+        """Look up p-value and critical value, simulate the envelope; with ties simulate all."""
         if case.is_dependent:
             raise ValueError(
                 f"null: got ExactModel() for {case.size} values of {case.n_specimens} specimens, "
@@ -290,9 +298,10 @@ class ExactModel(Null):
                 "each specimen through all conditions"
             )
         for condition in case.conditions:
-            n_predicted, n_observed = condition.predicted.size, condition.observed.size
-            # With m times as many the pool itself adds 1 / m to the variance of an ECDF: a tenth
-            # makes a test at 5% reject in some 6% of cases.
+            n_predicted = condition.predicted.size
+            n_observed = condition.observed.size
+            # A pool of m times as many values adds 1 / m to the variance of an ECDF. With a tenth,
+            # a test at 5% rejects in some 6% of cases.
             if n_predicted < 10 * n_observed:
                 raise ValueError(
                     f"{condition.name}: predicted: got {n_predicted} values for {n_observed} "
@@ -419,7 +428,7 @@ class JointNull(Null):
             try:
                 tested = [self._tested(case, condition) for condition in case.conditions]
             except PoorEmulatorError as error:
-                # All responses at the same points: those of the runs.
+                # Take all responses at the same points, those of the runs.
                 for bound in bounds:
                     bound.design = bound.design.runs_alone()
                 short = shortcomings(evaluator, self.optimum.theta[None])
@@ -436,7 +445,8 @@ class JointNull(Null):
         self, case: Case, sampling: SamplingDistribution, tested: list[_Tested]
     ) -> Floats:
         """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
-        evaluator, theta = self.optimum.evaluator, self.optimum.theta
+        evaluator = self.optimum.evaluator
+        theta = self.optimum.theta
         rng_of_ties = case.rng(1)
         numbers, n_new = _numbers_in_calibration(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
@@ -448,7 +458,7 @@ class JointNull(Null):
         )
         data = sets_at(evaluator, [values[0] for values, _ in populations], points)
         x, converged = refit(sampling, data)
-        # With fewer the replicates would be those of unusual data sets.
+        # If few minimisations converge, the remaining replicates are unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(
                 f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected "
@@ -470,7 +480,7 @@ class JointNull(Null):
         joined = np.concatenate(u, axis=1)
         return np.asarray(joined[~np.isnan(joined).any(axis=1)])
 
-    def _tested(self, case: Case, condition: Condition) -> _Tested:
+    def _tested(self, case: Case, condition: TestedCondition) -> _Tested:
         """Return a condition with the simulator whose points are its specimens."""
         if condition.predicted.shape[0] > 1:
             raise ValueError(
@@ -505,7 +515,7 @@ class JointNull(Null):
             caller="prb.validation.JointNull",
         )
         labels = set(condition.labels or ())
-        # Simulators that measured these specimens come first.
+        # Prefer simulators that measured these specimens.
         shared = [
             node.specimens is not None and bool(labels & set(specimen_names(node.specimens)))
             for node in nodes
@@ -526,9 +536,9 @@ class JointNull(Null):
 class _Tested:
     """A condition, and the simulator whose points are its specimens."""
 
-    condition: Condition
-    simulator: int
-    values: Floats | None  # (points,): responses at the simulator's points; None: the simulator's
+    condition: TestedCondition
+    simulator: int  # number of the simulator
+    values: Floats | None  # responses at its points, (points,); None: those of the simulator
 
     def projected(self, responses: Floats) -> Floats:
         """Return the tested numbers at points where the simulator has these responses."""
@@ -536,16 +546,18 @@ class _Tested:
         return np.asarray(self.condition.projected(values))
 
 
-def _require_population(condition: Condition, values: Floats, weights: Floats) -> None:
+def _require_population(condition: TestedCondition, values: Floats, weights: Floats) -> None:
     """Raise if the predicted population is not that at the optimum."""
     predicted = condition.predicted[~np.isnan(condition.predicted)]
-    # Between these a distribution function moves by .05, half of the smallest difference.
+    # Between two of these quantiles the distribution function grows by .05, half of the difference
+    # that is refused.
     at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
     expected = Predictive(values, weights).transform(at, None)
     got = Predictive(condition.predicted).transform(at, None)
     largest = np.abs(expected - got).max()
-    # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by
-    # far less; a normal population a quarter of a standard deviation away differs by .1.
+    # With probability 5%, 500 random samples differ from their population by .06 or more, and
+    # samples of `predict` by far less. A normal population that is shifted by a quarter of a
+    # standard deviation differs by .1.
     if largest > 0.1:
         raise ValueError(
             f"{condition.name}: predicted: got values whose distribution function differs by "
@@ -557,10 +569,10 @@ def _require_population(condition: Condition, values: Floats, weights: Floats) -
 
 def _numbers_in_calibration(
     nodes: Sequence[Node], tested: list[_Tested]
-) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the numbers of each condition's specimens in the calibration, and how many are new."""
+) -> tuple[list[Indices], int]:
+    """Return the specimens' numbers in the calibration, by condition, and how many are new."""
     node_numbers, total = number_specimens(nodes)
-    # The points of a group of simulators are drawn together.
+    # Points of simulators that share specimens are drawn together, as a group.
     group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}
     number_and_group: dict[str, tuple[int, int]] = {}
     for k, node in enumerate(nodes):
@@ -570,16 +582,17 @@ def _numbers_in_calibration(
     n_new = 0
     numbers = []
     for j, t in enumerate(tested):
-        condition, node = t.condition, nodes[t.simulator]
+        condition = t.condition
+        node = nodes[t.simulator]
         calibrated = node.target.observed
         if data_digest(condition.measured) == data_digest(calibrated):
-            # The same values, perhaps in another order.
+            # The data are those of the calibration, perhaps in another order.
             matched = np.empty(len(calibrated), dtype=np.intp)
             matched[in_order(condition.measured)] = node_numbers[t.simulator][in_order(calibrated)]
             numbers.append(matched)
             continue
         group = group_of[t.simulator]
-        # Without labels every value is of a new specimen.
+        # Without labels every value belongs to a new specimen.
         labels = condition.labels or tuple(f"{j}, {i}" for i in range(condition.observed.size))
         for label in labels:
             if label not in number_and_group:

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.validation.conditions import area
+from prbayes.validation.pit import area
 
 
 @cache

@@ -15,7 +15,7 @@ from prbayes.reports.assessment import agreement, answer, next_steps
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import comparison
-from prbayes.validation.conditions import DIRECTION
+from prbayes.validation.pit import DIRECTION
 
 
 def test_comparison(calibrated: Any, page: Any) -> None:

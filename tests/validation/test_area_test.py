@@ -13,8 +13,8 @@ from scipy.special import ndtr, ndtri
 import prbayes as prb
 from benchmarks import power, validity
 from prbayes._stats import envelope
-from prbayes.validation.conditions import area
 from prbayes.validation.nulls import uniform_envelope
+from prbayes.validation.pit import area
 
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()

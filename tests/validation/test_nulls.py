@@ -14,8 +14,8 @@ from scipy.special import ndtr, ndtri
 import prbayes as prb
 from benchmarks import area_null
 from prbayes._validate import Floats
-from prbayes.validation.conditions import Case, area, read_case
 from prbayes.validation.nulls import judge_by_replicates, table
+from prbayes.validation.pit import Case, area, read_case
 
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()

@@ -1,22 +1,32 @@
-"""Measured and predicted responses of a validation, by condition and output, and their u-values.
+"""u-values of measured responses under predictions: the probability integral transform.
 
-The probability integral transform, and the area between the ECDF of u-values and the identity:
-Czado, Gneiting and Held (2009), doi:10.1111/j.1541-0420.2009.01191.x; Ferson, Oberkampf and
-Ginzburg (2008), doi:10.1016/j.cma.2007.07.030.
+References: Czado, Gneiting and Held (2009), doi:10.1111/j.1541-0420.2009.01191.x, for u-values of
+ties; Ferson, Oberkampf and Ginzburg (2008), doi:10.1016/j.cma.2007.07.030, for the area between the
+ECDF of u-values and the identity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from prbayes._stats import cumulated
-from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
+from prbayes._validate import (
+    Floats,
+    Indices,
+    Seed,
+    Shape,
+    called,
+    flag,
+    real_array,
+    sample_labels,
+    seed_number,
+)
 from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
@@ -26,26 +36,29 @@ from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
 
 Predicted = xr.DataArray | NDArray[Any]
+# An argument of one condition, or of several conditions by name or in their order.
+type ByCondition[T] = T | Mapping[str, T] | Sequence[T]
 
-# Separates the name of a condition from the number of a projection of its outputs.
+# Text between the name of a condition and the number of a projection of its outputs.
 DIRECTION = ", direction "
 _SAMPLE_DIMS = ("chain", "draw", "sample")
-_SPECIMEN = "specimen"  # in place of samples: specimens under conditions of their own
+# Dimension that predictions have in place of samples if each specimen has a condition of its own.
+_SPECIMEN = "specimen"
 
 
 @dataclass(frozen=True, eq=False)
-class Condition:
+class TestedCondition:
     """Measured and predicted values of one condition, or of one projection of its outputs."""
 
     name: str
-    observed: Floats  # (n,)
-    predicted: Floats  # (D, S): a row for each draw
-    measured: Floats  # (n,) or (n, m): before the projection
-    labels: tuple[str, ...] | None  # of the specimens
-    numbers: NDArray[np.intp]  # (n,): the specimens, counted over all conditions
-    attributes: Mapping[Any, Any] = field(default_factory=dict)  # of the prediction
-    projection: Projection | None = None
-    group: int = 0  # values of a group have one ECDF; the number of a projection, else 0
+    observed: Floats  # measured values, projected, (n,)
+    predicted: Floats  # predicted values, projected, (D, S); a row for each draw
+    measured: Floats  # measured values before the projection, (n,) or (n, m)
+    labels: tuple[str, ...] | None  # labels of the specimens
+    numbers: Indices  # numbers of the specimens, counted over all conditions, (n,)
+    attributes: Mapping[Any, Any] = field(default_factory=dict)  # attributes of the prediction
+    projection: Projection | None = None  # projection of several outputs
+    group: int = 0  # number of the projection, else 0; the values of a group have one ECDF
 
     def projected(self, responses: Any) -> Any:
         """Return the projection of responses, (..., n) or (..., n, m) -> (..., n)."""
@@ -58,7 +71,7 @@ class Condition:
 
     @property
     def specimens(self) -> tuple[str, ...]:
-        """Names of the specimens: labels, or else the condition and a number."""
+        """Names of the specimens: their labels, or else the condition with a number."""
         if self.labels is not None:
             return self.labels
         return tuple(f"{self.base_name}, {i}" for i in range(self.observed.size))
@@ -68,13 +81,13 @@ class Condition:
 class Case:
     """All conditions of one test."""
 
-    conditions: tuple[Condition, ...]
+    conditions: tuple[TestedCondition, ...]
     n_specimens: int
-    shares_specimens: bool  # between conditions
+    shares_specimens: bool  # whether a specimen was measured under several conditions
     randomize: bool = False  # whether u-values of ties are random within their step
     random_seed: int | None = 0
     folded: bool = False  # whether the statistic is the area of abs(2u - 1)
-    identity: Identity | None = None  # of the calibrated problem, if predictions have it
+    identity: Identity | None = None  # fingerprint of the calibrated problem, if it is known
 
     @property
     def size(self) -> int:
@@ -96,7 +109,8 @@ class Case:
         """Whether u-values are middles of steps: measured values equal several predicted ones."""
         for condition in self.conditions:
             lower, upper = Predictive(condition.predicted).steps(condition.observed)
-            # The step of a single predicted value is one over their number.
+            # Without ties a measured value equals at most one predicted value, whose step is one
+            # over their number.
             if not self.randomize and ((upper - lower) * condition.predicted.size > 1.5).any():
                 return True
         return False
@@ -104,9 +118,9 @@ class Case:
     def statistic(self, u: Floats) -> Floats:
         """Return the statistic of u-values, (..., n) -> (...).
 
-        It is the area of all values together. For several outputs it is the mean over projections
-        of the areas of u and abs(2u - 1): a wrong correlation is a wrong spread in some of them.
-        Conditions of one output count by their number of values.
+        For one output it is the area of all values together. For several outputs it is the mean
+        over projections of the areas of u and abs(2u - 1), because a wrong correlation is a wrong
+        spread in some projections. Groups of values are weighted by their number of values.
         """
         tested = self.tested(u)
         sizes = [c.observed.size for c in self.conditions]
@@ -155,7 +169,7 @@ def read_case(
     flag(folded, "folded")
     flag(randomize, "randomize")
     numbers: dict[object, int] = {}
-    conditions: list[Condition] = []
+    conditions: list[TestedCondition] = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
         has_own_conditions = _SPECIMEN in getattr(simulated, "dims", ())
         if has_own_conditions:
@@ -165,9 +179,9 @@ def read_case(
         if labels is not None:
             labels = in_order_of(labels, measured, f"{name}: specimens")
             names = tuple(specimen_names(sample_labels(labels, len(y), f"{name}: specimens")))
-        # Without labels every value is of another specimen.
+        # Without labels every value belongs to a different specimen.
         keys = [(name, i) for i in range(len(y))] if names is None else names
-        condition = Condition(
+        condition = TestedCondition(
             name=name,
             observed=y,
             predicted=_simulated(name, simulated, y.shape[1:]),
@@ -200,7 +214,7 @@ def read_case(
     identities = {
         f"{c.name}: predicted": identity_from_attributes(c.attributes) for c in conditions
     }
-    # Projections of one condition have the same specimens.
+    # Count specimens once for all projections of a condition.
     n_by_condition = {c.base_name: np.unique(c.numbers).size for c in conditions}
     return Case(
         conditions=tuple(conditions),
@@ -213,9 +227,64 @@ def read_case(
     )
 
 
-def _by_specimen(condition: Condition) -> list[Condition]:
-    """Return a condition for each specimen, whose predicted values are those of a column."""
-    n, predicted = len(condition.observed), condition.predicted
+def u_values(
+    observed: ByCondition[ArrayLike],
+    predicted: ByCondition[Predicted],
+    *,
+    randomize: bool = False,
+    random_seed: Seed = 0,
+) -> Floats:
+    r"""Return the probability integral transform of measured responses.
+
+    .. math:: u_i = \tfrac{1}{2} \{ P(Y < y_i) + P(Y \le y_i) \}
+
+    The predictive distribution pools all draws and samples. Several conditions pool their u-values.
+
+    Parameters
+    ----------
+    observed : array_like, shape (n,); or a mapping or list of such, by condition
+        +inf is a specimen that had failed.
+    predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
+        +inf is larger than every number; NaN are left out.
+    randomize : bool
+        Whether u is uniform between P(Y < y) and P(Y <= y) instead of the middle: then u-values of
+        ties, such as failed specimens or discrete responses, are uniform too if the model is right.
+    random_seed : int, sequence of int, numpy.random.Generator or None
+        Of that choice.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the order of ``observed``, one condition after the other.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
+    Notes
+    -----
+    Rounded measured values have ties, unlike predicted ones: round the predicted ones alike, as in
+    ``u_values(observed, predicted.round(2))``.
+
+    References
+    ----------
+    .. [1] Czado, C., T. Gneiting and L. Held (2009), Predictive model assessment for count data,
+       Biometrics 65, 1254-1261, doi:10.1111/j.1541-0420.2009.01191.x.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> prb.validation.u_values([0.3, 1.5, 9.0], np.array([0.0, 1.0, 2.0, 3.0]))
+    array([0.25, 0.5 , 1.  ])
+    """
+    return read_case(observed, predicted, randomize=randomize, random_seed=random_seed).u_values()
+
+
+def _by_specimen(condition: TestedCondition) -> list[TestedCondition]:
+    """Split a condition into one for each specimen, with its column of predicted values."""
+    n = len(condition.observed)
+    predicted = condition.predicted
     if predicted.shape[1] != n:
         raise ValueError(
             f"{condition.name}: observed: got {n} values, expected {predicted.shape[1]}, one for "
@@ -237,15 +306,16 @@ def _by_specimen(condition: Condition) -> list[Condition]:
 def projections(pool: Floats) -> list[Projection]:
     """Return projections of predicted outputs of all draws, shape (D, S, m).
 
-    Their directions are well spread where the predicted outputs are white. Measured values have no
-    influence, so replicates have the same projections. Raises ValueError if predicted outputs
-    depend on each other linearly, as many outputs of few inputs do without a measurement error.
+    Directions are well spread in the white coordinates of the predicted outputs. They do not depend
+    on measured values, so that replicates have the same projections. Raises ValueError if predicted
+    outputs depend on each other linearly, as many outputs of few inputs do without a measurement
+    error.
     """
     m = pool.shape[-1]
     rows = pool.reshape(-1, m)
     rows = rows[~np.isnan(rows).any(axis=1)]
     finite = rows[np.isfinite(rows).all(axis=1)]
-    # 4096 specimens determine correlations to .02; any directions give a test of the right size.
+    # 4096 specimens determine correlations to .02. The test has the right size for any directions.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
     try:
@@ -256,7 +326,8 @@ def projections(pool: Floats) -> list[Projection]:
             f"predicted: {got}. If the readings have an error, add it to the prediction, such as "
             "by prb.predict(posterior, reading, x, pm.Normal.dist(0, sd, shape=m))"
         ) from None
-    caps, number = failure_caps(rows), max(1, sufficient_directions(m))
+    caps = failure_caps(rows)
+    number = max(1, sufficient_directions(m))
     return [Projection(outputs, caps, center, axes @ u) for u in directions(m, number, 0)]
 
 
@@ -279,15 +350,15 @@ def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[s
             )
         name = getattr(predicted, "name", None)
         return [(str(name) if name else "observed", observed, predicted, specimens)]
-    for argument, given in (("observed", observed), ("specimens", specimens)):
-        if given is None and argument == "specimens":
+    for argument, values in (("observed", observed), ("specimens", specimens)):
+        if values is None and argument == "specimens":
             continue
-        names = _names(given) if isinstance(given, Mapping) == is_mapping else None
-        # Some conditions of a mapping may have no labels.
+        names = _names(values) if isinstance(values, Mapping) == is_mapping else None
+        # In a mapping of labels some conditions may be missing.
         is_partial = argument == "specimens" and is_mapping
         keys = set(names or ())
         if not keys or not keys <= set(expected) or (keys != set(expected) and not is_partial):
-            got = type(given).__name__
+            got = type(values).__name__
             if names is not None:
                 got = str(sorted(map(str, names))) if is_mapping else f"{len(names)} conditions"
             kind = "mapping" if is_mapping else "list"
@@ -300,7 +371,7 @@ def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[s
 
 
 def _measured(name: str, values: Any, simulated: Any) -> Floats:
-    """Return measured values, (n,), or (n, m) of several outputs in the order of predicted ones."""
+    """Return measured values, (n,) or (n, m), with outputs in the order of the predicted ones."""
     y, outputs = read_observed(name, values)
     if y.ndim not in (1, 2) or y.size == 0:
         raise ValueError(
@@ -326,7 +397,7 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
     return y if order is None else y[:, order]
 
 
-def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
+def _simulated(name: str, values: Any, event: Shape) -> Floats:
     """Return predicted values, shape (D, S, *event)."""
     if isinstance(values, xr.DataArray):
         if not set(_SAMPLE_DIMS) <= set(values.dims) or len(values.dims) != 3 + len(event):
@@ -355,12 +426,12 @@ def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
 class Comparable:
     """Measured and predicted values of one output under one condition."""
 
-    name: str  # of the condition, with the output's as an index
-    measured: Floats  # (n,): +inf is a specimen that failed
-    predicted: Floats  # (P, S): a row for each population; NaN has no weight
+    name: str  # name of the condition, with the output as an index
+    measured: Floats  # measured values, (n,); +inf is a specimen that failed
+    predicted: Floats  # predicted values, (P, S); a row for each population; NaN has no weight
     unit: str = ""
     condition: str = ""
-    coords: Mapping[str, Any] = field(default_factory=dict)  # the output's label by dimension
+    coords: Mapping[str, Any] = field(default_factory=dict)  # label of the output, by dimension
 
     @property
     def weights(self) -> Floats:
@@ -370,14 +441,15 @@ class Comparable:
 
 
 def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
-    """Return data and predictions of the same conditions as pairs of one output each.
+    """Return pairs of data and predictions, one for each condition and output.
 
-    Of many outputs there are eight, three rows of panels. Raises TypeError or ValueError if
-    conditions or outputs differ.
+    At most eight outputs are returned, since these fill three rows of panels. Raises TypeError or
+    ValueError if conditions or outputs differ.
     """
     if not isinstance(predicted, Mapping):
         name = str(getattr(predicted, "name", None) or "response")
-        observed, predicted = {name: observed}, {name: predicted}
+        observed = {name: observed}
+        predicted = {name: predicted}
     for name, prediction in predicted.items():
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
@@ -427,7 +499,7 @@ class Predictive:
         numbers = values[is_number]
         if weights is None:
             self._values = np.sort(numbers)
-            # An empty pool has probability zero everywhere.
+            # Without any number the probability is zero everywhere.
             self._cumulative = np.arange(numbers.size + 1) / max(1, numbers.size)
             return
         order = np.argsort(numbers)
@@ -436,7 +508,7 @@ class Predictive:
         self._cumulative = cumulative / cumulative[-1]
 
     def steps(self, y: Floats) -> tuple[Floats, Floats]:
-        """Return P(Y < y) and P(Y <= y), of the shape of y; NaN where y is."""
+        """Return P(Y < y) and P(Y <= y), in the shape of y; NaN for a NaN."""
         nan = np.where(np.isnan(y), np.nan, 0.0)
         n_smaller = np.searchsorted(self._values, y, side="left")
         n_not_larger = np.searchsorted(self._values, y, side="right")
@@ -449,7 +521,7 @@ class Predictive:
 
 
 def between(lower: Floats, upper: Floats, rng: np.random.Generator | None) -> Floats:
-    """Return the middle of the two, or with a generator uniform numbers between them."""
+    """Return the middle of both bounds, or with a generator uniform numbers between them."""
     fraction = 0.5 if rng is None else rng.random(lower.shape)
     return np.asarray(lower + fraction * (upper - lower))
 

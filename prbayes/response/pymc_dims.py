@@ -23,15 +23,15 @@ def has_dims(variable: Variable) -> bool:
 
 
 def without_dims(graphs: Any) -> list[Any]:
-    """Return graphs as plain tensors of the same inputs; those without dimensions as they are.
+    """Return graphs as plain tensors of the same inputs; graphs without dimensions unchanged.
 
-    All are lowered at once, so that common parts stay common.
+    All graphs are converted in one call, so that parts that they share stay shared.
     """
     if not any(map(has_dims, ancestors(graphs))):
         return list(graphs)
-    # A rewrite changes a graph in place: that of the model must stay as it is.
+    # A rewrite changes a graph in place, and the graph of the model must stay as it is.
     copies = clone_replace([g.values if has_dims(g) else g for g in graphs])
-    # A `pymc.dims.Deterministic` is a view, which no rewrite lowers.
+    # A `pymc.dims.Deterministic` is a view operation, for which there is no rewrite.
     while views := [v for v in ancestors(copies) if v.owner and isinstance(v.owner.op, ViewOp)]:
         copies = graph_replace(copies, {v: v.owner.inputs[0] for v in views})
     lowered: list[Any] = list(rewrite_graph(copies, include=("lower_xtensor",)))
@@ -51,7 +51,9 @@ def values_of(variable: Any) -> Any:
     if not has_dims(variable):
         return variable
     values = getattr(variable.tag, "tensor", None)
-    if values is None or values.owner.inputs[0] is not variable:  # a clone has the original's
+    if (
+        values is None or values.owner.inputs[0] is not variable
+    ):  # a clone has the tensor of its original
         values = variable.tag.tensor = variable.values
         values.name = variable.name
     return values
@@ -65,8 +67,8 @@ def with_dims(graph: Any, variable: Variable) -> Any:
 def input_without_dims(x: Any, tensors: Mapping[Variable, Variable]) -> Any:
     """Return an input of a response as a plain tensor, the same one at each call.
 
-    ``tensors`` has those of the model's variables, on which the result depends. Random variables
-    that inputs share stay shared.
+    ``tensors`` maps the model's variables to their plain tensors, on which the result depends.
+    Random variables that several inputs share stay shared.
     """
     if x in tensors:
         return tensors[x]
@@ -86,7 +88,7 @@ def input_without_dims(x: Any, tensors: Mapping[Variable, Variable]) -> Any:
 
 
 def is_random(variable: Variable) -> bool:
-    """Return whether a variable of a graph is a random one: drawn, not computed."""
+    """Return whether a variable of a graph is drawn by a distribution, not computed."""
     if variable.owner is None:
         return False
     op = variable.owner.op
@@ -98,10 +100,10 @@ def is_random(variable: Variable) -> bool:
     )
 
 
-def foreign_variable(x: Any, own: set[Variable]) -> Variable | None:
-    """Return a variable with dimensions that an input depends on and another model has, or None."""
-    for v in ancestors([x], blockers=own):
-        is_named = v is not x and v not in own and v.name and has_dims(v)
-        if is_named and any(map(is_random, ancestors([v], blockers=own))):
+def foreign_variable(x: Any, model_variables: set[Variable]) -> Variable | None:
+    """Return a variable of another model, with dimensions, that an input depends on; else None."""
+    for v in ancestors([x], blockers=model_variables):
+        is_named = v is not x and v not in model_variables and v.name and has_dims(v)
+        if is_named and any(map(is_random, ancestors([v], blockers=model_variables))):
             return v
     return None

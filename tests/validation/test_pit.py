@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.validation.conditions import (
+from prbayes.validation.pit import (
     Predictive,
     area,
     between,
