@@ -331,7 +331,8 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
     inputs = _inputs_of_partners(name, arguments.inputs, partners)
     weights = data.weights
     if weights is not None:
-        weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+        weights = sample_weights(weights, len(values), f"{name}: weights")
+        weights /= (weights**2).sum()  # Their sum is the effective number of specimens (Kish).
     conditions = data.known_values([inputs.aleatory[place] for place in inputs.conditions])
     measurement = Measurement(
         name,

@@ -131,10 +131,17 @@ def test_no_run_is_made_when_a_model_is_written_and_few_at_its_first_use() -> No
     assert response.runs == runs
 
 
-def test_weights_are_factors_that_sum_to_the_number_of_specimens() -> None:
+def test_weights_sum_to_the_effective_number_of_specimens() -> None:
     weights = np.arange(1.0, N + 1)
     ours = values(build(weights=weights))
-    assert np.allclose(ours, weights * N / weights.sum() * exact(), atol=0.03)
+    kish = weights.sum() ** 2 / (weights**2).sum()
+    assert np.allclose(ours, weights * kish / weights.sum() * exact(), atol=0.03)
+
+
+def test_weights_of_zero_leave_specimens_out() -> None:
+    half = np.arange(N) < N // 2
+    ours = values(build(weights=half.astype(float)))
+    assert np.allclose(ours, np.where(half, exact(), 0.0), atol=0.03)
 
 
 def test_outside_the_support_of_a_population_gradients_are_finite() -> None:
