@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import xarray as xr
 
 import prbayes as prb
@@ -116,18 +117,21 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 @cache
-def prepared_case(name: str) -> tuple[Evaluator, SpecimenLikelihood, SpecimenPopulations]:
-    """Return an evaluator to be given data, a likelihood with the first runs, and populations."""
-    _base_model, base = likelihood_of(CASES[name])
+def prepared_case(name: str) -> tuple[Evaluator, SpecimenLikelihood, SpecimenPopulations, pm.Model]:
+    """Return an evaluator to be given data, a likelihood with the first runs, and populations.
+
+    The last item is the model of the second one, which has to stay in memory.
+    """
+    base_model, base = likelihood_of(CASES[name])
     model, _ = likelihood_of(CASES[name])
     evaluator = Evaluator.of(model)
     (likelihood,) = evaluator.likelihoods
-    return evaluator, base, SpecimenPopulations(likelihood)
+    return evaluator, base, SpecimenPopulations(likelihood), base_model
 
 
 def row(name: str, number: int) -> dict[str, Any]:
     """Return the findings of a data set; those of draws of the first data sets alone."""
-    evaluator, base, populations = prepared_case(name)
+    evaluator, base, populations, _ = prepared_case(name)
     (likelihood,) = evaluator.likelihoods
     figures = before_the_fit(likelihood, base, readings(CASES[name], number))
     if number < TESTED and "error" not in figures:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from prbayes._validate import Floats, called, number, positive_integer, positive_number
@@ -214,6 +213,8 @@ def _range_of_sd(lower: Floats, upper: Floats, mean: float | None) -> tuple[floa
         centers = np.linspace(ends.min(), ends.max(), 201)
         smallest = min(sd(np.clip(center, lower, upper)) for center in centers)
     else:
+        from scipy.optimize import brentq
+
         mean = float(np.clip(mean, lower.mean(), upper.mean()))
         # The mean of clipped values increases with the center.
         width = n * (np.ptp(np.append(ends, mean)) + 1e-12)

@@ -240,6 +240,11 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     known = np.full((len(likelihood.readings), coordinates.size), np.nan)
     if conditions is not None:
         known[:, coordinates.is_condition] = conditions
+    options = replace(likelihood.options, n_first=first_run_count(likelihood))
+    if np.isfinite(coordinates.ends).any() and len(coordinates.inputs_of_population) == 1:
+        # The error of an input counts beside its distance from an end. With several inputs the
+        # normal equations would lose the digits.
+        options = replace(options, floor=1e-3 * options.floor)
     return SpecimenData(
         likelihood.readings,
         known,
@@ -250,7 +255,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
-        options=replace(likelihood.options, n_first=first_run_count(likelihood)),
+        options=options,
         name=likelihood.name,
         output_names=tuple(
             label

@@ -505,10 +505,6 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
     with the distance in the user's units where that is shorter, as from a spread to zero. Where a
     population is normal, the root is at least half as large, also with three specimens.
     """
-
-    def value_at(theta: Floats, i: int) -> float:
-        return float(ends_of_prior(hyperparameters, theta)[0][i])
-
     size = best.theta.size
     is_too_small = np.zeros(size, dtype=bool)
     for i in range(size):
@@ -517,12 +513,12 @@ def _too_small_errors(hyperparameters: Hyperparameters, objective: _Objective, b
             continue
         # Move the other elements to their conditional optima under a normal likelihood.
         step = np.nan_to_num(best.covariance[i], posinf=0.0) / np.sqrt(variance)
-        value = value_at(best.theta, i)
-        near = value_at(best.theta + 0.01 * step, i)
-        unit = max(abs(near - value) / 0.01, 1e-300)  # bounded, because a transform may saturate
-        for shift in (-4.0, 4.0):
-            theta = best.theta + shift * step
-            distance = np.fmin(abs(value_at(theta, i) - value) / unit, 4.0)
+        thetas = [best.theta + shift * step for shift in (0.0, 0.01, -4.0, 4.0)]
+        values = [ends_of_prior(hyperparameters, theta)[0][i] for theta in thetas]
+        # The unit is bounded, because a transform may saturate.
+        unit = max(abs(values[1] - values[0]) / 0.01, 1e-300)
+        for theta, value in zip(thetas[2:], values[2:], strict=True):
+            distance = np.fmin(abs(value - values[0]) / unit, 4.0)
             if _signed_root(objective, best, theta, i) < distance / 3:
                 is_too_small[i] = True
     return is_too_small

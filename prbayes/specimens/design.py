@@ -167,7 +167,11 @@ def emulate(
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
         is_complete = batches >= enough or len(emulation.z) >= most
-        if emulation.bias <= data.options.bias and is_complete:
+        is_open = likely.proposals.is_open()
+        can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
+        # More runs decrease an error that would be reported, where corrections cannot.
+        is_smooth = bool(can_correct) or not is_rough(data, emulation) or len(emulation.z) >= most
+        if emulation.bias <= data.options.bias and is_complete and is_smooth:
             plausible = Plausible.of(data, emulation, wider(population))
             before = emulation.surface
             emulation = audited(run, data, emulation, plausible, rng)
@@ -177,8 +181,6 @@ def emulate(
                 earlier = plausible
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-            is_open = plausible.proposals.is_open(plausible.scale)
-            can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)

@@ -44,7 +44,7 @@ class SpecimenOptions:
     # Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
     # More runs are added where the emulator's error could cause as much.
     bias: float = 0.1
-    floor: float = 1e-9  # smallest error of the emulator, as a share of the data's spread
+    floor: float = 1e-6  # smallest error of the emulator, as a share of the data's spread
     sampled: int = 8  # runs of a batch that measure the error, at least
     n_first: int | None = None  # number of first runs; by default that of `first_runs`
     max_runs: int | None = None  # by default that of `most_runs`
@@ -298,7 +298,8 @@ class Plausible:
         options = data.options
         proposals = fit_proposals(data, emulation, population)
         # Few points of a specimen suffice among many specimens; the halves have to agree.
-        of_mode = min(options.points, max(2, 4096 // len(data.readings)))
+        n = len(data.readings)
+        of_mode = options.points if n <= 512 else max(2, 512 * options.points // n)
         count = of_mode * proposals.modes.table.shape[1]
         points = draw_points(data, proposals, 2 * count, data.seed)
         scale = likely_scale(data, points, emulation.error)

@@ -649,8 +649,10 @@ class Proposals:
         specimen = np.repeat(np.arange(n), count)
         met = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)[0]
         g = self.modes.slopes
-        precision = np.einsum("kmd,kme->kde", g, g) + 0.25 * np.eye(d)
-        roots = np.linalg.inv(np.linalg.cholesky(precision))
+        # The precision G'G + 1/4 is R'R; as a sum it would lose its small eigenvalues.
+        half = np.broadcast_to(0.5 * np.eye(d), (len(g), d, d))
+        triangles = np.linalg.qr(np.concatenate([g, half], axis=1), mode="r")
+        roots = np.linalg.inv(triangles).swapaxes(1, 2)
         around = self.modes.a[:, None] + ndtri(sobol(8, d, 1)) @ roots
         specimen = np.concatenate([specimen, np.repeat(self.modes.specimen, 8)])
         a = np.concatenate([met, around.reshape(-1, d)])

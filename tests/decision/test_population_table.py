@@ -278,8 +278,8 @@ def test_elements_of_a_vector_have_units_of_their_own() -> None:
         table = prb.population(posterior, model=model, quantiles=[0.05])
         assert table.unit.values.tolist() == expected
         assert [margin.unit for margin in margins(Evaluator.of(model))] == expected
-    (text,) = [s["inputs"] for s in describe(model_with(**{"x[1]": "mm"})[0])["simulators"]]
-    assert text.startswith("x (mm) ~ ")
+    (inputs,) = [s["inputs"] for s in describe(model_with(**{"x[1]": "mm"})[0])["simulators"]]
+    assert inputs[0][:2] == ["x", " (mm)"]
     with pytest.raises(KeyError, match=r"got 'x\[2\]', expected some of \['x', 'x\[0\]', 'x\[1\]'"):
         model_with(**{"x[2]": "mm"})
     with pytest.raises(
