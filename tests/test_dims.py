@@ -64,11 +64,13 @@ def model(build: Callable[[Any], Any], p: Any, metric: Any = None) -> tuple[pm.M
     return m, x
 
 
-def numbers(build: Callable[[Any], Any], p: Any, metric: Any = None) -> dict[str, Any]:
+def numbers(
+    build: Callable[[Any], Any], p: Any, metric: Any = None, draws: int = 50
+) -> dict[str, Any]:
     """Return the optimum, its standard errors, draws and predictions."""
     m, x = model(build, p, metric)
     optimum = prb.minimize(m, **QUIET)
-    idata = prb.sample(50, chains=2, model=m, optimum=optimum, **QUIET)
+    idata = prb.sample(draws, chains=2, model=m, optimum=optimum, **QUIET)
     prediction = prb.predict(idata, np.positive, x, model=m, n_samples=20, **QUIET)
     values = {f"optimum {k}": v for k, v in optimum.point.items()}
     values |= {f"stderr {k}": v for k, v in optimum.stderr.items()}
@@ -92,8 +94,10 @@ def test_numbers_are_those_of_plain_variables(build: Callable[[Any], Any]) -> No
 
 @pytest.mark.long
 def test_numbers_of_a_metric_are_those_of_plain_variables() -> None:
-    # Refits end within their tolerance, so that draws agree in units of their spread.
-    plain, named = [numbers(lognormal, p, prb.AreaMetric()) for p in (pm, pmd)]
+    # Refits end within their tolerance, so that draws agree in units of their spread. Resampling
+    # selects other points where weights differ in the last digits, which shifts the mean of few
+    # draws.
+    plain, named = [numbers(lognormal, p, prb.AreaMetric(), draws=1000) for p in (pm, pmd)]
     for name, value in plain.items():
         if name.startswith(("optimum", "stderr")):
             np.testing.assert_allclose(named[name], value, rtol=1e-4, err_msg=name)

@@ -40,7 +40,11 @@ def test_theophylline_has_the_published_estimates(capsys: pytest.CaptureFixture[
     lines = capsys.readouterr().out.splitlines()
     estimates = {line.split()[0]: float(line.split()[1]) for line in lines if "published" in line}
     assert set(estimates) == set(module["PUBLISHED"])
-    for name, (published, error) in module["PUBLISHED"].items():
+    # The volume was published to two decimals. Gauss-Hermite quadrature of 13 nodes, centred at
+    # the mode of each subject, gives a third one, and .459, 1.012, 70.7, 27.0, 13.7 and .696 for
+    # the other estimates.
+    right = module["PUBLISHED"] | {"v": (3.4538, 0.047)}
+    for name, (published, error) in right.items():
         # Coefficients of variation were published to a tenth of a percent.
         limit = 0.1 * error if error is not None else 0.25 if name.startswith("cv") else 0.005
         assert estimates[name] == pytest.approx(published, abs=limit), name
