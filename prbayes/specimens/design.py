@@ -169,8 +169,10 @@ def emulate(
         is_complete = batches >= enough or len(emulation.z) >= most
         is_open = likely.proposals.is_open()
         can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
-        # More runs decrease an error that would be reported, where corrections cannot.
-        is_smooth = bool(can_correct) or not is_rough(data, emulation) or len(emulation.z) >= most
+        # More runs decrease an error that would be reported, where corrections cannot. Inputs that
+        # the readings leave open hardly depend on it.
+        may_be_rough = is_open or can_correct or len(emulation.z) >= most
+        is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
             plausible = Plausible.of(data, emulation, wider(population))
             before = emulation.surface
@@ -184,7 +186,7 @@ def emulate(
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
-                is_good = bool(can_correct) or len(emulation.z) >= most
+                is_good = bool(may_be_rough) or len(emulation.z) >= most
             if is_good:
                 plausible = plausible.of_emulation(data, emulation)
                 return emulation, *plausible.agreeing(data), plausible.draws
