@@ -159,6 +159,7 @@ def emulate(
     population = normal_of(data.inner[:, data.free])
     most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
     rng = np.random.default_rng([data.seed, 1])
+    has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
     # An emulator of other data needs one batch, which measures its error at these.
     batches, enough = 0, 2 if previous is None else 1
     if previous is not None:
@@ -169,9 +170,9 @@ def emulate(
         is_complete = batches >= enough or len(emulation.z) >= most
         is_open = likely.proposals.is_open()
         can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
-        # More runs decrease an error that would be reported, where corrections cannot. Inputs that
-        # the readings leave open hardly depend on it.
-        may_be_rough = is_open or can_correct or len(emulation.z) >= most
+        # More runs decrease an error that would be reported, where corrections cannot. With fewer
+        # readings than inputs it hardly matters, because the inputs are not known well.
+        may_be_rough = has_fewer_readings or can_correct or len(emulation.z) >= most
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
             plausible = Plausible.of(data, emulation, wider(population))
