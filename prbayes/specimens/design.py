@@ -162,6 +162,7 @@ def emulate(
     has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
     # An emulator of other data needs one batch, which measures its error at these.
     batches, enough = 0, 2 if previous is None else 1
+    further = 0  # batches after the bias was small
     if previous is not None:
         emulation = replace(emulation, bias=np.inf, offsets=None)
     while True:
@@ -172,7 +173,8 @@ def emulate(
         can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it hardly matters, because the inputs are not known well.
-        may_be_rough = has_fewer_readings or can_correct or len(emulation.z) >= most
+        is_last = further >= 2 or len(emulation.z) >= most
+        may_be_rough = has_fewer_readings or can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
             plausible = Plausible.of(data, emulation, wider(population))
@@ -203,6 +205,7 @@ def emulate(
         share = 2 if emulation.bias > 3 * data.options.bias else 4
         growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
         count = max(data.options.sampled + 2, growth if previous is None else 0)
+        further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
 
