@@ -26,8 +26,8 @@ class Coordinates:
     # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
     # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
-    # (2, d): ends of the range from zero to one of inputs that the prior has near both; infinite of
-    # other inputs.
+    # (2, d): ends of the range of inputs between zero and one whose density may be infinite there;
+    # infinite numbers for other inputs.
     ends: Floats
     is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
 
@@ -54,6 +54,8 @@ class Coordinates:
         # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
         is_share = (flat <= 1).all(axis=0) & (high > 0.5)
         is_log = (flat > 0).all(axis=0) & (high > 10 * low) & ~is_share
+        # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
+        is_infinite = is_share & ((np.abs(flat - 0.5) > 0.499).mean(axis=0) > 0.01)
         low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
@@ -79,7 +81,7 @@ class Coordinates:
             drawn += block
         bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
-        ends = np.where(is_share & ~is_condition, range_, [[-np.inf], [np.inf]])
+        ends = np.where(is_infinite & ~is_condition, range_, [[-np.inf], [np.inf]])
         return cls(inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition)
 
     @property

@@ -381,11 +381,21 @@ def _with_bias_at_ends(
     best = likely.weights.argmax(axis=1)
     z = likely.points.z[np.arange(len(best)), best]
     _, jacobian = emulation(z)
-    slopes = np.nan_to_num(jacobian[:, :, data.free] / emulation.error[:, None])
-    sd = np.sqrt(np.einsum("ndd->nd", np.linalg.pinv(slopes.swapaxes(1, 2) @ slopes)))
-    distance = np.minimum(z - data.ends[0], data.ends[1] - z)[:, data.free]
+
+    def input_sd(sd: Floats) -> Floats:
+        """Return standard deviations of the inputs, (N, free), by those of the outputs, (N, m)."""
+        slopes = np.nan_to_num(jacobian[:, :, data.free] / sd[:, :, None])
+        covariance = np.linalg.pinv(slopes.swapaxes(1, 2) @ slopes)
+        return np.asarray(np.sqrt(np.einsum("ndd->nd", covariance)))
+
+    by_emulator = input_sd(np.where(data.readings.is_measured, emulation.error, np.inf))
+    by_all = input_sd(data.readings.comparison_sd(emulation.error))
+    # Errors of readings smooth the density, so that the error of the emulator is small beside them.
+    by_readings = np.sqrt(np.maximum(by_all**2 - by_emulator**2, 0.0))
     # The input may be nearer to the end by three standard deviations.
-    share = np.clip(sd / np.maximum(distance - 3 * sd, 1e-300), 0.0, 3.0)
+    distance = np.minimum(z - data.ends[0], data.ends[1] - z)[:, data.free] - 3 * by_emulator
+    share = by_emulator / np.maximum(np.maximum(distance, by_readings), 1e-300)
+    share = np.clip(share, 0.0, 3.0)
     at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
     return replace(emulation, bias=max(emulation.bias, float(at_ends)))
 

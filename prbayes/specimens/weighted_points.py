@@ -88,10 +88,8 @@ class WeightedPoints:
         """Yield log p(x_ik | theta), (N, K), of each population."""
         form, (n, count) = self.form, self.log_a.shape
         if form is not None:
-            size, has_covariates = (
-                len(form.anchors[0]),
-                bool(self.density.inputs.covariates) and n > 1,
-            )
+            size = len(form.anchors[0])
+            has_covariates = bool(self.density.inputs.covariates) and n > 1
             anchors = [np.concatenate([v] * (n if has_covariates else 1)) for v in form.anchors]
             with np.errstate(all="ignore"):
                 at_each = self.density.inputs.for_points(parents, size)

@@ -107,8 +107,12 @@ def test_inputs_outside_the_log_range_have_no_number() -> None:
 
 
 def test_shares_keep_both_ends() -> None:
-    x = coordinates(lambda factor: [pm.Beta.dist(0.3 * factor, 0.3), pm.Beta.dist(2, 90 * factor)])
-    assert x.is_log.tolist() == [False, True]
-    of_range = x.inputs(x.ends[:, :1] * np.array([[1.0, 0.0]]))[0]
+    def inputs(factor: Any) -> list[Any]:
+        even = pm.Uniform.dist(0.0, 1.0 - 1e-6 * factor**2)
+        return [pm.Beta.dist(0.3 * factor, 0.3), pm.Beta.dist(2, 90 * factor), even]
+
+    x = coordinates(inputs)
+    assert x.is_log.tolist() == [False, True, False]
+    of_range = x.inputs(x.ends[:, :1] * np.array([[1.0, 0.0, 0.0]]))[0]
     assert np.allclose(of_range, [0.0, 1.0], atol=1e-12)
-    assert np.isinf(x.ends[:, 1]).all()
+    assert np.isinf(x.ends[:, 1:]).all()
