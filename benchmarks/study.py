@@ -128,7 +128,9 @@ class Study:
         names = list(self.cells)
         parser = argparse.ArgumentParser(description=self.doc.splitlines()[0])
         parser.add_argument("--data-sets", type=int, default=self.data_sets)
-        parser.add_argument("--cells", nargs="+", default=["*"], help=f"of {', '.join(names)}")
+        parser.add_argument(
+            "--cells", nargs="+", default=["*"], help=f"of {', '.join(names)}".replace("%", "%%")
+        )
         parser.add_argument("--workers", type=int, default=1)
         parser.add_argument("--out", type=Path, default=self.out)
         given = parser.parse_args()

@@ -109,6 +109,13 @@ class Likely:
         population = Normal(*fit_normal(z, points.log_a[has_point], start))
         return cls(proposals, points, population, likely_weights(data, points, population))
 
+    @classmethod
+    def of_draws(cls, data: SpecimenData, plausible: Plausible) -> Likely:
+        """Return likely inputs under the populations of posterior draws."""
+        population = normal_of(plausible.draws.specimens()[:, data.free], 1.2)
+        weights = likely_weights(data, plausible.points, population)
+        return cls(plausible.proposals, plausible.points, population, weights)
+
     def sample(
         self, count: int, rng: np.random.Generator, weights: Floats | None = None
     ) -> tuple[Floats, NDArray[np.intp]]:
@@ -160,9 +167,11 @@ def emulate(
     most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
     rng = np.random.default_rng([data.seed, 1])
     has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
+    enough_further = 1 if has_fewer_readings else 2
     # An emulator of other data needs one batch, which measures its error at these.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # batches after the bias was small
+    plausible = None
     if previous is not None:
         emulation = replace(emulation, bias=np.inf, offsets=None)
     while True:
@@ -172,14 +181,16 @@ def emulate(
         is_open = likely.proposals.is_open()
         can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
-        # readings than inputs it hardly matters, because the inputs are not known well.
-        is_last = further >= 2 or len(emulation.z) >= most
-        may_be_rough = has_fewer_readings or can_correct or is_last
+        # readings than inputs it matters less, because the inputs are not known well.
+        is_last = further >= enough_further or len(emulation.z) >= most
+        may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
-            plausible = Plausible.of(data, emulation, wider(population))
+            plausible = Plausible.of(data, emulation, wider(population), plausible)
             before = emulation.surface
-            emulation = audited(run, data, emulation, plausible, rng)
+            # Where the audit fails, the next batch is at the same inputs.
+            likely = Likely.of_draws(data, plausible)
+            emulation = audited(run, data, emulation, likely, rng)
             is_good = emulation.bias <= 1.5 * data.options.bias
             if is_good and emulation.surface is not before:
                 # Another population may be the likely one by the new surface.
@@ -193,7 +204,6 @@ def emulate(
             if is_good:
                 plausible = plausible.of_emulation(data, emulation)
                 return emulation, *plausible.agreeing(data), plausible.draws
-            likely = Likely.of(data, emulation, population, batches)
         if len(emulation.z) >= most:
             if not likely.proposals.is_open() and most_corrections(*data.known.shape):
                 emulation = corrected(run, data, emulation, population)
@@ -446,7 +456,7 @@ def audited(
     run: Run,
     data: SpecimenData,
     emulation: Emulation,
-    plausible: Plausible,
+    likely: Likely,
     rng: np.random.Generator,
 ) -> Emulation:
     """Return the emulation with runs at points that matter to the posterior, and their bias.
@@ -455,10 +465,6 @@ def audited(
     runs, which are far from each other, is often too large: it decreases towards what is measured
     here.
     """
-    points = plausible.points
-    population = normal_of(plausible.draws.specimens()[:, data.free], 1.2)
-    weights = likely_weights(data, points, population)
-    likely = Likely(plausible.proposals, points, population, weights)
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
     # Half of the runs are among the quarter of them at which the emulator is the least certain.
@@ -485,7 +491,7 @@ def audited(
         error = np.sqrt(min(measured, 1.0)) * emulation.error
         emulation = replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
         return _with_bias_at_ends(data, emulation, likely)
-    used = _near_population(data, all_z, population)
+    used = _near_population(data, all_z, likely.population)
     surface, left_out, _ = fit_surface(
         all_z, all_y, data.readings, data.name, emulation.surface, used
     )

@@ -289,13 +289,21 @@ class Plausible:
     count: int  # points of each half to begin with
 
     @classmethod
-    def of(cls, data: SpecimenData, emulation: Emulation, population: Normal) -> Plausible:
-        """Return draws; ``population`` is the first reference.
+    def of(
+        cls,
+        data: SpecimenData,
+        emulation: Emulation,
+        population: Normal,
+        earlier: Plausible | None = None,
+    ) -> Plausible:
+        """Return draws; ``population`` is the first reference, or that of earlier draws.
 
         Where the readings leave inputs open, the reference has the moments of specimens of
         posterior draws, refitted twice. Raise DesignError if `most_points` are not enough.
         """
         options = data.options
+        if earlier is not None and earlier.proposals.is_open(earlier.scale):
+            population = earlier.proposals.residuals.population
         proposals = fit_proposals(data, emulation, population)
         # Few points of a specimen suffice among many specimens; the halves have to agree.
         n = len(data.readings)
@@ -313,9 +321,9 @@ class Plausible:
             seed = data.seed + refit
             draws, points, proposals = reliable_draws(data, proposals, count, seed, scale)
             count = points.log_a.shape[1]
-            previous, population = population, normal_of(draws.specimens()[:, data.free])
-            inflated = Normal(population.mean, 1.15 * population.root)
-            proposals = fit_proposals(data, emulation, inflated)
+            previous = proposals.residuals.population
+            population = normal_of(draws.specimens()[:, data.free], 1.15)
+            proposals = fit_proposals(data, emulation, population)
             change = np.linalg.solve(previous.root, population.root)
             if np.abs(change - np.eye(len(change))).max() < 0.2:
                 break
@@ -443,7 +451,9 @@ def agreeing_points(
             return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
             raise _monte_carlo_error(data.name, 2 * count, difference[1], largest)
-        count *= 2
+        # The error falls like 1 / count at best.
+        times = 2 ** int(np.log2(np.clip(difference[1] / largest, 2, most // (2 * count))))
+        count *= times
 
 
 def _half_difference(

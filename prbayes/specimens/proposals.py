@@ -452,8 +452,8 @@ class Proposals:
         """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
 
         Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
-        converged. The determinant keeps its sign on the way: beyond a fold another proposal finds
-        the points.
+        converged: xi need not be that of the lattice, as the density is that at the inputs found.
+        The determinant keeps its sign on the way: beyond a fold another proposal finds the points.
         """
         a = self.modes.a[mode].copy()
         value, jacobian = self.mapped(mode, a)
@@ -463,11 +463,11 @@ class Proposals:
         for _ in range(25):
             step = _solutions(jacobian[active], xi[active] - value[active])
             length = np.sqrt((step**2).sum(axis=1))
-            usable = np.isfinite(length) & (fraction[active] > 1e-2)
+            usable = np.isfinite(length) & (fraction[active] > 0.1)
             active, step, length = active[usable], step[usable], length[usable]
             if not active.size:
                 break
-            longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+            longest = np.maximum(2.0, np.sqrt((a[active] ** 2).sum(axis=1)))
             step *= (fraction[active] / np.maximum(length / longest, 1.0))[:, None]
             trial = a[active] + step
             new_value, new_jacobian = self.mapped(mode[active], trial)
@@ -483,7 +483,7 @@ class Proposals:
             # that no inputs have.
             is_regular = np.linalg.slogdet(jacobian[active])[1] > self.log_det[mode[active]] - 1.0
             is_last = is_whole & is_regular & (distance < 0.01) & (distance > last[active] / 2)
-            converged[active] = (distance < 1e-6) | is_last
+            converged[active] = (distance < 1e-4) | is_last
             last[active] = distance
             active = active[~converged[active]]
         log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
@@ -592,7 +592,7 @@ class Proposals:
                 value, slopes = self._of_errors(at, a[rows], *errors)
                 sign, log_det = np.linalg.slogdet(slopes)
                 density = log_det + self.log_density(at, value) + logs[at]
-                matters = (sign == self.orientation[at]) & (density > largest[rows] - 10)
+                matters = (sign == self.orientation[at]) & (density > largest[rows] - 5)
                 rows, at, density = rows[matters], at[matters], density[matters]
                 is_reached = np.zeros(len(rows), dtype=bool)
                 if drawn is not None:
