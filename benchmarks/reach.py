@@ -278,7 +278,7 @@ CASES: dict[str, Case] = dict(
         ("log L, relative error", Case(partial(likelihood_row, True), 5, {"nats": 0.1})),
         ("log L, additive error", Case(partial(likelihood_row, False), 5, {"nats": 0.1})),
         ("inputs of specimens", Case(individuals_row, 7, GOOD)),
-        _board("three masses, well separated", 200, 3, runs=110),
+        _board("three masses, well separated", 200, 3, 400.0, runs=110),
         _board("three masses, close", 200, 3, 400.0, runs=900),
         _board("growth", 100, 3, 600.0),
     )
