@@ -70,11 +70,12 @@ class Runs(Shown):
     array([1.64,  nan])
     """
 
-    # What to do where the response is NaN.
+    # Advice in messages about points where the response is NaN.
     remedy = "add the runs that prb.propose_runs(model) returns"
 
     def __init__(self, inputs: Any, responses: Any) -> None:
-        # Without the warning of points outside the ranges: a large share of them is refused.
+        # The surrogate does not warn of points outside the ranges, since a large share of them is
+        # refused.
         table = read_table("Runs", inputs, responses)
         self.surrogate = replace(Surrogate.of_table("Runs", table), _warned=[True])
         self.outputs = table.outputs

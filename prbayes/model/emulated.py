@@ -43,14 +43,14 @@ from prbayes.specimens.emulation import Surface
 class EmulatedPopulationSizes:
     """Sizes of emulated samples."""
 
-    # Specimens of a population in plots and scores, so many that the error of a quantile is far
+    # Number of specimens of a population in plots and scores. The error of a quantile is then far
     # below the width of a posterior band.
     specimens: int = 1024
-    # Populations, and specimens of each population, in the weighted sample of a decision. Twice as
-    # many change probabilities by less than their reported error.
+    # Number of populations, and number of specimens of each, in the weighted sample of a decision.
+    # Twice as many change probabilities by less than their reported error.
     populations: int = 64
     of_each: int = 64
-    blocks: int = 8  # parts of the sample whose differences give its error
+    blocks: int = 8  # number of batches of the sample, whose scatter gives the Monte Carlo error
 
 
 _SIZES = EmulatedPopulationSizes()
@@ -66,8 +66,9 @@ class EmulatedResponse:
     surface: Surface  # surface through the finite runs
     columns: slice  # columns of the surface that belong to the response
     event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
-    error: Floats  # (m,): root mean square error of left-out runs, near the specimens
-    is_continued: bool = True  # whether there is a response beyond the runs' range
+    error: Floats  # (m,): root mean square cross-validation error near the specimens
+    # Whether responses beyond the runs' range are those at its end, or NaN.
+    is_continued: bool = True
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
@@ -91,10 +92,11 @@ class EmulatedResponse:
         z = self.coordinates.of(inputs, 1)
         ends = self._in_range(z)
         beyond = z - ends
-        # Slopes are differences to points further inside, by 2 % of the range at most.
+        # Slopes are differences to points further inside, by up to 2 % of the range.
         share = 0.02 / np.maximum((np.abs(beyond) / self._width).max(axis=1), 1e-12)
         inner = self._in_range(ends - share[:, None] * beyond)
-        with np.errstate(invalid="ignore"):  # infinite values have no difference
+        # Infinite outputs, of failed specimens, have no difference.
+        with np.errstate(invalid="ignore"):
             difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
@@ -134,8 +136,8 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
             f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
             "prb.predict, which computes responses at new specimens"
         )
-    # Left-out errors count at runs within the range of the specimens' roots, or at all runs if few
-    # are there.
+    # Cross-validation errors count at runs within the range of the specimens' likely inputs, or at
+    # all runs if this range contains few runs.
     roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
     low, high = np.quantile(roots, [0.01, 0.99], axis=0)
     is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
@@ -176,15 +178,15 @@ class EmulatedSimulator:
     inputs: Inputs = field(init=False)
     responses: Responses = field(init=False)
     outputs: Outputs = field(init=False)
-    # Whether responses of a population's specimens are known without further runs.
+    # Whether responses of a population's specimens are available without further runs.
     has_specimens: bool = field(init=False)
 
-    # A `Node` has its design here.
+    # A `Node` has its design in this attribute; emulated responses need no design.
     reweighted: ClassVar[None] = None
-    max_lost: float = field(init=False)  # largest share of a population without response
+    max_lost: float = field(init=False)  # largest accepted share of a population without response
 
     def __post_init__(self) -> None:
-        """Set the attributes of the measurement, or of one of its groups."""
+        """Copy the attributes of the measurement, or of one of its groups."""
         m, groups = self.measurement, self.measurement.inputs.groups
         name, group, rows = m.name, "", np.arange(len(m.observed))
         if groups is not None and self.place is not None:
@@ -216,7 +218,7 @@ class EmulatedSimulator:
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:
-        """The emulator of the simulator's outputs; its first use computes the runs."""
+        """The emulator of the simulator's outputs; the first access computes the runs."""
         emulation = prepared(self.likelihood).emulation
         columns = output_columns(self.likelihood, self.measurement)
         return EmulatedResponse(
@@ -301,17 +303,20 @@ class EmulatedSample:
     """
 
     simulator: EmulatedSimulator
-    points: list[Floats]  # (n, *event): values of each input
+    points: list[Floats]  # values of each input, (n, *event)
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
-    blocks: NDArray[np.intp]  # (n,): index of the eighth, which represents the mixture itself
+    # (n,): batch of each specimen; each of the eight batches represents the mixture itself.
+    blocks: NDArray[np.intp]
     inputs: Inputs  # inputs of the simulator
     n_points: int  # number of specimens
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
-    max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
-    has_runs: ClassVar[Literal[False]] = False  # whether points are runs, as those of a design
-    on_line: ClassVar[bool] = False  # whether the points are a quadrature rule
-    is_continued: ClassVar[bool] = True  # whether responses are constant beyond the runs
+    max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
+    # Whether the points are runs, as those of a design are.
+    has_runs: ClassVar[Literal[False]] = False
+    on_line: ClassVar[bool] = False  # whether the points form a quadrature rule
+    # Whether responses beyond the runs are those at the end of their range.
+    is_continued: ClassVar[bool] = True
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
@@ -350,7 +355,7 @@ class EmulatedSample:
         return len(self._emulator(responses).z)
 
     def _emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return the emulator of a response, which the first call for the response fits."""
+        """Return the emulator of a response; the first call for the response fits the emulator."""
         if responses not in self._emulators:
             self._emulators[responses] = self.simulator.emulator(responses)
         return self._emulators[responses]
@@ -379,7 +384,7 @@ class EmulatedSample:
 def _population_log_densities(
     inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
 ) -> Floats:
-    """Return log-densities of specimens in populations, (k, n)."""
+    """Return log-densities of n specimens in k populations, (k, n)."""
     function = compiled_log_density(inputs)
     step = max(1, AT_ONCE // len(points[0]))
     parts = []
