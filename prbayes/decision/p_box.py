@@ -199,7 +199,7 @@ class ProbabilityBox(Table):
 
 
 def _place(function: Floats, y: Floats, probability: float) -> float:
-    """Return where a distribution function (m,) reaches a probability; infinite beyond y."""
+    """Return the quantile of a distribution function given at y, (m,); infinite beyond y."""
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 

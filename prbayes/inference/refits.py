@@ -201,7 +201,8 @@ def refit_prepared(
             data, weights = one_set(evaluator, sets, i)
             try:
                 prepared = evaluator.observing(data, weights=weights)
-            except ValueError:  # such as a data set of specimens that are all alike
+            except ValueError:
+                # A data set can be invalid for a metric, for example if all specimens are alike.
                 continue
             objective = BatchObjective.of(prepared, scales, observed_set(prepared))
             starts = np.stack([np.zeros_like(minimiser), minimiser])
@@ -476,7 +477,7 @@ class BatchObjective:
         return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
 
     def _values(self, thetas: Floats, rows: Any) -> Floats:
-        """Return the values for some data sets."""
+        """Return the objectives of the data sets in ``rows``, each at its own thetas."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
         total: Any = 0.0
         for i, k in enumerate(self.simulators):

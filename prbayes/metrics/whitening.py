@@ -302,5 +302,5 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _listed(outputs: Indices) -> str:
-    """Return the numbers of outputs for a message."""
+    """Return the indices of outputs as text for a message."""
     return ", ".join(map(str, outputs.tolist()))

@@ -397,7 +397,8 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     elif is_flat:
         result = Result.NO_INFORMATION
     elif is_affordable and not search.settings.prior and stored_overlap(evaluator, theta) < OVERLAP:
-        # Without overlap the minimum is one of the mass beyond the metric's grid, and no fit.
+        # Without overlap the minimum is not a fit, because the data lie beyond the metric's grid,
+        # and the discrepancy measures only the mass there.
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
@@ -498,7 +499,8 @@ def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
     size = np.abs(gradients)
     is_touched = np.einsum("...i,ij,...j->...", size, is_infinite.astype(float), size) > 0
-    # At a bound of the support the gradient of a function vanishes, and its error is not known.
+    # At a bound of the support a function of theta may have a gradient of zero. Then its standard
+    # error is unknown, not zero.
     is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
     variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
     return np.sqrt(np.where(is_at_bound, np.nan, variance))

@@ -112,9 +112,8 @@ def _calibration(
 ) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
 
-    ``by_specimen`` has the log-likelihoods of specimens, if these have been computed.
-
-    Log-likelihoods by specimen are the last; their discrepancies are minus log-likelihoods.
+    ``by_specimen`` has the log-likelihoods of specimens, if these have been computed. Their
+    simulators come last, and have minus log-likelihoods as discrepancies.
     """
     records = simulator_records(evaluator)
     n_chains, n_draws, d = chains.thetas.shape

@@ -405,7 +405,7 @@ class Responses:
                 if changed is None:
                     continue
                 second = self._by_itself(specimens, part, copies)
-            except ResponseError as error:  # the response takes no small batch
+            except ResponseError as error:  # the response rejects small batches
                 if self.is_batched:
                     self._refuse_one_size(specimens, (len(values),), error)
                 return
