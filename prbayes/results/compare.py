@@ -105,24 +105,7 @@ def compare(
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
-    for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
-        refuse_model(result, "compare: results")
-    if not isinstance(results, Mapping):
-        raise TypeError(
-            f"compare: results: got {called(results)}, expected a mapping such as "
-            "{'optimum': optimum, 'ABC': idata}"
-        )
-    if metrics is not None and not (
-        isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
-    ):
-        raise TypeError(
-            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
-            "[prb.AreaMetric()]"
-        )
-    if not results:
-        raise ValueError(
-            "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
-        )
+    _refuse_wrong(results, metrics)
     identities = {label: identity_in(result) for label, result in results.items()}
     try:
         identity = require_together(identities, "compare", model=model)
@@ -134,28 +117,12 @@ def compare(
     trees = [_tree_of(label, result) for label, result in results.items()]
     read = [estimates_of(tree, model=naming) for tree in trees]
     columns, shown = zip(*read, strict=True)
-    in_all = set.intersection(*map(set, columns))
-    shared = [name for name in columns[0] if name in in_all]
-    left_out = [name for column in columns for name in column if name not in in_all]
-    if left_out and shared and None in identities.values():
-        # Other tools may name variables differently.
-        listed = ", ".join(dict.fromkeys(left_out))
-        text = f"compare: left out {listed:.300}, as not all results have these names."
-        report(Finding("names-differ", text))
-    if model is not None:
-        variables = [str(variable.name) for variable in model.unobserved_RVs]
-        shared = [name for name in shared if variable_of(name, variables) in variables]
+    by_label = dict(zip(results, columns, strict=True))
+    shared = _shared_elements(by_label, model, may_rename=None in identities.values())
     in_table = set.intersection(*map(set, shown))
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
-        got = {label: list(column) for label, column in zip(results, columns, strict=True)}
-        if model is not None:
-            got["the model"] = variables
-        texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
-        raise ValueError(
-            f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
-            "names"
-        )
+        raise _nothing_shared(by_label, model)
     table = np.array([[column[name] for name in names] for column in columns])
     estimates, sds = table[..., 0], table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
@@ -185,6 +152,60 @@ def compare(
         **as_attributes(identity),
     }
     return Comparison(data, coords=coords, attrs=attrs)
+
+
+def _refuse_wrong(results: Any, metrics: Any) -> None:
+    """Raise if there are no results, or an argument has a wrong type."""
+    for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
+        refuse_model(result, "compare: results")
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            f"compare: results: got {called(results)}, expected a mapping such as "
+            "{'optimum': optimum, 'ABC': idata}"
+        )
+    if metrics is not None and not (
+        isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
+    ):
+        raise TypeError(
+            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
+            "[prb.AreaMetric()]"
+        )
+    if not results:
+        raise ValueError(
+            "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
+        )
+
+
+def _shared_elements(
+    columns: Mapping[str, Mapping[str, Any]], model: pm.Model | None, *, may_rename: bool
+) -> list[str]:
+    """Return the elements that all results have, restricted to the variables of a model.
+
+    Elements that are left out are reported if other tools may have renamed variables.
+    """
+    first, *_ = columns.values()
+    in_all = set.intersection(*map(set, columns.values()))
+    shared = [name for name in first if name in in_all]
+    left_out = [name for column in columns.values() for name in column if name not in in_all]
+    if left_out and shared and may_rename:
+        listed = ", ".join(dict.fromkeys(left_out))
+        text = f"compare: left out {listed:.300}, as not all results have these names."
+        report(Finding("names-differ", text))
+    if model is None:
+        return shared
+    variables = [str(variable.name) for variable in model.unobserved_RVs]
+    return [name for name in shared if variable_of(name, variables) in variables]
+
+
+def _nothing_shared(columns: Mapping[str, Mapping[str, Any]], model: pm.Model | None) -> ValueError:
+    """Return the error that the results, and the model, have no hyperparameter in common."""
+    got = {label: list(column) for label, column in columns.items()}
+    if model is not None:
+        got["the model"] = [str(variable.name) for variable in model.unobserved_RVs]
+    texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
+    return ValueError(
+        f"compare: got results that share no hyperparameter ({texts:.500}), expected the same names"
+    )
 
 
 class Comparison(Table):
