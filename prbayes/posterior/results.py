@@ -108,12 +108,12 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 
 
 def _calibration(
-    evaluator: Evaluator, chains: Chains, by_specimen: xr.Dataset | None
+    evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset | None
 ) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
 
-    ``by_specimen`` has the log-likelihoods of specimens, if these have been computed. Their
-    simulators come last, and have minus log-likelihoods as discrepancies.
+    ``log_likelihoods`` are those of specimens, if they have been computed. Their simulators come
+    last, and have minus log-likelihoods as discrepancies.
     """
     records = simulator_records(evaluator)
     n_chains, n_draws, d = chains.thetas.shape
@@ -142,13 +142,12 @@ def _calibration(
             records[k]["required_ess"] = node.reweighted.required_ess
     if evaluator.measurements:
         failing = failing_share(evaluator, rows.mean(axis=0))
-        log_likelihoods = (
-            _log_likelihood_by_specimen(evaluator, chains) if by_specimen is None else by_specimen
-        )
+        if log_likelihoods is None:
+            log_likelihoods = _log_likelihood_by_specimen(evaluator, chains)
     for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
         name = measurement.name
         # Of simulators that share specimens the last one has their log-likelihood.
-        if name in log_likelihoods:
+        if log_likelihoods is not None and name in log_likelihoods:
             discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=-1)
         else:
             discrepancies[:, :, k] = 0.0

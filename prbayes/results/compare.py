@@ -312,16 +312,15 @@ def _scores(
         lacking = [shortcomings(evaluator, theta[None]) for theta in thetas]
         several = len(evaluator.simulators) > 1
         scores = {}
+        defaults: list[Sequence[Metric]] = [_METRICS] * len(evaluator.nodes)
+        # The log-likelihood by specimen, below, replaces that by kernels.
+        defaults += [_METRICS[:-1]] * len(evaluator.emulated)
         for k, simulator in enumerate(evaluator.simulators):
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
-            default: Sequence[Metric] = _METRICS
-            if simulator.metric.by_specimen:
-                # The log-likelihood by specimen replaces that by kernels.
-                default = _METRICS[:-1]
-            if simulator.observed.ndim > 1:
-                default = [Joint(metric) for metric in default]  # It treats all outputs alike.
-            selection = default if metrics is None else metrics
+            selection = defaults[k] if metrics is None else metrics
+            if metrics is None and simulator.observed.ndim > 1:
+                selection = [Joint(metric) for metric in selection]  # It treats all outputs alike.
             if simulator.metric.exact_likelihood:  # A data sheet has statistics, no specimens.
                 selection = [simulator.metric]
             for metric in selection:
