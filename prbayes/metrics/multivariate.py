@@ -126,11 +126,6 @@ def components_of(target: Discrepancy) -> tuple[Components, ...]:
     return target.components if isinstance(target, CompositeDiscrepancy) else ()
 
 
-def components_summary(target: Discrepancy) -> str:
-    """Return sentences about the variance that principal components leave out."""
-    return "; ".join(c.summary for c in components_of(target))
-
-
 def failure_caps(observed: Floats) -> Floats:
     """Return the value of a failure in each output: the largest observed one plus the range."""
     finite = np.where(np.isfinite(observed), observed, np.nan)

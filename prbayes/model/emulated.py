@@ -116,41 +116,6 @@ class EmulatedResponse:
         return with_failures(values, z / self._width, self.z / self._width, self.y)
 
 
-def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
-    """Compute another response at the points of a likelihood's runs, and interpolate it.
-
-    Raises a DesignError if fewer than eight runs have a finite response.
-    """
-    preparation = prepared(likelihood)
-    run_z = preparation.emulation.z
-    runs = likelihood.coordinates.inputs(run_z)
-    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
-    values = responses(points, [])
-    coordinates = Coordinates.of_prior(responses.inputs)
-    z = coordinates.of(points, 1)
-    y = values.reshape(len(z), -1)
-    is_finite = np.isfinite(y).all(axis=1)
-    if is_finite.sum() < 8:
-        raise DesignError(
-            f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
-            f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
-            "prb.predict, which computes responses at new specimens"
-        )
-    # Cross-validation errors count at runs within the range of the specimens' likely inputs, or at
-    # all runs if this range contains few runs.
-    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
-    if is_near.sum() < 16:
-        is_near = np.ones(len(run_z), dtype=bool)
-    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
-    rows = np.flatnonzero(is_finite)[distinct]
-    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
-    surface = fit_emulator(z[rows], y[rows], near)
-    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
-    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
-
-
 def values_of_inputs(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
     """Return the values of a subset of the inputs, from those of all inputs of a response."""
     places = [
@@ -210,14 +175,8 @@ class EmulatedSimulator:
             has_specimens=self.likelihood.has_table or not self.likelihood.calls_response,
         )
 
-    @property
-    def conditions(self) -> Floats | None:
-        """The conditions of the specimens, (N, C), None without one."""
-        conditions = self.measurement.conditions
-        return None if conditions is None else conditions[self.rows]
-
     @cached_property
-    def _emulated(self) -> EmulatedResponse:
+    def emulated(self) -> EmulatedResponse:
         """The emulator of the simulator's outputs; the first access computes the runs."""
         emulation = prepared(self.likelihood).emulation
         columns = output_columns(self.likelihood, self.measurement)
@@ -232,36 +191,14 @@ class EmulatedSimulator:
             is_continued=not self.likelihood.has_table,
         )
 
-    def emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return a response of the same inputs as a function of them.
-
-        The simulator's own response costs no run. Another one is computed at the points of the
-        emulator's runs.
-        """
-        if responses.same_as(self.responses):
-            emulated = self._emulated
-            runs = self.likelihood.coordinates.inputs(emulated.z)
-            points = values_of_inputs(runs, self.likelihood.inputs, responses.inputs)
-            values = emulated.y.reshape(len(emulated.z), *emulated.event)
-            responses.refuse_change(points, values, self.responses)
-            return emulated
-        return _emulate_at_runs(self.likelihood, responses)
-
     def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return emulated responses and weights of populations, (k, n) or (k, n, m) and (k, n).
 
         The quasi-random numbers are the same for all calls.
         """
         size, n = len(parents[0]), _SIZES.specimens
-        values = self._emulated(self.draw_specimens(parents, n))
+        values = self.emulated(draw_specimens(self, parents, n))
         return values.reshape(size, n, *self.measurement.event), np.full((size, n), 1 / n)
-
-    def draw_specimens(self, parents: Sequence[Floats], n: int) -> list[Floats]:
-        """Return n specimens of each of k populations, (k n, *event) by input."""
-        rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
-        specimens = at_conditions(self.inputs, specimens, self.conditions)
-        return [x.reshape(-1, *x.shape[2:]) for x in specimens]
 
     def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
         """Return the discrepancies of populations from a prepared metric, (k,)."""
@@ -269,9 +206,58 @@ class EmulatedSimulator:
         weights = responding_weights(values, weights)
         return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(values))])
 
-    def weighted_sample(self, parents: Sequence[Floats]) -> EmulatedSample:
-        """Return specimens whose weights make populations near those at parents."""
-        return EmulatedSample.of(self, parents)
+
+def draw_specimens(simulator: EmulatedSimulator, parents: Sequence[Floats], n: int) -> list[Floats]:
+    """Return n specimens of each of k populations, (k n, *event) by input."""
+    inputs, conditions = simulator.inputs, simulator.measurement.conditions
+    if conditions is not None:
+        conditions = conditions[simulator.rows]
+    rng = np.random.default_rng(0)
+    specimens, _ = new_specimens(simulator.name, inputs, list(parents), n, rng)
+    specimens = at_conditions(inputs, specimens, conditions)
+    return [x.reshape(-1, *x.shape[2:]) for x in specimens]
+
+
+def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedResponse:
+    """Return a response of a simulator's inputs as a function of them.
+
+    The simulator's own response costs no run. Another one is computed at the points of the
+    emulator's runs. Raises a DesignError if fewer than eight of these have a finite response.
+    """
+    likelihood = simulator.likelihood
+    preparation = prepared(likelihood)
+    run_z = preparation.emulation.z
+    runs = likelihood.coordinates.inputs(run_z)
+    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
+    if responses.same_as(simulator.responses):
+        emulated = simulator.emulated
+        values = emulated.y.reshape(len(run_z), *emulated.event)
+        responses.refuse_change(points, values, simulator.responses)
+        return emulated
+    values = responses(points, [])
+    coordinates = Coordinates.of_prior(responses.inputs)
+    z = coordinates.of(points, 1)
+    y = values.reshape(len(z), -1)
+    is_finite = np.isfinite(y).all(axis=1)
+    if is_finite.sum() < 8:
+        raise DesignError(
+            f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
+            f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
+            "prb.predict, which computes responses at new specimens"
+        )
+    # Cross-validation errors count at runs within the range of the specimens' likely inputs, or at
+    # all runs if this range contains few runs.
+    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    if is_near.sum() < 16:
+        is_near = np.ones(len(run_z), dtype=bool)
+    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
+    rows = np.flatnonzero(is_finite)[distinct]
+    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
+    surface = fit_emulator(z[rows], y[rows], near)
+    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
+    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
@@ -312,11 +298,10 @@ class EmulatedSample:
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
-    # Whether the points are runs, as those of a design are.
+    # Whether the points are runs, as those of a design are. Otherwise responses beyond the runs are
+    # those at the end of their range.
     has_runs: ClassVar[Literal[False]] = False
     on_line: ClassVar[bool] = False  # whether the points form a quadrature rule
-    # Whether responses beyond the runs are those at the end of their range.
-    is_continued: ClassVar[bool] = True
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
@@ -326,7 +311,7 @@ class EmulatedSample:
         parents = [parent[rows] for parent in parents]
         of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
         of_each *= _SIZES.blocks
-        flat = simulator.draw_specimens(parents, of_each)
+        flat = draw_specimens(simulator, parents, of_each)
         log_p = _population_log_densities(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
@@ -350,14 +335,15 @@ class EmulatedSample:
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
 
-    def n_runs_of(self, responses: Responses) -> int:
-        """Return the number of runs behind a response."""
-        return len(self._emulator(responses).z)
+    @property
+    def n_runs(self) -> int:
+        """Number of runs of the emulator of any response."""
+        return len(self.simulator.emulated.z)
 
     def _emulator(self, responses: Responses) -> EmulatedResponse:
         """Return the emulator of a response; the first call for the response fits the emulator."""
         if responses not in self._emulators:
-            self._emulators[responses] = self.simulator.emulator(responses)
+            self._emulators[responses] = emulator_of(self.simulator, responses)
         return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:

@@ -337,36 +337,29 @@ class SpecimenLikelihood:
             )
         return Hyperparameters.of(model)
 
-    def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
+    def observing(self, data: Mapping[str, Any], model: Any = None) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.
 
-        It is the same object where the values are the same.
+        ``model`` is a copy of the model. The likelihood is the same object if the values are the
+        same, unless `pymc.do` or `pymc.observe` left other free variables in the copy, for whose
+        posterior points are drawn.
         """
         changed = tuple(
             m if data.get(m.name) is None else m.observing(data[m.name]) for m in self.measurements
         )
-        if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
+        models = [m for m in (self.model(), model) if m is not None] if model is not None else []
+        names = [{str(rv.name) for rv in m.free_RVs} for m in models]
+        is_same_model = model is None or names[1:] == names[:1]
+        is_same_data = all(a is b for a, b in zip(changed, self.measurements, strict=True))
+        if is_same_model and is_same_data:
             return self
-        return replace(self, measurements=changed, shared_emulation=self._emulation)
-
-    def in_model(self, model: Any) -> SpecimenLikelihood:
-        """Return the likelihood in a copy of the model, with the same runs.
-
-        It is the same object unless `pymc.do` or `pymc.observe` left other free variables, for
-        whose posterior points are drawn.
-        """
-        original = self.model()
-        if original is not None:
-            names = [{str(rv.name) for rv in m.free_RVs} for m in (original, model)]
-            if names[0] == names[1]:
-                return self
-        return replace(self, model=weakref.ref(model), shared_emulation=self._emulation)
-
-    @property
-    def _emulation(self) -> Emulation | None:
-        """The emulator, or None before it has been fitted."""
         prepared = self.cache.get("preparation")
-        return prepared.emulation if prepared else self.shared_emulation
+        return replace(
+            self,
+            measurements=changed,
+            model=self.model if is_same_model else weakref.ref(model),
+            shared_emulation=prepared.emulation if prepared else self.shared_emulation,
+        )
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:

@@ -72,8 +72,6 @@ class Node:
     propagation: Propagation  # configuration of the propagation
     epsilon: Any  # epsilon as a shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
-    # Names of earlier simulators in the model that share a ``.dist()`` of the inputs with this one.
-    same_inputs: tuple[str, ...] = ()
     outputs: Outputs = SINGLE_OUTPUT  # outputs of the response: names, units and shape
     group: str = ""  # name of the group of specimens, empty without groups
 
@@ -110,11 +108,6 @@ class Node:
         """Return the discrepancies of populations from a prepared metric, (k,)."""
         return self.bound.discrepancies(parents, target)
 
-    def weighted_sample(self, parents: Sequence[Floats]) -> ReweightedBound:
-        """Return specimens whose weights make populations: those of the design."""
-        assert self.reweighted is not None
-        return self.reweighted
-
     @property
     def epsilon_value(self) -> float:
         """The value of epsilon, NaN while it is not set."""
@@ -125,32 +118,28 @@ class Node:
         """Effective number of specimens: repeated observations of a specimen count once."""
         return effective_specimens(self.target, self.specimens)
 
-    def observing(self, data: Any) -> Node:
-        """Return the same simulator with other observed responses; it computes no response.
 
-        It is the same object where the values are the same. Raise TypeError or ValueError if the
-        metric does not take the values, or weights or labels belong to another number of them.
-        """
-        target, bound = self.target, self.bound
-        data = np.asarray(data)
-        if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
-            return self
-        is_aligned = self.specimens is not None or bool(np.ptp(target.weights) > 0)
-        values = new_observed(self, data, "specimens= or weights=", is_aligned=is_aligned)
-        is_same_size = len(values) == len(target.weights)
-        try:
-            target = self.metric.against(values, target.weights if is_same_size else None)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"{self.name}: {error}") from None
-        changed = with_target(self, target.metric.for_inputs(target, bound.inputs.dimensions))
-        if has_default_epsilon(self):
-            changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
-        return changed
+def with_observed(node: Node, data: Any) -> Node:
+    """Return the same simulator with other observed responses; it computes no response.
 
-    def copied(self) -> Node:
-        """Return the same simulator with its own design, count of responses and epsilon."""
-        epsilon = shared_epsilon(self.name, self.epsilon_value)
-        return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+    It is the same object where the values are the same. Raise TypeError or ValueError if the metric
+    does not take the values, or weights or labels belong to another number of them.
+    """
+    target = node.target
+    data = np.asarray(data)
+    if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
+        return node
+    is_aligned = node.specimens is not None or bool(np.ptp(target.weights) > 0)
+    values = new_observed(node, data, "specimens= or weights=", is_aligned=is_aligned)
+    is_same_size = len(values) == len(target.weights)
+    try:
+        target = node.metric.against(values, target.weights if is_same_size else None)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{node.name}: {error}") from None
+    changed = with_target(node, target.metric.for_inputs(target, node.inputs.dimensions))
+    if has_default_epsilon(node):
+        changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
+    return changed
 
 
 def with_target(node: Node, target: Discrepancy) -> Node:
@@ -170,7 +159,6 @@ class Specification:
     propagation: Propagation
     epsilon: Any  # shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
-    same_inputs: tuple[str, ...] = ()
     outputs: Outputs = SINGLE_OUTPUT
     group: str = ""
     progressbar: bool = True
@@ -184,13 +172,16 @@ class Specification:
         """The metric of the target."""
         return self.target.metric
 
-    def copied(self) -> Specification:
-        """Return the same simulator with its own epsilon, for a clone of the model."""
-        epsilon = shared_epsilon(self.name, float(self.epsilon.get_value()))
-        return replace(self, epsilon=epsilon, original=self.original or self)
-
 
 type AnySimulator = Specification | Node
+
+
+def copied(simulator: AnySimulator) -> AnySimulator:
+    """Return the same simulator with its own design, count and epsilon, for a clone of a model."""
+    epsilon = shared_epsilon(simulator.name, float(simulator.epsilon.get_value()))
+    if isinstance(simulator, Node):
+        return replace(simulator, bound=simulator.bound.copied(), epsilon=epsilon)
+    return replace(simulator, epsilon=epsilon, original=simulator.original or simulator)
 
 
 def computed(simulator: AnySimulator) -> Node:
@@ -204,7 +195,8 @@ def computed(simulator: AnySimulator) -> Node:
         if simulator.node is not None:
             return simulator.node
         if simulator.original is not None:
-            node = replace(computed(simulator.original).copied(), epsilon=simulator.epsilon)
+            node = computed(simulator.original)
+            node = replace(node, bound=node.bound.copied(), epsilon=simulator.epsilon)
         else:
             propagation, target = simulator.propagation, simulator.target
             # The copy counts calls and collects notes. Both are dropped with the copy if an attempt
@@ -246,7 +238,6 @@ def computed(simulator: AnySimulator) -> Node:
                 propagation,
                 simulator.epsilon,
                 simulator.specimens,
-                simulator.same_inputs,
                 outputs,
                 simulator.group,
             )
@@ -331,7 +322,7 @@ class ObservedRV(RandomVariable):
     model or a compiled function, and weakly by the operation itself.
     """
 
-    __props__ = ("name", "signature", "dtype", "inplace", "reference")
+    __props__ = ("name", "signature", "dtype", "inplace", "reference", "simulators")
 
     def __init__(
         self,
@@ -341,8 +332,11 @@ class ObservedRV(RandomVariable):
         inplace: bool = False,
         *,
         reference: weakref.ref[Any],
+        simulators: tuple[str, ...],
     ) -> None:
         self.reference = reference
+        # Names of the simulators with the same specimens; this simulator is the last one.
+        self.simulators = simulators
         label = "Simulator of {} by {}".format(*self._response_and_metric)
         super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
 
@@ -425,13 +419,13 @@ class SimulatorRV(ObservedRV):
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
-        if self.simulator.same_inputs and not self._warned:
+        *others, name = self.simulators
+        if others and not self._warned:
             self._warned = True
-            names = ", ".join(self.simulator.same_inputs)
             report(
                 Finding(
                     "independent-draws",
-                    f"{self.simulator.name} and {names} have the inputs of the same specimens, but "
+                    f"{name} and {', '.join(others)} have the inputs of the same specimens, but "
                     "PyMC's predictive sampling draws each variable independently: use "
                     "prb.predict for responses of the same specimens.",
                 )
@@ -504,7 +498,7 @@ def _metric_log_density(
     data = known_value(value)
     node = computed(op.simulator)
     if data is not None:
-        node = node.observing(data)
+        node = with_observed(node, data)
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
@@ -628,7 +622,7 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
             # A clone of a model shares the operation with its original, and gets a copy of the
             # simulator.
             if apply.op.owner() is not apply:
-                apply.op.assign(apply, apply.op.simulator.copied())
+                apply.op.assign(apply, copied(apply.op.simulator))
             by_variable[rv] = apply.op.simulator
     return by_variable
 
@@ -641,7 +635,7 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     """
     by_variable = {}
     for rv, simulator in simulators(model).items():
-        node = computed(simulator).observing(known_value(model.rvs_to_values[rv]))
+        node = with_observed(computed(simulator), known_value(model.rvs_to_values[rv]))
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
         by_variable[rv] = node

@@ -57,7 +57,7 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.response.condition import refuse_covariates, refuse_vectors_of_specimens
+from prbayes.response.condition import refuse_vectors_of_specimens
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -563,7 +563,12 @@ def _add_by_metric(
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
-    refuse_covariates(name, inputs.covariates)
+    if inputs.covariates:
+        raise TypeError(
+            f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "
+            "expected one population, as a metric compares distributions; use "
+            "metric=prb.LogLikelihood(), or prb.response.group for few different values"
+        )
     target = _prepared_metric(name, metric, data.values, data.weights)
     if data.labels is not None:
         _refuse_ambiguous_labels(name, data.labels, list(simulators(model).values()))
@@ -616,17 +621,18 @@ def _add_specification(
     else:
         _warn_shared_specimens(specification, labels, earlier)
     aleatory = set(inputs.aleatory)
-    same_inputs = [
+    same_inputs = tuple(
         simulator.name
         for simulator in earlier
         if simulator.group == specification.group
         and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
-    ]
+    )
     group = pt.constant(place, dtype="int64")
     params = [group if is_group(v) else v for v in inputs.parents]
     signature = rv_signature([p.type.ndim for p in params], len(target.event))
-    simulator = replace(specification, same_inputs=tuple(same_inputs))
-    operation = SimulatorRV(signature=signature, reference=weakref.ref(simulator))
+    reference = weakref.ref(specification)
+    names = (*same_inputs, name)
+    operation = SimulatorRV(signature=signature, reference=reference, simulators=names)
     rv = SimulatorDistribution(name, *params, operation=operation, observed=observed, dims=dims)
     # The owner is set at once, because a clone of the model could become the owner otherwise.
     rv.owner.op.owner = weakref.ref(rv.owner)

@@ -431,18 +431,12 @@ def _with_reading_errors(
 class SpecimenRV(ObservedRV):
     """The operation of a simulator with a log-likelihood by specimen; its record is that."""
 
-    __props__ = (*ObservedRV.__props__, "simulators")  # type: ignore[assignment]
-    __str__ = ObservedRV.__str__  # PyTensor would generate another text from the properties
-
-    def __init__(self, *arguments: Any, simulators: tuple[str, ...], **keywords: Any) -> None:
-        # Names of the simulators with the same specimens; this simulator is the last one. The
-        # observed variables of the others are parameters of this operation.
-        self.simulators = simulators
-        super().__init__(*arguments, **keywords)
-
     @property
     def measurements(self) -> list[Measurement]:
-        """The measurements of `simulators`; the last is that of this simulator."""
+        """The measurements of `simulators`; the last is that of this simulator.
+
+        The observed variables of the others are parameters of this operation.
+        """
         by_name = {m.name: m for m in self.record.measurements}
         return [by_name[name] for name in self.simulators]
 
@@ -540,7 +534,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
     result = {rv: rv.owner.op.record for rv in rvs}
-    current = {old: old.observing(data).in_model(model.root) for old in result.values()}
+    current = {old: old.observing(data, model.root) for old in result.values()}
     for rv, old in result.items():
         if current[old] is not old:
             rv.owner.op.assign(rv.owner, current[old])

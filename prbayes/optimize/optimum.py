@@ -22,7 +22,7 @@ from prbayes.inference.refits import (
     sampling_obstacle,
     sampling_of_functions,
 )
-from prbayes.metrics.multivariate import components_summary
+from prbayes.metrics.multivariate import components_of
 from prbayes.model.description import (
     as_attribute,
     failures_dataset,
@@ -595,7 +595,7 @@ def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
         {
             "simulator": node.name,
             "metric": without_addresses(node.metric),
-            "compared": components_summary(node.target),
+            "compared": "; ".join(c.summary for c in components_of(node.target)),
             "is_likelihood": 0,
             "n_runs": node.bound.n_runs,
         }

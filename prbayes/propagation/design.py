@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
-from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import (
     SIZES,
     DesignEmulator,
@@ -111,6 +111,10 @@ class Design:
         )
 
 
+class PoorEmulatorError(DesignError):
+    """The emulator of another response of the same specimens is too poor."""
+
+
 @dataclass(eq=False)
 class DesignSampler:
     """Points of designs, and their weights: runs, and emulated points if there is an emulator."""
@@ -120,6 +124,25 @@ class DesignSampler:
     emulator: Any
     # Compiled function of the log-weights, if the support of an input moves.
     _log_weights: Any = None
+
+    def emulator_of(self, design: Design, at_runs: Floats) -> DesignEmulator:
+        """Return an emulator of another response, fitted to its values at the runs of a design."""
+        assert design.emulator is not None
+        runs = replace(design.runs, values=at_runs)
+        emulator = DesignEmulator.fit(self.emulator, runs, design.emulator.weights)
+        # With a mixing weight of one half the bias of the emulator is as large as the sampling
+        # error of the runs. The runs get the mixing weight that they have for the design's own
+        # response.
+        most = 0.5
+        share = 1.0 if emulator is None else emulator.run_share
+        if emulator is None or share > most + design.emulator.run_share:
+            raise PoorEmulatorError(
+                f"{self.mixtures.name}: got a response of the same specimens whose emulator would "
+                f"leave {share:.0%} of a population to the {len(runs)} runs alone, expected at "
+                f"most {most:.0%} more than for the response of the design; calibrate with "
+                "prb.Reweighted(n, emulator=None), or let one response return both outputs"
+            )
+        return emulator
 
     def with_runs(
         self, design: Design | None, components: Sequence[Floats], n: int, responses: Responses

@@ -36,7 +36,6 @@ from prbayes.propagation.base import (
 from prbayes.propagation.design import Design, DesignSampler, log_weight_graph
 from prbayes.propagation.importance import (
     SIZES,
-    DesignEmulator,
     MixtureSampler,
     Sample,
 )
@@ -219,10 +218,6 @@ class Reweighted(Propagation):
         return ReweightedBound(name, inputs, target, responses, self)
 
 
-class PoorEmulatorError(DesignError):
-    """The emulator of another response of the same specimens is too poor."""
-
-
 class ReweightedBound(Bound):
     """Stored responses with weights p(x given theta) / g(x) for every theta.
 
@@ -232,10 +227,8 @@ class ReweightedBound(Bound):
     """
 
     stored: ClassVar[bool] = True
-    # Whether the points are runs, unlike emulated specimens.
+    # Whether the points are runs. Responses beyond those of emulated specimens are constant.
     has_runs: ClassVar[Literal[True]] = True
-    # Whether responses beyond the runs are those at the end of their range.
-    is_continued: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -352,34 +345,26 @@ class ReweightedBound(Bound):
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, (n,) or (n, m).
 
-        Known runs are reused. Raise PoorEmulatorError if the response is emulated poorly between
-        the runs; runs alone need no emulator.
+        Known runs are reused. Raise ValueError if the design's own response has changed since its
+        runs, and PoorEmulatorError if another response is emulated poorly between the runs; runs
+        alone need no emulator.
         """
+        design = self._design
         if responses.same_as(self.responses):
-            self.refuse_change(responses)
-            return self._design.sample.values
+            points = self.points_of(responses.inputs, design.runs.points)
+            responses.refuse_change(points, design.runs.values, self.responses)
+            return design.sample.values
         at_runs = self._at_runs(responses)
-        emulated = self._design.emulated
-        if emulated is None:
+        if design.emulated is None:
             return at_runs
-        values = self._emulator_of(at_runs).at(emulated)
+        values = self._sampler.emulator_of(design, at_runs).at(design.emulated)
         has_runs = len(values) < self.n_points
         return np.concatenate([values, at_runs]) if has_runs else values
-
-    def n_runs_of(self, responses: Responses) -> int:
-        """Return the number of runs behind a response."""
-        return self.n_runs
 
     @property
     def on_line(self) -> bool:
         """Whether the points are a quadrature rule of one continuous number."""
         return self._design.on_line
-
-    def refuse_change(self, responses: Responses) -> None:
-        """Raise if the design's own response gives other values now than at the runs."""
-        runs = self._design.runs
-        points = self.points_of(responses.inputs, runs.points)
-        responses.refuse_change(points, runs.values, self.responses)
 
     def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
         """Return a response at any points of the design's inputs by emulators, (n,) or (n, m).
@@ -390,7 +375,7 @@ class ReweightedBound(Bound):
         if emulator is None:
             return []
         if not responses.same_as(self.responses):
-            emulator = self._emulator_of(self._at_runs(responses))
+            emulator = self._sampler.emulator_of(self._design, self._at_runs(responses))
         return [emulator.at(points), *emulator.without_each_block(points)]
 
     def _at_runs(self, responses: Responses) -> Floats:
@@ -421,26 +406,6 @@ class ReweightedBound(Bound):
             responses.runs.users.add(responses.caller)
             self._other_responses.append((responses, replace(runs, values=values)))
         return values
-
-    def _emulator_of(self, at_runs: Floats) -> DesignEmulator:
-        """Return an emulator of another response, fitted to its values at the runs."""
-        design = self._design
-        assert design.emulator is not None
-        runs = replace(design.runs, values=at_runs)
-        emulator = DesignEmulator.fit(self.config.emulator, runs, design.emulator.weights)
-        # With a mixing weight of one half the bias of the emulator is as large as the sampling
-        # error of the runs. The runs get the mixing weight that they have for the design's own
-        # response.
-        most = 0.5
-        share = 1.0 if emulator is None else emulator.run_share
-        if emulator is None or share > most + design.emulator.run_share:
-            raise PoorEmulatorError(
-                f"{self.name}: got a response of the same specimens whose emulator would leave "
-                f"{share:.0%} of a population to the {self.n_runs} runs alone, expected at most "
-                f"{most:.0%} more than for the response of the design; calibrate with "
-                "prb.Reweighted(n, emulator=None), or let one response return both outputs"
-            )
-        return emulator
 
     def _graph_basis(self) -> Basis:
         """Return the basis for compiled graphs; its structure does not change as a design grows."""

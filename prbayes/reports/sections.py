@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -127,12 +127,12 @@ class _Objective:
     compares: str  # sentence on how measured and simulated responses are compared
     standard_errors: str  # what standard errors are those of
     comparable: str  # which models have comparable marginal likelihoods
-    is_named: bool = False  # whether its name depends on the metric
-    sign: float = 1.0  # factor of stored discrepancies
+    is_named: bool  # whether its name depends on the metric
+    sign: float  # factor of stored discrepancies
     # Titles of further columns with values of the results, by variable of the calibration.
-    columns: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, str]
     # Sentences on the width of the draws, by the sampler's adjustment.
-    adjustments: Mapping[str, str] = field(default_factory=dict)
+    adjustments: Mapping[str, str]
 
 
 _DISCREPANCY = _Objective(
@@ -144,6 +144,7 @@ _DISCREPANCY = _Objective(
     "the estimator over repeated sets of as many specimens",
     "with the same metric and epsilon",
     is_named=True,
+    sign=1.0,
     columns={"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"},
     adjustments={
         "estimate": "The posterior is that given the metric's own estimate: prior times density "
@@ -159,7 +160,10 @@ _LOG_LIKELIHOOD = _Objective(
     "population, through the inputs that reproduce it, on an emulator of the response.",
     "the curvature of the log-likelihood",
     "of the same data",
+    is_named=False,
     sign=-1.0,
+    columns={},
+    adjustments={},
 )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -117,20 +117,24 @@ def compare(
     trees = [_tree_of(label, result) for label, result in results.items()]
     read = [estimates_of(tree, model=naming) for tree in trees]
     columns, shown = zip(*read, strict=True)
-    by_label = dict(zip(results, columns, strict=True))
-    shared = _shared_elements(by_label, model, may_rename=None in identities.values())
-    in_table = set.intersection(*map(set, shown))
+    shared = _in_all(columns)
+    if shared and None in identities.values():
+        _report_left_out(columns, shared)
+    if model is not None:
+        variables = [str(variable.name) for variable in model.unobserved_RVs]
+        shared = [name for name in shared if variable_of(name, variables) in variables]
+    in_table = _in_all(shown)
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
-        raise _nothing_shared(by_label, model)
-    table = np.array([[column[name] for name in names] for column in columns])
-    estimates, sds = table[..., 0], table[..., 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
-        shift = (estimates - estimates[0]) / sds
-    shift[0] = 0.0
-    dims = ["result", "hyperparameter"]
-    data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_ESTIMATE)}
-    data["shift"] = (dims, shift)
+        got = dict(zip(results, columns, strict=True))
+        if model is not None:
+            got["the model"] = variables
+        texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
+        raise ValueError(
+            f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
+            "names"
+        )
+    data = _estimates(np.array([[column[name] for name in names] for column in columns]))
     for key in COSTS:
         costs = [float(estimates_in(tree).attrs.get(key, np.nan)) for tree in trees]
         data[key] = ("result", costs)
@@ -176,36 +180,29 @@ def _refuse_wrong(results: Any, metrics: Any) -> None:
         )
 
 
-def _shared_elements(
-    columns: Mapping[str, Mapping[str, Any]], model: pm.Model | None, *, may_rename: bool
-) -> list[str]:
-    """Return the elements that all results have, restricted to the variables of a model.
+def _in_all(columns: Sequence[Iterable[str]]) -> list[str]:
+    """Return the elements that all results have, in the order of the first one."""
+    in_all = set.intersection(*map(set, columns))
+    return [name for name in columns[0] if name in in_all]
 
-    Elements that are left out are reported if other tools may have renamed variables.
-    """
-    first, *_ = columns.values()
-    in_all = set.intersection(*map(set, columns.values()))
-    shared = [name for name in first if name in in_all]
-    left_out = [name for column in columns.values() for name in column if name not in in_all]
-    if left_out and shared and may_rename:
+
+def _estimates(table: Floats) -> dict[str, Any]:
+    """Return variables with estimates, (results, elements, 4), and shifts from the first result."""
+    estimates, sds = table[..., 0], table[..., 1]
+    with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
+        shift = (estimates - estimates[0]) / sds
+    shift[0] = 0.0
+    variables = {key: table[..., i] for i, key in enumerate(_ESTIMATE)} | {"shift": shift}
+    return {key: (["result", "hyperparameter"], values) for key, values in variables.items()}
+
+
+def _report_left_out(columns: Sequence[Iterable[str]], shared: Sequence[str]) -> None:
+    """Report elements that not all results have, as other tools may have renamed variables."""
+    left_out = [name for column in columns for name in column if name not in shared]
+    if left_out:
         listed = ", ".join(dict.fromkeys(left_out))
         text = f"compare: left out {listed:.300}, as not all results have these names."
         report(Finding("names-differ", text))
-    if model is None:
-        return shared
-    variables = [str(variable.name) for variable in model.unobserved_RVs]
-    return [name for name in shared if variable_of(name, variables) in variables]
-
-
-def _nothing_shared(columns: Mapping[str, Mapping[str, Any]], model: pm.Model | None) -> ValueError:
-    """Return the error that the results, and the model, have no hyperparameter in common."""
-    got = {label: list(column) for label, column in columns.items()}
-    if model is not None:
-        got["the model"] = [str(variable.name) for variable in model.unobserved_RVs]
-    texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
-    return ValueError(
-        f"compare: got results that share no hyperparameter ({texts:.500}), expected the same names"
-    )
 
 
 class Comparison(Table):
