@@ -68,7 +68,7 @@ class Preparation:
     # (S, p): posterior draws at which the estimates from both halves of the points agree.
     thetas: Floats
     findings: tuple[Finding, ...]  # findings about the data and the runs, before the fit
-    # Share of a population with a response, if some populations have a smaller share than one.
+    # Share of a population with a response; None if it hardly changes the log-likelihood.
     share: ResponseShare | None = None
 
 

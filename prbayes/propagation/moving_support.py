@@ -91,7 +91,7 @@ def refuse_moving_atoms(
     number = population.max() + 1
     for dist, x in zip(inputs.aleatory, points, strict=True):
         if not dist.dtype.startswith("float"):
-            # Discrete inputs with a moving support are refused elsewhere; others may repeat values.
+            # A moving support of discrete inputs is refused above; other values may repeat.
             continue
         for column in x.reshape(len(x), -1).T:
             _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)

@@ -50,8 +50,8 @@ from prbayes.response.response import (
     deduplicated_responses,
 )
 
-# Largest number of elements of a basis in a compiled graph, 1 GiB, for the largest design. Graphs
-# that call Python instead of using a basis are as fast, but JAX cannot compile the calls.
+# Largest number of elements of a basis in a compiled graph, 1 GiB, for the largest design. Above
+# this size metrics take a smaller form, which is as fast, but whose operations JAX cannot compile.
 _MAX_BASIS = 1 << 27
 
 
