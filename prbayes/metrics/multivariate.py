@@ -77,7 +77,7 @@ class CompositeDiscrepancy(Discrepancy):
             values, index = part.observed_of(observed)
             part_weights = w[..., index]
             has_specimens[..., k] = part_weights.sum(axis=-1) > 0
-            if not index.size:  # values without weight, which do not count
+            if not index.size:  # no specimen has values: use any values, with weight zero
                 values = part.target.observed
                 part_weights = np.zeros((*batch, len(values)))
             part_weights = np.where(has_specimens[..., k, None], part_weights, 1.0)

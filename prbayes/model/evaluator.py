@@ -530,7 +530,7 @@ VISIBLE = Requirement(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 class Shortcoming:
     """Requirements that a design does not meet for populations."""
 
-    text: str  # what was got and expected, as the end of a sentence
+    text: str  # end of a sentence: what was got, and what was expected
     is_lost: bool  # whether the shortcoming is too much weight on points without response
 
     def __str__(self) -> str:

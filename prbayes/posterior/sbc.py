@@ -214,7 +214,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and variables outside of it."""
     from arviz_stats.ecdf_utils import ecdf_pit
 
-    prob = 0.95  # that of ArviZ's own pictures of ranks
+    prob = 0.95  # the probability in ArviZ's own pictures of ranks
     ecdfs, outside = {}, []
     values = {name: variable[0] for name, variable in ranks.data_vars.items()}
     for name, column in split_elements(values).items():

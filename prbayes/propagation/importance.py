@@ -226,7 +226,7 @@ SIZES = EmulatedSizes()
 class Sample:
     """Points with their responses and proposal density, for importance weights."""
 
-    points: tuple[Floats, ...]  # (n, *event), by aleatory input
+    points: tuple[Floats, ...]  # (n, *event): points, an array for each aleatory input
     values: Floats  # (n,) or (n, m): responses; NaN without a response
     log_density: Floats  # (n,): log-density of the mixture that the points were drawn from
     blocks: NDArray[np.intp]  # (n,): index of the batch, of eight, that each point belongs to

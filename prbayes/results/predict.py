@@ -481,7 +481,7 @@ class _Predicted:
     # an axis after the populations
     values: Floats
     specimens: list[Floats]  # aleatory inputs, (k, n, *event) each
-    source: str  # how specimens were made
+    source: str  # text on how the specimens were made
     error: Floats | None = None  # error of the emulator by output, (m,)
 
 
