@@ -284,29 +284,15 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         points, proposals, draws = specimen_points(data, emulation, population)
     else:
         emulation, points, proposals, draws = emulate(runs, data, emulation)
-    findings = tuple(_preparation_findings(likelihood, emulation, points, proposals))
-    return Preparation(emulation, points, proposals, draws.thetas, findings)
-
-
-def _preparation_findings(
-    likelihood: SpecimenLikelihood,
-    emulation: Emulation,
-    points: SpecimenPoints,
-    proposals: Proposals,
-) -> list[Finding]:
-    """Return findings about the data, and about the emulator at the specimens' likely inputs."""
     name, readings, error = likelihood.name, likelihood.readings, emulation.error
-    return [
-        *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
-        *misfit_findings(
-            name,
-            readings,
-            proposals.modes,
-            error,
-            gross_errors=likelihood.measurements[0].gross_errors is not False,
-        ),
+    several_roots = bool((points.n_roots > 1).any())
+    gross_errors = likelihood.measurements[0].gross_errors is not False
+    findings = (
+        *_data_findings(likelihood, emulation.y, several_roots=several_roots),
+        *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error),
-    ]
+    )
+    return Preparation(emulation, points, proposals, draws.thetas, findings)
 
 
 def _data_findings(

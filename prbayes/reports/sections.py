@@ -507,20 +507,6 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
 
 def specimens(m: Material) -> list[Section]:
     """Return measured values and u-values of the specimens of the test, at most a page."""
-    rows = _measured_rows(m)
-    if not rows:
-        return []
-    about = (
-        "u is the share of the predicted responses below the measured one: a specimen with a u "
-        "near 0 or 1 is at the edge of the prediction."
-    )
-    if len(rows) > 40:
-        about += f" The first 40 of {len(rows)} values are shown."
-    return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
-
-
-def _measured_rows(m: Material) -> list[dict[str, Any]]:
-    """Return a row for each specimen and output of the validation data."""
     rows = []
     for condition, tested in m.validation.items():
         labels = _specimen_labels(condition, len(tested.measured), m)
@@ -532,7 +518,15 @@ def _measured_rows(m: Material) -> list[dict[str, Any]]:
                 {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
                 for label, value, u in zip(labels, values, us, strict=True)
             ]
-    return rows
+    if not rows:
+        return []
+    about = (
+        "u is the share of the predicted responses below the measured one: a specimen with a u "
+        "near 0 or 1 is at the edge of the prediction."
+    )
+    if len(rows) > 40:
+        about += f" The first 40 of {len(rows)} values are shown."
+    return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
 
 
 def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
