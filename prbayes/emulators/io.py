@@ -29,6 +29,7 @@ class SavedSurrogate:
     """The contents of a file."""
 
     fields: dict[str, Any]  # fields of the `Surrogate`
+    outputs: Outputs | None  # names of the outputs, if they have names
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
     follows_coarse: bool  # whether the surface follows a coarse response
@@ -39,7 +40,7 @@ def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
-    names = surrogate._named
+    names = surrogate._surface.outputs
     model = surrogate.model
     settings = asdict(model) if isinstance(model, _SHIPPED) else {}
     configuration = {
@@ -98,10 +99,9 @@ def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
             "outside": Abort() if outside is None else Replace(float(outside)),
             "noise": config["noise"],
             "n_runs": config["n_runs"],
-            "_named": outputs,
         }
         follows_coarse = config.get("joined") is not None
-        return SavedSurrogate(fields, kind, model, follows_coarse, data["probes"].values)
+        return SavedSurrogate(fields, outputs, kind, model, follows_coarse, data["probes"].values)
     # A damaged file may raise any error of the libraries that read it.
     except Exception as error:
         raise StoreError(

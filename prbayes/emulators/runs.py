@@ -14,7 +14,7 @@ from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surrogate import Surrogate, with_output_labels
+from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
@@ -225,7 +225,7 @@ def continued(runs: Runs, *inputs: ArrayLike) -> Any:
     columns, batch = domain.columns(inputs)
     unit = domain.scaled(columns)
     inner = np.clip(unit, 0, 1)
-    values = surrogate._at(domain.at(inner))
+    values = values_inside(surrogate, domain.at(inner))
     rows = np.flatnonzero(domain.outside(columns).any(axis=1))
     _, jacobian = surrogate._surface.emulator(inner[rows])
     change = np.einsum("kmd,kd->km", jacobian, unit[rows] - inner[rows])

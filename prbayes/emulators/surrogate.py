@@ -61,6 +61,8 @@ class DesignSurface:
     # The coarse response that the surface follows, and the emulator that has it as an input.
     coarse: Callable[..., Any] | None = None
     follower: Follower | None = None
+    # Names of the outputs if the response returns a mapping, else None.
+    outputs: Outputs | None = None
 
     @classmethod
     def of(
@@ -203,8 +205,6 @@ class Surrogate(Shown):
     coarse: Callable[..., Any] | None = None
     # A list that is empty until the first warning of points outside the ranges.
     _warned: list[bool] = field(repr=False, default_factory=list)
-    # Names of the outputs if the response returns a mapping, else None.
-    _named: Outputs | None = field(repr=False, default=None)
     _surface: DesignSurface = field(repr=False, kw_only=True)
 
     @classmethod
@@ -338,11 +338,10 @@ class Surrogate(Shown):
             *(domain, design, responses, model, outside, tally.computed),
             error=CrossValidation(residuals, _spread(responses[surface.usable])),
             coarse=surface.coarse,
-            _named=tally.named,
-            _surface=surface,
+            _surface=replace(surface, outputs=tally.named),
         )
         if predictive is not None:
-            values = surrogate._at(predictive)
+            values = values_inside(surrogate, predictive)
             error = CrossValidation(residuals, _spread(values[_usable(values)]))
             surrogate = replace(surrogate, error=error)
         _log.info(
@@ -421,8 +420,7 @@ class Surrogate(Shown):
         return cls(
             *(domain, design, values, models[best], outside, 0),
             error=CrossValidation(surfaces[best].left_out, spread),
-            _named=table.labels,
-            _surface=surfaces[best],
+            _surface=replace(surfaces[best], outputs=table.labels),
         )
 
     @property
@@ -444,7 +442,7 @@ class Surrogate(Shown):
         labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
         columns = [
             *column_names(self.names, [r.size for r in self.domain.inputs]),
-            *(labels if self._named is None else self._named.names),
+            *(labels if self._surface.outputs is None else self._surface.outputs.names),
         ]
         return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
 
@@ -481,7 +479,7 @@ class Surrogate(Shown):
         bad = is_outside.any(axis=1)
         event = self.responses.shape[1:]
         values = np.full((len(columns), *event), np.nan)
-        values[~bad] = self._at(columns[~bad])
+        values[~bad] = values_inside(self, columns[~bad])
         if bad.any():
             text = f"surrogate: {self.domain.complaint(columns, is_outside)}"
             if isinstance(self.outside, Abort):
@@ -613,29 +611,33 @@ class Surrogate(Shown):
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
                 f"settings (and a fixed random seed){and_coarse}"
             )
+        surface = replace(surface, outputs=saved.outputs)
         return cls(**fields, model=model, coarse=coarse, _surface=surface)
 
-    def _at(self, columns: Floats) -> Floats:
-        """Return values at points inside the ranges, (n,)."""
-        if not len(columns):
-            return np.empty((0, *self.responses.shape[1:]))
-        values = self._surface(columns)
-        if self.noise is not None:
-            # Add one of the k nearest residuals, with either sign, selected by a hash of the input.
-            residuals = self._surface.nearby(self.error.residuals, columns)
-            n, k = residuals.shape[:2]
-            number, sign = np.divmod(hashed_rows(columns, self.noise), np.uint64(2))
-            place = (number % np.uint64(k)).astype(np.intp)
-            signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
-            values = values + residuals[np.arange(n), place] * signs
-        unit = self.domain.scaled(columns)
-        return with_failures(values, unit, self._surface.unit, self.responses)
+
+def values_inside(surrogate: Surrogate, columns: Floats) -> Floats:
+    """Return the values of a surrogate at points inside its ranges, (n,) or (n, m)."""
+    surface = surrogate._surface
+    if not len(columns):
+        return np.empty((0, *surface.event))
+    values = surface(columns)
+    if surrogate.noise is not None:
+        # Add one of the k nearest residuals, with either sign, selected by a hash of the input.
+        residuals = surface.nearby(surrogate.error.residuals, columns)
+        n, k = residuals.shape[:2]
+        number, sign = np.divmod(hashed_rows(columns, surrogate.noise), np.uint64(2))
+        place = (number % np.uint64(k)).astype(np.intp)
+        signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
+        values = values + residuals[np.arange(n), place] * signs
+    unit = surrogate.domain.scaled(columns)
+    return with_failures(values, unit, surface.unit, surrogate.responses)
 
 
 def with_output_labels(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
     """Return values of rows in the shape of a batch, with the labels of the outputs."""
     values = values.reshape((*batch, *surrogate.responses.shape[1:]))
-    return values if surrogate._named is None else surrogate._named.by_key(values)
+    outputs = surrogate._surface.outputs
+    return values if outputs is None else outputs.by_key(values)
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:

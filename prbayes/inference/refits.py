@@ -25,7 +25,7 @@ from prbayes.inference.asymptotics import (
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
 from prbayes.metrics.density import is_differentiable
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 from prbayes.numerics.batched_minimisers import Descent, descend, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 from prbayes.numerics.threads import one_thread
@@ -520,7 +520,7 @@ def refit_obstacle(evaluator: Evaluator) -> str | None:
     obstacle = sampling_obstacle(evaluator) or summary_obstacle(evaluator)
     if obstacle is None and evaluator.emulated:
         return "the model has a log-likelihood by specimen"
-    if obstacle is None and evaluator.other_terms:
+    if obstacle is None and has_other_terms(evaluator.model):
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle
 

@@ -92,8 +92,6 @@ class Evaluator:
     # Designs with stored runs by the simulator's name.
     reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)
     responses_per_theta: int = field(init=False)  # number of scalar responses of one theta
-    # Observed variables without a metric of distributions, and potentials.
-    other_terms: list[Any] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the simulators and the model."""
@@ -103,7 +101,6 @@ class Evaluator:
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
             responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
-            other_terms=[*_ordinary(self.model), *self.model.potentials],
         )
 
     @classmethod
@@ -248,14 +245,6 @@ class Evaluator:
 
         return counted
 
-    def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
-        """Return an evaluator of the same model with other prepared metrics, by simulator."""
-        if len(targets) > 1:
-            targets = [with_unbiased_areas(target) for target in targets]
-        pairs = zip(self.nodes, targets, strict=True)
-        changed = tuple(replace(node, target=target) for node, target in pairs)
-        return replace(self, nodes=changed, has_graph=False)
-
     def observing(
         self,
         data: dict[str, Floats],
@@ -275,7 +264,7 @@ class Evaluator:
                 counted = node.weights
             target = (metric or node.metric).against(observed, counted)
             targets.append(target.metric.for_inputs(target, node.bound.inputs.dimensions))
-        return self.with_targets(common_targets(self.nodes, targets))
+        return with_targets(self, common_targets(self.nodes, targets))
 
     def parents(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
@@ -327,7 +316,21 @@ def _unpickled(payload: bytes) -> Evaluator:
 
     model, targets = cloudpickle.loads(payload)
     evaluator = Evaluator.of(model)
-    return evaluator if targets is None else evaluator.with_targets(targets)
+    return evaluator if targets is None else with_targets(evaluator, targets)
+
+
+def with_targets(evaluator: Evaluator, targets: list[Discrepancy]) -> Evaluator:
+    """Return an evaluator of the same model with other prepared metrics, by simulator."""
+    if len(targets) > 1:
+        targets = [with_unbiased_areas(target) for target in targets]
+    pairs = zip(evaluator.nodes, targets, strict=True)
+    changed = tuple(replace(node, target=target) for node, target in pairs)
+    return replace(evaluator, nodes=changed, has_graph=False)
+
+
+def has_other_terms(model: pm.Model) -> bool:
+    """Return whether a model has terms other than metrics of distributions, and priors."""
+    return bool(_ordinary(model) or model.potentials)
 
 
 def _ordinary(model: pm.Model) -> list[Any]:

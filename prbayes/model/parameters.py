@@ -137,14 +137,6 @@ class Hyperparameters:
         graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
         return self.compile([*(term.sum() for term in terms), *graphs])
 
-    def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
-        """Return the log-density of each free variable in the user's own units, shapes (P,)."""
-        values = self._log_prior(np.ascontiguousarray(thetas))[:-1]
-        return {
-            str(rv.name): np.array(np.broadcast_to(value, len(thetas)))
-            for rv, value in zip(self.model.free_RVs, values, strict=True)
-        }
-
     def log_prior(self, thetas: Floats) -> Floats:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
         values = self._log_prior(np.ascontiguousarray(thetas))
@@ -264,6 +256,15 @@ class Hyperparameters:
             return self.prior_thetas(size, seed)
         thetas = self.thetas_of(self.quantiles(sobol(size, self.quantiles.size, seed)))
         return np.where(np.isfinite(thetas), thetas, self.initial)
+
+
+def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+    """Return the log-density of each free variable in the user's own units, shapes (P,)."""
+    values = hyperparameters._log_prior(np.ascontiguousarray(thetas))[:-1]
+    return {
+        str(rv.name): np.array(np.broadcast_to(value, len(thetas)))
+        for rv, value in zip(hyperparameters.model.free_RVs, values, strict=True)
+    }
 
 
 def fixed_values(model: pm.Model) -> dict[str, Floats]:

@@ -33,6 +33,7 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import (
     Evaluator,
+    has_other_terms,
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
@@ -402,7 +403,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.settings.prior or evaluator.other_terms:
+    elif len(scales) > 1 or search.settings.prior or has_other_terms(evaluator.model):
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales

@@ -30,7 +30,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
-from prbayes.model.parameters import variables_at
+from prbayes.model.parameters import log_prior_terms, variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import by_simulator, simulator_records
@@ -186,7 +186,7 @@ def arviz_groups(evaluator: Evaluator, chains: Chains, seed: int | None) -> dict
     rng = np.random.default_rng(seed)
     prior_seed = int(rng.integers(2**31))
     prior = evaluator.hyperparameters.prior_thetas(n_draws, prior_seed)[None]
-    log_priors = evaluator.hyperparameters.log_prior_terms(thetas.reshape(-1, d))
+    log_priors = log_prior_terms(evaluator.hyperparameters, thetas.reshape(-1, d))
     coords = {"chain": np.arange(n_chains), "draw": np.arange(n_draws)}
     variables = {
         name: (["chain", "draw"], values.reshape(n_chains, n_draws))

@@ -19,7 +19,7 @@ from prbayes._validate import Floats, Seed, executes, flag, positive_integer, se
 from prbayes.inference.refits import summary_obstacle
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -120,7 +120,7 @@ def simulation_based_calibration(
     obstacle = simulation_obstacle(evaluator)
     if evaluator.nodes:
         obstacle = summary_obstacle(evaluator)
-        if obstacle is None and evaluator.other_terms:
+        if obstacle is None and has_other_terms(model):
             raise ValueError(
                 "simulation_based_calibration: got a model with likelihood terms or potentials "
                 "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes "
