@@ -323,7 +323,7 @@ class Joint(Metric):
     def _prepare_outputs(
         self, observed: Floats, weights: Floats, n_inputs: int | None = None
     ) -> Discrepancy:
-        """Return the mean over directions, for each set of outputs that specimens have."""
+        """Return the mean discrepancy over projections, for each set of measured outputs."""
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []
