@@ -118,7 +118,7 @@ def model(m: Material) -> list[Section]:
 
 
 @dataclass(frozen=True)
-class _Objective:
+class _ObjectiveTexts:
     """What the sections say of the function that calibrations minimise, or maximise."""
 
     name: str
@@ -135,7 +135,7 @@ class _Objective:
     adjustments: Mapping[str, str]
 
 
-_DISCREPANCY = _Objective(
+_DISCREPANCY = _ObjectiveTexts(
     "discrepancy",
     "Metric and epsilon",
     "Of a posterior the mean discrepancy over its draws is shown.",
@@ -152,7 +152,7 @@ _DISCREPANCY = _Objective(
         "none": "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's.",
     },
 )
-_LOG_LIKELIHOOD = _Objective(
+_LOG_LIKELIHOOD = _ObjectiveTexts(
     "log-likelihood",
     "Log-likelihood",
     "Runs are those of the emulator. Of a posterior the mean over its draws is shown.",
@@ -167,7 +167,7 @@ _LOG_LIKELIHOOD = _Objective(
 )
 
 
-def _objective(m: Material) -> _Objective:
+def _objective_texts(m: Material) -> _ObjectiveTexts:
     """Return what the sections say of the objective of all calibrations."""
     return _LOG_LIKELIHOOD if m.is_by_specimen else _DISCREPANCY
 
@@ -177,7 +177,7 @@ def comparison_of_responses(m: Material) -> list[Section]:
     if not (m.calibrations or m.description["simulators"]):
         return []
     labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
-    objective = _objective(m)
+    objective = _objective_texts(m)
     text = [objective.compares]
     if m.sheets and len(m.sheets) == len(metrics_of(m)):
         text = ["The likelihood is the density of the statistics of the data sheet."]
@@ -248,7 +248,7 @@ def failures(m: Material) -> list[Section]:
 
 def metric(m: Material) -> list[Section]:
     """Return the discrepancies and epsilons of the results, or their log-likelihoods."""
-    objective = _objective(m)
+    objective = _objective_texts(m)
     rows: list[dict[str, Any]] = []
     for label, calibration in m.calibrations.items():
         sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
@@ -291,7 +291,7 @@ def optima(m: Material) -> list[Section]:
             for mode in m.live_optima[label].local_optima:
                 place = labelled(evaluator, mode["point"], {}).data_vars
                 text.append(_other_optimum(mode, place, names))
-        text.append(f"Standard errors are those of {_objective(m).standard_errors}.")
+        text.append(f"Standard errors are those of {_objective_texts(m).standard_errors}.")
         rows = []
         for name in names:
             value, stderr, *_ = estimates[name]
@@ -323,7 +323,7 @@ def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Seq
 
 def posteriors(m: Material) -> list[Section]:
     """Return a section for each posterior."""
-    sections, objective = [], _objective(m)
+    sections, objective = [], _objective_texts(m)
     for label, tree in m.posteriors.items():
         posterior = tree["posterior"]
         chains = counted(int(posterior.sizes["chain"]), "chain")

@@ -105,7 +105,7 @@ def compare(
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
-    _refuse_wrong(results, metrics)
+    _refuse_wrong_arguments(results, metrics)
     identities = {label: identity_in(result) for label, result in results.items()}
     try:
         identity = require_together(identities, "compare", model=model)
@@ -134,7 +134,7 @@ def compare(
             f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
             "names"
         )
-    data = _estimates(np.array([[column[name] for name in names] for column in columns]))
+    data = _estimate_variables(np.array([[column[name] for name in names] for column in columns]))
     for key in COSTS:
         costs = [float(estimates_in(tree).attrs.get(key, np.nan)) for tree in trees]
         data[key] = ("result", costs)
@@ -158,7 +158,7 @@ def compare(
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-def _refuse_wrong(results: Any, metrics: Any) -> None:
+def _refuse_wrong_arguments(results: Any, metrics: Any) -> None:
     """Raise if there are no results, or an argument has a wrong type."""
     for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
         refuse_model(result, "compare: results")
@@ -186,7 +186,7 @@ def _in_all(columns: Sequence[Iterable[str]]) -> list[str]:
     return [name for name in columns[0] if name in in_all]
 
 
-def _estimates(table: Floats) -> dict[str, Any]:
+def _estimate_variables(table: Floats) -> dict[str, Any]:
     """Return variables with estimates, (results, elements, 4), and shifts from the first result."""
     estimates, sds = table[..., 0], table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
