@@ -364,7 +364,7 @@ class _Question:
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
-        count, n_runs = sample.responses.count, sample.n_runs
+        count, n_runs = sample.responses.count, sample.design.n_runs
         return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
     def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:

@@ -130,7 +130,7 @@ def p_box(
     y = _evaluation_points(samples)
     n_searched = 0
     if len(places) > 1:
-        respond = CentralSpecimens(populations, response, output, samples[0].n_runs)
+        respond = CentralSpecimens(populations, response, output, samples[0].design.n_runs)
         # Limits beyond all responses lead to the places with the most extreme responses.
         limits = [2 * y[0] - y[-1], np.median(y), 2 * y[-1] - y[0]]
         extremes = extreme_places(inputs, places, respond, limits)
@@ -199,7 +199,7 @@ class ProbabilityBox(Table):
 
 
 def _place(function: Floats, y: Floats, probability: float) -> float:
-    """Return where a distribution function (m,) reaches a probability; infinite beyond y."""
+    """Return the quantile of a distribution function given at y, (m,); infinite beyond y."""
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 

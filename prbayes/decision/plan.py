@@ -539,7 +539,7 @@ def _validated_counts(k: object) -> list[int]:
 
 
 def _refuse_candidates(candidates: object) -> None:
-    """Raise if candidates are no conditions by name."""
+    """Raise if candidates are no mapping of names to conditions."""
     advice = 'such as {"later": prb.decision.Condition(response, x)}'
     if not isinstance(candidates, Mapping) or not candidates:
         raise TypeError(

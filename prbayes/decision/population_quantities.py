@@ -40,8 +40,8 @@ class Element:
     name: str
     unit: str
     groups: Groups | None
-    # numbers by quantity, (groups, k), or (1, k) without groups. The first population of an optimum
-    # is its own.
+    # Values by the name of a quantity, (groups, k), or (1, k) without groups. If the result is an
+    # optimum, the first of the k populations is that of the optimum.
     numbers: dict[str, Floats]
     findings: tuple[Finding, ...] = ()
 

@@ -28,7 +28,7 @@ from prbayes.decision.quantities import (
 )
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
-from prbayes.model.emulated import EmulatedSample
+from prbayes.model.emulated import EmulatedSample, EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
@@ -152,11 +152,24 @@ class Populations:
             )
         k = simulators.index(simulator)
         if k not in self._designs:
-            parents = self.evaluator.parents(self.thetas, k)
-            self._designs[k] = simulator.weighted_sample(parents)
+            if isinstance(simulator, EmulatedSimulator):
+                parents = self.evaluator.parents(self.thetas, k)
+                self._designs[k] = EmulatedSample.of(simulator, parents)
+            elif simulator.reweighted is not None:
+                self._designs[k] = simulator.reweighted
         design = self._designs[k]
         sample = ResponseSample(self, k, design, responses, design.values_of(responses), None)
-        sample.refuse_unsupported()
+        parents = sample.parents(self.thinned())
+        if design.has_runs:
+            refuse_unsupported(responses.name, design, parents)
+        else:
+            design.refuse_unsupported(responses.name, parents)
+        if sample.lost > design.max_lost:
+            raise DesignError(
+                f"{responses.name}: lost mass: got {sample.lost:.1%} of a population's weight on "
+                f"points whose response is NaN, expected at most {design.max_lost:.1%}; repair "
+                "it, or return +inf for specimens that fail"
+            )
         return sample
 
 
@@ -200,11 +213,6 @@ class ResponseSample:
     def values(self) -> Floats:
         """The responses in ascending order, (n,)."""
         return self.select(self.outputs)[self._order]
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs behind the responses."""
-        return self.design.n_runs_of(self.responses)
 
     @cached_property
     def blocks(self) -> Indices:
@@ -276,20 +284,6 @@ class ResponseSample:
         weights = self.masses(self.populations.thinned())
         return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
 
-    def refuse_unsupported(self) -> None:
-        """Raise if the design does not support the populations, or too many responses are NaN."""
-        parents = self.parents(self.populations.thinned())
-        if self.design.has_runs:
-            refuse_unsupported(self.responses.name, self.design, parents)
-        else:
-            self.design.refuse_unsupported(self.responses.name, parents)
-        if self.lost > self.design.max_lost:
-            raise DesignError(
-                f"{self.responses.name}: lost mass: got {self.lost:.1%} of a population's weight "
-                f"on points whose response is NaN, expected at most {self.design.max_lost:.1%}; "
-                "repair it, or return +inf for specimens that fail"
-            )
-
     def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
         """Return findings, and the error of the quantity at the centre.
 
@@ -339,7 +333,7 @@ class ResponseSample:
         tails *= min(quantity.probability, 1 - quantity.probability) / share
         ends = ascending_quantile(self.values, weights, 1 - tails if is_upper else tails)
         error = float(np.abs(ends - value).max())
-        if self.design.is_continued:
+        if not self.design.has_runs:
             error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
         return findings, error
 
@@ -361,7 +355,7 @@ def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
 
 def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
     """Return a finding if the constant response beyond the runs limits a quantity."""
-    if not sample.design.is_continued:
+    if sample.design.has_runs:
         return ()
     thetas = sample.populations.thinned()
     change = standard_deviation(_range_effect(sample, quantity, thetas)) / 2

@@ -18,8 +18,8 @@ from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
 from prbayes.numerics.threads import one_thread
 
-# Surfaces that compete. Quadratic trends save runs of smooth responses with many inputs; a Matern
-# process is better for kinks and jumps.
+# Surfaces among which cross-validation selects. Quadratic trends save runs of smooth responses with
+# many inputs; a Matern process is better for kinks and jumps.
 CANDIDATES: tuple[Surface, ...] = (GaussianProcess(degree=2), RadialBasis("quintic", degree="best"))
 ROUGH_CANDIDATES: tuple[Surface, ...] = (
     GaussianProcess(),
@@ -35,17 +35,18 @@ class Emulator:
     With more than six outputs the surfaces are those of principal components.
     """
 
-    z: Floats  # (n, d): runs
-    left_out: Floats  # (n, m): error at each run of the surface through all others
+    z: Floats  # (n, d): inputs of the runs
+    left_out: Floats  # (n, m): cross-validation error of each output at each run
     center: Floats  # (m,): mean of the outputs
     unit: Floats  # (m,): spread of the outputs
-    components: Floats | None  # (c, m): principal components; None if surfaces are of outputs
-    surfaces: tuple[FittedSurface, ...]  # of each output or component
+    # (c, m): principal components of the outputs; None if each output has a surface.
+    components: Floats | None
+    surfaces: tuple[FittedSurface, ...]  # surface of each output, or of each principal component
 
     def __call__(self, z: Floats, columns: NDArray[np.intp] | None = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
 
-        Those of the outputs in ``columns``, (k, c), of each point.
+        With ``columns``, (k, c), they are those of the outputs listed in the row of each point.
         """
         parts, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
         values, jacobian = np.stack(parts, axis=1), np.stack(slopes, axis=1)
@@ -131,7 +132,7 @@ def fit_emulator(
     components, scores = None, scaled.T
     if y.shape[1] > 6:
         u, sizes, components = np.linalg.svd(scaled, full_matrices=False)
-        # Scores and components of unit spread, as the outputs.
+        # Scores and components are scaled, so that scores have unit spread, as scaled outputs have.
         scores, components = np.sqrt(n) * u.T, (sizes / np.sqrt(n))[:, None] * components
     surfaces: list[FittedSurface] = []
     left_out, rest = np.zeros_like(y), scaled
@@ -143,13 +144,13 @@ def fit_emulator(
             raise np.linalg.LinAlgError(
                 f"interpolation: got {n} points that determine no surface of {z.shape[1]} inputs"
             )
-        # A surface alone needs no left-out errors to be selected.
+        # A single candidate is taken without its cross-validation error, which would take time.
         best = min(solved, key=lambda fit: fit.error) if len(solved) > 1 else solved[0]
         surfaces.append(best)
         if components is None:
             left_out[:, k] = best.left_out
             continue
-        # Further components do not matter if what they add is far below the left-out errors.
+        # Further components can be left out if they add far less than the cross-validation errors.
         rest = rest - output[:, None] * components[k]
         left_out += best.left_out[:, None] * components[k]
         error = np.sqrt(weights @ left_out**2)

@@ -28,8 +28,8 @@ class Follower:
     """An emulator of one output, with a coarse response as its last input."""
 
     rows: NDArray[np.bool_]  # (n,): runs with a finite coarse response, used in the fit
-    center: float  # of the coarse response
-    unit: float  # gives the coarse response the spread of the inputs
+    center: float  # location of the coarse response
+    unit: float  # scale of the coarse response; after scaling it has the spread of the inputs
     emulator: Emulator
 
     def values(self, z: Floats, coarse: Floats) -> Floats:
@@ -49,14 +49,15 @@ def fit_follower(
     rows = np.isfinite(coarse)
     if 2 * rows.sum() < 3 * max(model.terms(z.shape[1] + 1) for model in tried):
         return None
-    # The coarse response has the place and spread of the inputs.
+    # Scale the coarse response to the location and spread of the inputs.
     unit = float(coarse[rows].std() / z[rows].std(axis=0).mean()) or 1.0
     center = float(coarse[rows].mean() - z[rows].mean() * unit)
     points = np.column_stack([z[rows], (coarse[rows] - center) / unit])
     emulator = fit_emulator(points, y[rows, None], tried=tried)
     error = (emulator.left_out**2).sum()
     alone = (left_out[rows] ** 2).sum()
-    # The gain must exceed rounding and chance.
+    # The coarse response has to reduce the squared error by a tenth, which excludes chance, and the
+    # error without it has to exceed rounding.
     if error > 0.9 * alone or alone < 1e-18 * rows.sum() * y.var():
         return None
     return Follower(rows, center, unit, emulator)

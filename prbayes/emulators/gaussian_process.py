@@ -112,7 +112,7 @@ class GaussianProcess(KernelSurface):
         degrees = possible or [0]
         fit = partial(fit_kriging, z, y, weights, self.kernel)
         if self.lengths is not None and self.nugget is not None:
-            # Larger nuggets where the matrix is singular with this one.
+            # If the matrix is singular with the given nugget, larger ones are tried.
             nuggets = [self.nugget, *(x for x in (1e-13, 1e-11, 1e-9) if x > self.nugget)]
             lengths = np.array(self.lengths)
             fits = (fit(lengths, degrees, [nugget]) for nugget in nuggets)

@@ -28,10 +28,11 @@ _SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
 class SavedSurrogate:
     """The contents of a file."""
 
-    fields: dict[str, Any]  # of the surrogate
+    fields: dict[str, Any]  # fields of the `Surrogate`
+    outputs: Outputs | None  # names of the outputs, if they have names
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
-    follows_coarse: bool  # whether it follows a coarse response
+    follows_coarse: bool  # whether the surface follows a coarse response
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
@@ -39,7 +40,7 @@ def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
-    names = surrogate._named
+    names = surrogate._surface.outputs
     model = surrogate.model
     settings = asdict(model) if isinstance(model, _SHIPPED) else {}
     configuration = {
@@ -48,7 +49,7 @@ def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -
             for r in surrogate.domain.inputs
         ],
         "model": {"kind": type(model).__name__, **settings},
-        # As text: JSON has no NaN.
+        # The value is stored as text, because JSON has no NaN.
         "outside": str(surrogate.outside.value) if hasattr(surrogate.outside, "value") else None,
         "noise": surrogate.noise,
         "n_runs": surrogate.n_runs,
@@ -77,7 +78,7 @@ def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
         with xr.open_dataset(path, engine="h5netcdf") as data:
             data.load()
         config = json.loads(data.attrs["configuration"])
-        # JSON has lists for tuples.
+        # JSON has turned tuples into lists.
         kind = config["model"].pop("kind")
         settings = {k: tuple(x) if isinstance(x, list) else x for k, x in config["model"].items()}
         model = next((cls(**settings) for cls in _SHIPPED if cls.__name__ == kind), None)
@@ -87,7 +88,7 @@ def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
         if outputs is not None:
             keys = [(str(key), None if size is None else int(size)) for key, size in outputs]
             outputs = outputs_of_keys(keys)
-            if not keys:  # labels that are numbers
+            if not keys:  # the labels are numbers
                 dim, *labels = config["labels"]
                 outputs = Outputs(tuple(labels), dim)
         fields = {
@@ -98,11 +99,10 @@ def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
             "outside": Abort() if outside is None else Replace(float(outside)),
             "noise": config["noise"],
             "n_runs": config["n_runs"],
-            "_named": outputs,
         }
         follows_coarse = config.get("joined") is not None
-        return SavedSurrogate(fields, kind, model, follows_coarse, data["probes"].values)
-    # Damaged files raise any error of the library that meets the damage.
+        return SavedSurrogate(fields, outputs, kind, model, follows_coarse, data["probes"].values)
+    # A damaged file may raise any error of the libraries that read it.
     except Exception as error:
         raise StoreError(
             f"Surrogate.load: path: got {path}, expected a file of Surrogate.save that can be "
@@ -111,7 +111,7 @@ def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
 
 
 def _ranges(inputs: list[dict[str, Any]], low: Floats, high: Floats) -> Ranges:
-    """Return ranges from their columns."""
+    """Return ranges from their lower and upper ends in columns."""
     ranges = []
     start = 0
     for entry in inputs:

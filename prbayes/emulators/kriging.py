@@ -34,12 +34,12 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from prbayes._validate import IN_CACHE, Floats
 
-# Runs of a surface, whose cost grows with their cube.
+# Largest number of runs of a surface, whose cost grows with the cube of this number.
 MOST_RUNS = 2000
-# Runs for the choice of lengths and degrees.
+# Number of runs that are used to choose lengths and degrees.
 MOST_TUNED = 256
 
-# From squared distances, which are overwritten, to the kernel and minus twice its slope.
+# Function of squared distances, which it overwrites; returns the kernel and -2 dk / d(r^2).
 Kernel = Callable[[Floats], tuple[Floats, Floats]]
 
 
@@ -105,17 +105,17 @@ KERNELS: dict[str, Kernel] = {
 class Kriging:
     """A surface of one kernel through an output of runs, equation (1)."""
 
-    z: Floats  # (n, d): runs
-    y: Floats  # (n,): their outputs
-    rows: NDArray[np.intp]  # (n,): indices among all runs
+    z: Floats  # (n, d): inputs of the runs
+    y: Floats  # (n,): output of the runs
+    rows: NDArray[np.intp]  # (n,): indices of these runs among all runs
     kernel: str
-    lengths: Floats  # (d,): units of distances
+    lengths: Floats  # (d,): length scales, the units of distances
     degree: int  # degree of the polynomial
-    nugget: float  # in units of the largest kernel
-    weights: Floats  # (n,)
-    coefficients: Floats  # (terms,)
-    left_out: Floats  # error at each of all runs of the surface without the run
-    error: float  # weighted root mean square of the left-out errors
+    nugget: float  # nugget in units of the largest kernel
+    weights: Floats  # (n,): weights of the kernels
+    coefficients: Floats  # (terms,): coefficients of the polynomials
+    left_out: Floats  # cross-validation error at each of all runs
+    error: float  # weighted root mean square of the cross-validation errors
     scale: float  # variance of the output in units of the kernel
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
@@ -155,16 +155,18 @@ class Kriging:
 
         system, kernel = self._system, KERNELS[self.kernel]
         factor = system.factor(self.nugget)
-        assert factor is not None  # since the fit has solved the same system
+        assert factor is not None  # the factor exists, since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
         for rows, _, square in self._distances(z):
             kernels = kernel(square)[0]  # (n, k)
-            # The prediction is u' y, and its error has variance k(0) - 2 u' k + u' K u. The
-            # polynomials determine a part B t of u; the best other part is Q (k - K B t).
+            # The prediction is u' y with weights u of the runs. Its error has variance k(0) - 2 u'
+            # k + u' K u. Exact polynomials require a part B t of u; the best other part is Q (k - K
+            # B t).
             trend = system.basis @ np.linalg.solve(system.root.T, self.polynomials(z[rows]))
             rest = kernels - system.kernels @ trend
             errors[rows] = at_zero - (trend * (kernels + rest)).sum(axis=0)
-            # By the factor, as the digits of the inverse do not suffice for the difference.
+            # The Cholesky factor is used, because the inverse has too few digits for this
+            # difference.
             solved = solve_triangular(factor, system.contrasts(rest), lower=True)
             errors[rows] -= (solved**2).sum(axis=0)
         return np.maximum(errors, 0) * self.scale
@@ -185,7 +187,7 @@ class Kriging:
 
     @property
     def _system(self) -> System:
-        """The linear system of the output."""
+        """The linear system for the weights of the runs."""
         matrix = kernel_matrix(self.kernel, self.z / self.lengths)
         return System.of(matrix, *np.linalg.qr(self.polynomials(self.z).T))
 
@@ -196,18 +198,19 @@ class Kriging:
 
     @cached_property
     def _scaled_runs(self) -> Floats:
-        """The runs in units of lengths around the center, (n, d)."""
+        """The runs relative to the center, in units of lengths, (n, d)."""
         return np.asarray((self.z - self.polynomials.center) / self.lengths)
 
     @cached_property
     def _on_line(self) -> tuple[Any, Floats] | None:
-        """The quintic functions of one input, and the Legendre series; None for other surfaces.
+        """Piecewise quintic of one input, and the Legendre series; None for other surfaces.
 
-        Between two runs these radial functions are a polynomial of degree five.
+        Between two neighbouring runs the sum of all radial functions is a polynomial of degree
+        five.
         """
         if self.kernel != "quintic" or self.z.shape[1] > 1:
             return None
-        from scipy.interpolate import PPoly  # takes long to import
+        from scipy.interpolate import PPoly  # the import takes long
 
         order = np.argsort(self.z[:, 0])
         runs, weights = self.z[order, 0], self.weights[order] / self.lengths[0] ** 5
@@ -228,7 +231,8 @@ class Kriging:
             values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
             return values, slopes / polynomials.half_width
         single = polynomials.by_input(z)
-        derivative = legder(np.eye(len(single)))  # columns of Legendre series
+        # Column p: Legendre series of the derivative of P_p.
+        derivative = legder(np.eye(len(single)))
         slopes = np.empty(z.shape)
         for a, half_width in enumerate(polynomials.half_width):
             factors = single.copy()
@@ -241,7 +245,7 @@ class Kriging:
         """Constant, slopes, (d,), and second derivatives, (d, d), of a polynomial of degree two."""
         powers, coefficients = self.polynomials.powers, self.coefficients
         degrees = powers.sum(axis=1)
-        # Squares are of P_2(u) = (3 u^2 - 1) / 2.
+        # Squares are in the terms P_2(u) = (3 u^2 - 1) / 2.
         is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
         products = powers[is_product]
         hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
@@ -251,14 +255,15 @@ class Kriging:
         return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
-        """Yield rows of a block of points, the points (d, k) and squared distances to runs (n, k).
+        """Yield the rows of blocks of points, the points (d, k), squared distances to runs (n, k).
 
-        The array of distances is reused, and stays in the cache of the processor.
+        All blocks use the same array of distances, which stays in the processor's cache.
         """
         runs, n = self._scaled_runs, len(self.z)
         step = max(1, min(IN_CACHE // 2 // n, len(z)))
         array = np.empty(n * step)
-        # |a - b|^2 = |a|^2 + |b|^2 - 2 a'b; the digits that small ones lose do not matter.
+        # A matrix product computes |a - b|^2 = |a|^2 + |b|^2 - 2 a'b. Small distances lose digits
+        # by the cancellation, which does not matter for predictions.
         ones, of_runs = np.ones((n, 1)), (runs**2).sum(axis=1, keepdims=True)
         run_factors = np.concatenate([-2 * runs, of_runs, ones], axis=1)
         for first in range(0, len(z), step):
@@ -274,8 +279,8 @@ class Kriging:
 class Polynomials:
     """Products of Legendre polynomials up to a total degree, in a box scaled to [-1, 1]."""
 
-    center: Floats  # (d,)
-    half_width: Floats  # (d,)
+    center: Floats  # (d,): center of the box
+    half_width: Floats  # (d,): half of the box's width
     powers: NDArray[np.intp]  # (terms, d): degrees of the factors of each term, in order of degree
 
     @classmethod
@@ -305,7 +310,7 @@ class Polynomials:
         single = np.ones((int(self.powers.max()) + 1, *u.shape))
         if len(single) > 1:
             single[1] = u
-        # p P_p = (2 p - 1) u P_{p-1} - (p - 1) P_{p-2}
+        # Recurrence of Legendre polynomials: p P_p = (2 p - 1) u P_{p-1} - (p - 1) P_{p-2}.
         for p in range(2, len(single)):
             np.multiply(single[p - 1], u, out=single[p])
             single[p] *= 2 * p - 1
@@ -325,11 +330,12 @@ class Polynomials:
 class System:
     """The linear system of outputs at runs."""
 
-    kernels: Floats  # (n, n): K
-    basis: Floats  # (n, p): B
-    root: Floats  # (p, p): B root are the polynomials at the runs
-    projected: Floats  # (n, n): P K P + sigma B B', positive definite but for rounding
-    sigma: float  # at least the largest eigenvalue of P K P
+    kernels: Floats  # (n, n): kernel matrix K
+    basis: Floats  # (n, p): orthonormal basis B of the polynomials at the runs
+    root: Floats  # (p, p): B root is the matrix of the polynomials at the runs
+    # (n, n): P K P + sigma B B' with P = I - B B', positive definite except for rounding.
+    projected: Floats
+    sigma: float  # upper bound of the largest eigenvalue of P K P
     unit: float  # largest kernel, the unit of nuggets
 
     @classmethod
@@ -365,7 +371,8 @@ class System:
         """Return the weights of outputs, (n,), and the last step of their refinement, (n,)."""
         step = weights = np.zeros(len(y))
         contrasts = self.contrasts(y)
-        # Two steps of iterative refinement: close runs make the matrix badly conditioned.
+        # The first solution is followed by two steps of iterative refinement, because close runs
+        # make the matrix badly conditioned.
         for _ in range(3):
             rest = contrasts - self.kernels @ weights - nugget * self.unit * weights
             step = self.contrasts(dpotrs(factor, self.contrasts(rest), lower=True)[0])
@@ -381,7 +388,8 @@ class System:
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
     """Return the kernels of all pairs of points in units of lengths, (n, d) -> (n, n)."""
     square = np.zeros((len(scaled), len(scaled)))
-    # By differences, since products lose digits of small distances.
+    # Differences are squared directly, because the expanded product loses digits of small
+    # distances.
     for column in scaled.T:
         square += (column[:, None] - column) ** 2
     return KERNELS[kernel](square)[0]
@@ -409,7 +417,8 @@ def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
     order = np.argsort(-weights, kind="stable")
     n_important = min(most // 2, int((weights > weights.mean()).sum()))
     spread = np.linspace(n_important, n - 1, most - n_important).astype(int)
-    # In the order of the runs, so that those of equal weights are spread over a sequence.
+    # The other runs are taken in their order, so that runs of equal weights are spread evenly over
+    # the sequence.
     rest = np.sort(order[n_important:])[spread - n_important]
     return np.sort(np.concatenate([order[:n_important], rest]))
 
@@ -445,8 +454,9 @@ def fit_kriging(
             w, step = system.weights(factor, outputs, nugget)
             precisions = np.diag(system.inverse(factor, nugget))
             left_out = w / precisions
-            # Left-out errors are too small where the matrix is singular to rounding, and large
-            # weights have values that are rough by rounding, which roots need to be found.
+            # Cross-validation errors are too small if the matrix is singular to rounding. Large
+            # weights make the surface rough by rounding, which disturbs the search of roots. Both
+            # add to the error.
             unsolved = np.abs(step / precisions).max()
             rounding = np.finfo(float).eps * system.unit * np.linalg.norm(w)
             error = float(np.sqrt(weights @ left_out**2) + unsolved + 100 * rounding)

@@ -17,8 +17,8 @@ from prbayes.emulators.kriging import (
 )
 from prbayes.emulators.surfaces import KernelSurface
 
-# The lowest degree with which a kernel is conditionally positive definite, and the interpolant
-# unique: Wendland (2005), Scattered Data Approximation, ch. 8.
+# The lowest degree for which a kernel is conditionally positive definite, so that the interpolant
+# is unique: Wendland (2005), Scattered Data Approximation, ch. 8.
 _LOWEST_DEGREE = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}
 
 
@@ -72,7 +72,7 @@ class RadialBasis(KernelSurface):
 
     @property
     def _degree(self) -> int:
-        """The degree, or the lowest of several."""
+        """The degree, or the lowest degree if several are tried."""
         return self.degree if isinstance(self.degree, int) else _LOWEST_DEGREE[self.kernel]
 
     def fit(
@@ -89,8 +89,8 @@ class RadialBasis(KernelSurface):
                 for nugget in nuggets
             )
             return next((surface for surface in fits if surface is not None), None)
-        # Polynomials with at most a third as many terms as runs. With many runs they matter little,
-        # and take most of the time.
+        # Polynomials are tried up to a third as many terms as runs. With many runs high degrees
+        # improve the surface little, and take most of the time.
         highest = 17 if n <= 256 else self._degree + 2
         more = range(self._degree + 1, highest)
         degrees = [self._degree, *(p for p in more if 3 * comb(d + p, d) <= n)]

@@ -17,8 +17,8 @@ from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, PriorSampler, valid
 from prbayes.response.inputs import model_on_context, read_inputs
 
-# Ranges are quantiles of these 2^15 draws: with a coverage of .999 some 16 draws are beyond either
-# end, and the share left out is known to a quarter.
+# Ranges are quantiles of 512 x 64 = 2^15 draws. With a coverage of .999 about 16 draws are beyond
+# either end, so that the share left out has a standard error of a quarter.
 POPULATIONS, SPECIMENS = 512, 64
 
 
@@ -27,10 +27,10 @@ class Range:
     """The range of one input."""
 
     name: str
-    # (*event): lowest and highest value, in the input's own units.
+    # Lowest and highest value, (*event), in the input's own units.
     low: Floats
     high: Floats
-    constant: bool = False  # whether it is one value only
+    constant: bool = False  # whether the input is a constant
 
     @property
     def size(self) -> int:
@@ -93,9 +93,9 @@ class Ranges:
 
     def outside(self, columns: Floats) -> NDArray[np.bool_]:
         """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
-        # For a bound that was computed in another way: far above rounding.
+        # The slack, far above rounding, is for bounds that the user has computed in another way.
         slack = 1e-9 * (self.high - self.low)
-        # Comparisons with NaN are false.
+        # Comparisons with NaN are false, so that NaN is outside.
         inside = (columns >= self.low - slack) & (columns <= self.high + slack)
         return np.asarray(~inside)
 
@@ -141,7 +141,7 @@ class Ranges:
         return np.concatenate(rows, axis=1), batch
 
     def _places(self) -> Iterator[tuple[Range, slice]]:
-        """Yield inputs with their columns."""
+        """Yield the range of each input with the input's columns."""
         start = 0
         for r in self.inputs:
             yield r, slice(start, start + r.size)
@@ -180,7 +180,7 @@ def read_ranges(
         )
     if not draws:
         return ranges, None
-    # Inputs with a range are uniform.
+    # Inputs that are given by a range have a uniform distribution.
     unit = sobol(POPULATIONS * SPECIMENS, ranges.dimensions, random_seed)
     values = ranges.arguments(ranges.at(unit))
     for i, (key, r) in enumerate(zip(entries, ranges.inputs, strict=True)):
@@ -193,14 +193,14 @@ def read_ranges(
 def _range_of(
     name: str, key: str | int, entry: Any, draws: Floats | None, coverage: float
 ) -> Range:
-    """Return the range of an input: given, or of the central share of draws; or a constant."""
+    """Return the range of an input: as given, of the central share of draws, or a constant."""
     label = key if isinstance(key, str) else str(getattr(entry, "name", None) or f"input {key}")
     if draws is not None:  # (populations, specimens, *event)
         tail = (1 - coverage) / 2
         low, high = np.quantile(draws, [tail, 1 - tail], axis=(0, 1))
         is_constant = False
     else:
-        # A list of a number and True is one of numbers to NumPy.
+        # NumPy would convert a list of numbers and booleans to numbers without an error.
         if isinstance(entry, list | tuple) and any(isinstance(x, bool) for x in entry):
             entry = np.asarray(entry, dtype=object)
         array = real_array(entry, f"{name}: inputs: {label}")
@@ -237,12 +237,13 @@ def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list
             f"{name}: got invalid parameters of the inputs at all draws of the priors, "
             "expected valid ones"
         )
-    # Other draws replace those with invalid parameters, such as a negative standard deviation.
+    # Valid draws are used twice where others have invalid parameters, such as a negative standard
+    # deviation.
     places = usable[np.arange(POPULATIONS) % usable.size]
     valid_values = [values[places] for values in parents]
     rng = np.random.default_rng(random_seed)
     aleatory, epistemic = PopulationSampler(inputs)(valid_values, SPECIMENS, rng)
-    # An epistemic value is the same for all specimens.
+    # An epistemic value is the same for all specimens of a population, and is repeated for them.
     return [
         np.broadcast_to(values, (POPULATIONS, SPECIMENS, *values.shape[2:])).astype(np.float64)
         for values in inputs.fill(aleatory, epistemic)

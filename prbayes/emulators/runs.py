@@ -14,7 +14,7 @@ from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
-from prbayes.emulators.surrogate import Surrogate, with_output_labels
+from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
@@ -70,11 +70,12 @@ class Runs(Shown):
     array([1.64,  nan])
     """
 
-    # What to do where the response is NaN.
+    # Advice in messages about points where the response is NaN.
     remedy = "add the runs that prb.propose_runs(model) returns"
 
     def __init__(self, inputs: Any, responses: Any) -> None:
-        # Without the warning of points outside the ranges: a large share of them is refused.
+        # The surrogate does not warn of points outside the ranges, since a large share of them is
+        # refused.
         table = read_table("Runs", inputs, responses)
         self.surrogate = replace(Surrogate.of_table("Runs", table), _warned=[True])
         self.outputs = table.outputs
@@ -224,7 +225,7 @@ def continued(runs: Runs, *inputs: ArrayLike) -> Any:
     columns, batch = domain.columns(inputs)
     unit = domain.scaled(columns)
     inner = np.clip(unit, 0, 1)
-    values = surrogate._at(domain.at(inner))
+    values = values_inside(surrogate, domain.at(inner))
     rows = np.flatnonzero(domain.outside(columns).any(axis=1))
     _, jacobian = surrogate._surface.emulator(inner[rows])
     change = np.einsum("kmd,kd->km", jacobian, unit[rows] - inner[rows])

@@ -73,7 +73,7 @@ class CrossValidation:
 
 
 def _scalar_or_array(values: Any) -> Any:
-    """Return an array of several outputs, or the number of one."""
+    """Return an array for several outputs, or a number for one output."""
     return float(values) if np.ndim(values) == 0 else values
 
 
@@ -81,7 +81,8 @@ def points_needed(model: Any, dimensions: int) -> int:
     """Return the least number of design points such that nine tenths determine a surface."""
     terms = as_surface(model).terms(dimensions)
     n = terms + 2
-    while n - -(-n // min(FOLDS, n)) < terms + 1:  # without the largest fold
+    # The runs without the largest fold have to determine the surface.
+    while n - -(-n // min(FOLDS, n)) < terms + 1:
         n += 1
     return n
 
@@ -91,8 +92,8 @@ class TrainingRuns:
     """Runs that an emulator is fitted on."""
 
     x: Floats  # (n, d): inputs
-    y: Floats  # (n, m): outputs; a run that is not finite in one of them has none
-    importance: Floats  # (n,): mean weights in the relevant populations; they sum to one
+    y: Floats  # (n, m): outputs; a run with an output that is not finite is left out
+    importance: Floats  # (n,): mean importance weights in the populations of interest, of sum one
     blocks: NDArray[np.intp]  # (n,): block of each run; each block is spread over all runs
 
     @cached_property
@@ -128,7 +129,8 @@ class TrainingRuns:
         """
         rows, d = self.rows, self.x.shape[1]
         usable = [model for model in tried if 2 * len(rows) >= 3 * model.terms(d)]
-        # Part of the importance is uniform: the errors of a few runs alone would be noise.
+        # A part of the importance is uniform, because the errors of few important runs alone would
+        # be too noisy.
         near = self.importance[rows] + 0.1 / len(self.y)
         return fit_emulator(self.scaled(self.x[rows]), self.y[rows], near, tried=usable)
 
@@ -179,13 +181,14 @@ def weight_of_runs(
     for output, prediction in zip(y.T, predictions.T, strict=True):
         steps = SmoothedSteps.of(output, weights.mean(axis=0))
         below = steps(output)
-        # Error of the emulator's distribution functions: by block, (T, B, L).
+        # Errors of the emulator's distribution functions, by block, (T, B, L).
         error = steps(prediction) - below
         errors = np.einsum("tn,bn,nl->tbl", weights, member, error)
-        # The variance of a sum over independent blocks.
+        # The variance of a sum over independent blocks is subtracted, since it adds to the squared
+        # sum.
         squared_bias = errors.sum(axis=1) ** 2 - len(member) * errors.var(axis=1, ddof=1)
         bias += float(np.maximum(squared_bias, 0.0).sum(axis=-1).mean())
-        # Weighted runs around their distribution function.
+        # Deviations of the runs from their weighted distribution function, by block.
         function = np.einsum("tn,nl->tl", weights, below)
         deviations = below - function[:, None, :]
         by_block = np.einsum("tn,bn,tnl->tbl", weights, member, deviations)
@@ -202,7 +205,7 @@ class SmoothedSteps:
     one value for many specimens would be wrong at all of them where an emulator errs by a rounding.
     """
 
-    levels: Floats  # (L,)
+    levels: Floats  # (L,): levels, quantiles of the output
     width: float
 
     @classmethod
@@ -219,7 +222,7 @@ class SmoothedSteps:
         return cls(levels, 0.2 * (high - low) / 2)
 
     def __call__(self, values: Floats) -> Floats:
-        """Return the indicators, (n, L); NaN and +inf are below no level."""
+        """Return smoothed indicators of values below levels (n, L); NaN and +inf are below none."""
         if not self.width > 0:
             return (values[:, None] <= self.levels).astype(float)
         ramp = (self.levels - values[:, None]) / self.width + 0.5

@@ -24,7 +24,7 @@ from prbayes.emulators.kriging import Kriging, Polynomials, spread_of
 
 Predict = Callable[[Floats], Floats]
 
-# Tenfold: Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
+# Ten folds, as recommended by Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
 FOLDS = 10
 
 
@@ -146,11 +146,11 @@ class Refitted:
     """A surface of one output without a formula for its derivatives and left-out errors."""
 
     model: Surface
-    z: Floats  # (n, d)
-    y: Floats  # (n,)
-    folds: NDArray[np.bool_]  # (B, n): runs that are left out together
-    weights: Floats  # (n,)
-    used: NDArray[np.bool_] | slice = slice(None)  # runs of the fit
+    z: Floats  # (n, d): inputs of the runs
+    y: Floats  # (n,): output of the runs
+    folds: NDArray[np.bool_]  # (B, n): which runs each fold leaves out
+    weights: Floats  # (n,): weights of the runs' errors
+    used: NDArray[np.bool_] | slice = slice(None)  # runs that the surface is fitted to
 
     @cached_property
     def predict(self) -> Predict:
@@ -159,7 +159,7 @@ class Refitted:
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k,)."""
-        # Some regressors return a column.
+        # Some regressors return a column, (k, 1).
         return np.asarray(self.predict(z), dtype=np.float64).reshape(len(z))
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
@@ -237,8 +237,8 @@ class Polynomial(Surface):
 
 
 def _polynomial(polynomials: Polynomials, coefficients: Floats, at: Floats) -> Floats:
-    """Return a polynomial at points, (k, d) -> (k,)."""
-    step = 4096  # the terms of so many points stay in the cache
+    """Return the values of a polynomial at points, (k, d) -> (k,)."""
+    step = 4096  # the terms of 4096 points fit into the processor's cache
     starts = range(0, len(at), step)
     blocks = [coefficients @ polynomials(at[start : start + step]) for start in starts]
     return np.concatenate([np.empty(0), *blocks])
@@ -286,5 +286,5 @@ class Following(Surface):
 
 
 def _followed(rho: float, rest: Predict, at: Floats) -> Floats:
-    """Return a multiple of the last input and a surface of the others, (k, d) -> (k,)."""
+    """Return rho times the last input plus a surface of the other inputs, (k, d) -> (k,)."""
     return np.asarray(rho * at[:, -1] + np.asarray(rest(at[:, :-1])).reshape(len(at)))

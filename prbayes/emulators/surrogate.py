@@ -55,12 +55,14 @@ class DesignSurface:
 
     domain: Ranges
     unit: Floats  # (n, d): the design in the unit cube
-    usable: NDArray[np.bool_]  # (n,): which runs have only finite outputs
+    usable: NDArray[np.bool_]  # (n,): whether all outputs of a run are finite
     event: tuple[int, ...]  # shape of a response
-    emulator: Emulator  # fitted in the unit cube
-    # The coarse response that the surface follows, and the emulator that does so.
+    emulator: Emulator  # emulator, fitted in the unit cube
+    # The coarse response that the surface follows, and the emulator that has it as an input.
     coarse: Callable[..., Any] | None = None
     follower: Follower | None = None
+    # Names of the outputs if the response returns a mapping, else None.
+    outputs: Outputs | None = None
 
     @classmethod
     def of(
@@ -76,8 +78,8 @@ class DesignSurface:
         """Fit a surface to runs, which follows a coarse response, (n,), if errors are smaller."""
         unit, usable = domain.scaled(points), _usable(responses)
         x, y = unit[usable], responses[usable].reshape(int(usable.sum()), -1)
-        # Beside a coarse response fixed parts are left out, so that a file of the surrogate follows
-        # in the same way.
+        # With a coarse response the folds of cross-validation are fixed, so that a surrogate read
+        # from a file makes the same choice whether to follow it.
         seed = seed if coarse_values is None else 0
         surface = as_surface(model)
         emulator = fit_emulator(x, y, tried=[surface], seed=seed)
@@ -92,7 +94,7 @@ class DesignSurface:
 
     def __call__(self, columns: Floats) -> Floats:
         """Return values at rows inside the ranges, (n,) or (n, m)."""
-        # Rounding may put a point on the edge outside.
+        # Rounding may move a point at an edge out of the unit cube.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
         values = self.emulator.values(unit).reshape(-1, *self.event)
         if self.coarse is None or self.follower is None:
@@ -128,7 +130,7 @@ class DesignSurface:
 
     @cached_property
     def _tree(self) -> Any:
-        """The search tree of the usable runs."""
+        """The k-d tree of the usable runs."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.unit[self.usable])
@@ -136,9 +138,9 @@ class DesignSurface:
     def nearby(self, residuals: Floats, columns: Floats) -> Floats:
         """Return the residuals of the nearest usable runs, (n, k, ...)."""
         usable, unit = residuals[self.usable], self.domain.scaled(columns)
-        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
+        # At least eight residuals determine their root mean square to a quarter, 1 / sqrt(2 k).
         k = min(len(usable), 4 * (unit.shape[1] + 1))
-        # Points that are not finite are outside: any neighbours will do.
+        # Points that are not finite count as outside, so that any neighbours will do.
         _, nearest = self._tree.query(np.where(np.isfinite(unit), unit, 0.5), k=k)
         return np.asarray(usable[nearest])
 
@@ -201,10 +203,8 @@ class Surrogate(Shown):
     error: CrossValidation
     noise: int | None = None
     coarse: Callable[..., Any] | None = None
-    # Not empty after the first warning of points outside.
+    # A list that is empty until the first warning of points outside the ranges.
     _warned: list[bool] = field(repr=False, default_factory=list)
-    # Names of the outputs in the response's mapping; None without names.
-    _named: Outputs | None = field(repr=False, default=None)
     _surface: DesignSurface = field(repr=False, kw_only=True)
 
     @classmethod
@@ -312,7 +312,7 @@ class Surrogate(Shown):
             unit = domain.like(predictive, unit)
         design = domain.at(unit)
 
-        # Compute the responses; the coarse ones first, as an error in them then costs no run.
+        # Compute the coarse responses first, because an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
         database = None
         if store is not None:
@@ -325,7 +325,7 @@ class Surrogate(Shown):
         with shown(progressbar):
             _learn_names(settings, runs, tally)
             responses = respond(settings, runs, tally)
-            if tally.computed >= n:  # stored runs are checked as they are read
+            if tally.computed >= n:  # runs of a store are checked when they are read
                 refuse_other_runs(settings, runs, responses, tally)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
@@ -338,11 +338,10 @@ class Surrogate(Shown):
             *(domain, design, responses, model, outside, tally.computed),
             error=CrossValidation(residuals, _spread(responses[surface.usable])),
             coarse=surface.coarse,
-            _named=tally.named,
-            _surface=surface,
+            _surface=replace(surface, outputs=tally.named),
         )
         if predictive is not None:
-            values = surrogate._at(predictive)
+            values = values_inside(surrogate, predictive)
             error = CrossValidation(residuals, _spread(values[_usable(values)]))
             surrogate = replace(surrogate, error=error)
         _log.info(
@@ -406,7 +405,7 @@ class Surrogate(Shown):
         models = ROUGH_CANDIDATES if model is None else (model,)
         for candidate in models:
             refuse_wrong_surface(name, candidate, outside)
-        # A kind of surface that has too few runs is left out of several.
+        # Of several surfaces those that need more runs are left out.
         needed = [points_needed(m, design.shape[1]) for m in models]
         _refuse_unfit(name, values, min(needed))
         n_usable = _usable(values).sum()
@@ -414,14 +413,14 @@ class Surrogate(Shown):
         surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
         spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
-        # The largest residuals are those of the most extreme runs.
+        # The 90 % quantile is compared, because the largest residuals are those of the most extreme
+        # runs.
         errors = [np.nanquantile(np.abs(s.left_out / unit), 0.9, axis=0).sum() for s in surfaces]
         best = int(np.argmin(errors))
         return cls(
             *(domain, design, values, models[best], outside, 0),
             error=CrossValidation(surfaces[best].left_out, spread),
-            _named=table.labels,
-            _surface=surfaces[best],
+            _surface=replace(surfaces[best], outputs=table.labels),
         )
 
     @property
@@ -443,7 +442,7 @@ class Surrogate(Shown):
         labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
         columns = [
             *column_names(self.names, [r.size for r in self.domain.inputs]),
-            *(labels if self._named is None else self._named.names),
+            *(labels if self._surface.outputs is None else self._surface.outputs.names),
         ]
         return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
 
@@ -480,7 +479,7 @@ class Surrogate(Shown):
         bad = is_outside.any(axis=1)
         event = self.responses.shape[1:]
         values = np.full((len(columns), *event), np.nan)
-        values[~bad] = self._at(columns[~bad])
+        values[~bad] = values_inside(self, columns[~bad])
         if bad.any():
             text = f"surrogate: {self.domain.complaint(columns, is_outside)}"
             if isinstance(self.outside, Abort):
@@ -490,7 +489,8 @@ class Surrogate(Shown):
                 )
             replacement = cast(Replace, self.outside).value
             values[bad] = replacement
-            # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
+            # The warning appears once, because a sampler calls the surrogate thousands of times,
+            # and a simulator reports the lost mass itself.
             level = logging.DEBUG if self._warned else logging.WARNING
             once = f"{text}; they give {replacement}; this warning appears once."
             report(Finding("outside-ranges", once), level=level)
@@ -602,7 +602,8 @@ class Surrogate(Shown):
         spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
         probes, expected = surface.probes() / size, saved.probes / size
-        # The tolerance is above rounding on another processor, below the effect of a setting.
+        # The tolerance is above rounding errors of another processor, and below the effect of a
+        # different setting.
         if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
             and_coarse = ", and the same coarse response" if coarse is not None else ""
             raise ValueError(
@@ -610,29 +611,33 @@ class Surrogate(Shown):
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
                 f"settings (and a fixed random seed){and_coarse}"
             )
+        surface = replace(surface, outputs=saved.outputs)
         return cls(**fields, model=model, coarse=coarse, _surface=surface)
 
-    def _at(self, columns: Floats) -> Floats:
-        """Return values inside the ranges, shape (n,)."""
-        if not len(columns):
-            return np.empty((0, *self.responses.shape[1:]))
-        values = self._surface(columns)
-        if self.noise is not None:
-            # One of the k residuals nearby, with either sign, by a hash of the input.
-            residuals = self._surface.nearby(self.error.residuals, columns)
-            n, k = residuals.shape[:2]
-            number, sign = np.divmod(hashed_rows(columns, self.noise), np.uint64(2))
-            place = (number % np.uint64(k)).astype(np.intp)
-            signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
-            values = values + residuals[np.arange(n), place] * signs
-        unit = self.domain.scaled(columns)
-        return with_failures(values, unit, self._surface.unit, self.responses)
+
+def values_inside(surrogate: Surrogate, columns: Floats) -> Floats:
+    """Return the values of a surrogate at points inside its ranges, (n,) or (n, m)."""
+    surface = surrogate._surface
+    if not len(columns):
+        return np.empty((0, *surface.event))
+    values = surface(columns)
+    if surrogate.noise is not None:
+        # Add one of the k nearest residuals, with either sign, selected by a hash of the input.
+        residuals = surface.nearby(surrogate.error.residuals, columns)
+        n, k = residuals.shape[:2]
+        number, sign = np.divmod(hashed_rows(columns, surrogate.noise), np.uint64(2))
+        place = (number % np.uint64(k)).astype(np.intp)
+        signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
+        values = values + residuals[np.arange(n), place] * signs
+    unit = surrogate.domain.scaled(columns)
+    return with_failures(values, unit, surface.unit, surrogate.responses)
 
 
 def with_output_labels(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
     """Return values of rows in the shape of a batch, with the labels of the outputs."""
     values = values.reshape((*batch, *surrogate.responses.shape[1:]))
-    return values if surrogate._named is None else surrogate._named.by_key(values)
+    outputs = surrogate._surface.outputs
+    return values if outputs is None else outputs.by_key(values)
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
@@ -642,7 +647,7 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
     splittable pseudorandom number generators, doi:10.1145/2660193.2660195.
     """
     h = np.full(len(x), random_seed, dtype=np.uint64)
-    # Adding 0.0 makes -0.0 the number that it equals.
+    # Adding 0.0 turns -0.0 into 0.0, which is equal but has other bits.
     for column in np.ascontiguousarray(x.T + 0.0):
         h = (h ^ column.view(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)
         h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -652,20 +657,20 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
-    """Return which runs have only finite outputs, (n,)."""
+    """Return whether all outputs of each run are finite, (n,)."""
     return ~is_missing(np.where(np.isfinite(responses), responses, np.nan))
 
 
 def _spread(values: Floats) -> Any:
-    """Return the standard deviation of responses, a number or one for each output."""
+    """Return the standard deviation of responses: a number, or an array for several outputs."""
     sd = values.std(axis=0)
     return float(sd) if sd.ndim == 0 else sd
 
 
 def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
-    """Learn the names of several stored outputs before any other run.
+    """Determine the names of several stored outputs before any other run.
 
-    A store contains numbers only: with a version, one of its runs is computed again, and refused if
+    A store contains numbers only. With a version, one of its runs is computed again, and refused if
     its outputs have changed places.
     """
     store = settings.store
@@ -704,7 +709,7 @@ def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool
 
 
 def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
-    """Return a coarse response at rows, (n,); NaN where it raises."""
+    """Return a coarse response at points, (n,); NaN where it raises an error."""
     points = Points(domain.arguments(columns), domain.varying)
     try:
         return compute(coarse, points, tolerant=True).values
@@ -713,7 +718,7 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
 
 
 def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
-    """Return a coarse response at the design, or raise if it is no response of the inputs."""
+    """Return a coarse response at the design; raise if it cannot be computed from the inputs."""
     refuse_uncallable(name, coarse, "coarse")
     values = _coarse_at(name, coarse, domain, columns)
     if not np.isfinite(values).any():
@@ -725,7 +730,7 @@ def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
-    """Raise if an argument of `Surrogate.fit` is not of its kind."""
+    """Raise if an argument of `Surrogate.fit` has a wrong type."""
     refuse_uncallable(name, response)
     refuse_wrong_surface(name, model, outside)
     designs = ("even", "predictive")

@@ -21,9 +21,11 @@ class RunTable:
     """Runs, and the names of their outputs."""
 
     domain: Ranges
-    points: Floats  # (n, columns)
-    responses: Floats  # (n,) or (n, m)
-    outputs: tuple[str, ...]  # "response" of one without a name, "response[0]" of several
+    points: Floats  # (n, columns): inputs of the runs
+    responses: Floats  # (n,) or (n, m): responses of the runs
+    # Names of the outputs: "response" for a single unnamed output, "response[0]" for the first of
+    # several.
+    outputs: tuple[str, ...]
 
     @property
     def labels(self) -> Outputs | None:
@@ -122,7 +124,7 @@ def read_csv(
 
 
 def _number_in_cell(cell: str, decimal: str, label: str) -> float:
-    """Return the number of a cell; NaN of an empty one."""
+    """Return the number in a cell; NaN for an empty cell."""
     text = cell.strip()
     try:
         return float(text.replace(decimal, ".")) if text else np.nan
@@ -135,12 +137,15 @@ def _number_in_cell(cell: str, decimal: str, label: str) -> float:
 
 
 def _named_columns(label: str, values: Any, inputs: Any) -> list[tuple[str, Floats]]:
-    """Return columns (n, *event) in the order of the inputs' index; names are empty without one."""
+    """Return names and columns (n, *event), with rows in the order of the inputs' index.
+
+    Columns without a name have an empty one.
+    """
 
     def column(part: Any, name: str) -> Floats:
         return real_array(in_order_of(part, inputs, name, reference="the inputs"), name)
 
-    if isinstance(values, Mapping):  # datasets of xarray among them
+    if isinstance(values, Mapping):  # datasets of xarray are mappings
         columns = [(str(key), column(x, f"{label}: {key}")) for key, x in values.items()]
     elif hasattr(values, "columns"):
         columns = [
@@ -170,7 +175,7 @@ def _refuse_length(label: str, column: Floats, n: int) -> None:
 
 
 def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
-    """Raise for too few or too many runs, for equal ones, and for responses without meaning."""
+    """Raise for too few, too many or repeated runs, and for responses of -inf."""
     n, d = points.shape
     usable = int((~is_missing(values) & np.isfinite(values).all(axis=1)).sum())
     least = max(8, 4 * d)
@@ -179,7 +184,7 @@ def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
             f"{caller}: got {usable} runs with responses for {counted(d, 'input')}, expected at "
             f"least {least}; add runs, or leave inputs out that do not matter"
         )
-    if n > 4000:  # the time of a surface grows with their cube
+    if n > 4000:  # the time of a fit grows with the cube of their number
         raise ValueError(
             f"{caller}: got {n} runs, expected at most 4000; pass a sample of the rows"
         )

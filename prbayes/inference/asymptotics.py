@@ -470,7 +470,10 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
 
 
 def _area_covariance(information: list[Information], scales: Floats, weakest: float) -> Local:
-    """Return the sampling distribution with area metrics, from shifts over data sets."""
+    """Return the sampling distribution with area metrics, from first-order shifts of the estimate.
+
+    The covariance is that of the shifts over synthetic data sets.
+    """
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
     # Columns span the space that any simulator identifies. The column of zeros keeps the array from

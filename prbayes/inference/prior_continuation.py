@@ -62,7 +62,7 @@ class Continuation:
         return self._thetas(self._shares(coordinates, margin), coordinates)
 
     def _unbounded_shares(self, coordinates: Floats) -> Floats:
-        """Return values as shares of the interval, also those beyond its ends."""
+        """Return values as fractions of the interval; those beyond its ends are not clipped."""
         return (self.values(coordinates) - self.lower) / (self.upper - self.lower)
 
     def _shares(self, coordinates: Floats, margin: float) -> Floats:

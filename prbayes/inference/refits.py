@@ -25,7 +25,7 @@ from prbayes.inference.asymptotics import (
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
 from prbayes.metrics.density import is_differentiable
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 from prbayes.numerics.batched_minimisers import Descent, descend, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 from prbayes.numerics.threads import one_thread
@@ -201,7 +201,8 @@ def refit_prepared(
             data, weights = one_set(evaluator, sets, i)
             try:
                 prepared = evaluator.observing(data, weights=weights)
-            except ValueError:  # such as a data set of specimens that are all alike
+            except ValueError:
+                # A data set can be invalid for a metric, for example if all specimens are alike.
                 continue
             objective = BatchObjective.of(prepared, scales, observed_set(prepared))
             starts = np.stack([np.zeros_like(minimiser), minimiser])
@@ -476,7 +477,7 @@ class BatchObjective:
         return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
 
     def _values(self, thetas: Floats, rows: Any) -> Floats:
-        """Return the values for some data sets."""
+        """Return the objectives of the data sets in ``rows``, each at its own thetas."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
@@ -519,7 +520,7 @@ def refit_obstacle(evaluator: Evaluator) -> str | None:
     obstacle = sampling_obstacle(evaluator) or summary_obstacle(evaluator)
     if obstacle is None and evaluator.emulated:
         return "the model has a log-likelihood by specimen"
-    if obstacle is None and evaluator.other_terms:
+    if obstacle is None and has_other_terms(evaluator.model):
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle
 

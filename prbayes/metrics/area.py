@@ -197,9 +197,10 @@ class RankedBasis(Basis):
 
 @dataclass(frozen=True, eq=False)
 class _Integral:
-    """The integral of the observed distribution function, for areas in few steps.
+    """Integral of the observed distribution function S_N, which makes an area cheap to compute.
 
-    Between two simulated values F is constant, so that S_N, which increases, crosses it once.
+    Between two simulated values the simulated distribution function F is constant, so that the
+    increasing S_N crosses F at most once.
     """
 
     order: Indices  # order of the simulated values, (n,)

@@ -77,7 +77,7 @@ class CompositeDiscrepancy(Discrepancy):
             values, index = part.observed_of(observed)
             part_weights = w[..., index]
             has_specimens[..., k] = part_weights.sum(axis=-1) > 0
-            if not index.size:  # values without weight, which do not count
+            if not index.size:  # no specimen has values: use any values, with weight zero
                 values = part.target.observed
                 part_weights = np.zeros((*batch, len(values)))
             part_weights = np.where(has_specimens[..., k, None], part_weights, 1.0)
@@ -124,11 +124,6 @@ class CompositeDiscrepancy(Discrepancy):
 def components_of(target: Discrepancy) -> tuple[Components, ...]:
     """Return the principal components that outputs are compared by."""
     return target.components if isinstance(target, CompositeDiscrepancy) else ()
-
-
-def components_summary(target: Discrepancy) -> str:
-    """Return sentences about the variance that principal components leave out."""
-    return "; ".join(c.summary for c in components_of(target))
 
 
 def failure_caps(observed: Floats) -> Floats:
@@ -328,7 +323,7 @@ class Joint(Metric):
     def _prepare_outputs(
         self, observed: Floats, weights: Floats, n_inputs: int | None = None
     ) -> Discrepancy:
-        """Return the mean over directions, for each set of outputs that specimens have."""
+        """Return the mean discrepancy over projections, for each set of measured outputs."""
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []

@@ -31,7 +31,9 @@ class ScoreOptions:
     step: float = 1e-4  # relative step of central differences
     block: int = 128  # number of specimens that are evaluated at once
     nodes: int = 1024  # number of nodes in tables of scores as functions of a response
-    margin: float = 10.0  # distance of the ends of these tables from all responses, in bandwidths
+    # Number of default bandwidths by which these tables extend beyond the smallest and the largest
+    # response.
+    margin: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,7 +65,8 @@ class Components:
 
         ``population`` is the share of the variance of the best population that is left out.
         """
-        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # that of white noise is .1
+        # The correlation of white noise is about .1.
+        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:
             return (
                 f"{self.summary}: this is not noise, and the metric does not compare it; pass more "
                 "components= to prb.Joint, or measure more specimens"
@@ -302,5 +303,5 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _listed(outputs: Indices) -> str:
-    """Return the numbers of outputs for a message."""
+    """Return the indices of outputs as text for a message."""
     return ", ".join(map(str, outputs.tolist()))

@@ -72,7 +72,8 @@ def cost(model: pm.Model | None = None) -> Cost:
     model = model_on_context(model, "prb.cost()")
     require_simulator(model)
     costs = []
-    owner: dict[int, str] = {}  # of runs that several simulators share
+    # Name of the first simulator that uses each `Runs` object, which simulators may share.
+    owner: dict[int, str] = {}
     for simulator in simulators(model).values():
         responses = simulator.responses
         needed = simulator.propagation.cost

@@ -37,7 +37,7 @@ def warn_out_of_range(
     name: str, observed: Floats, responses: Floats, outputs: Sequence[str]
 ) -> None:
     """Warn if all observed values of an output lie outside all simulated responses."""
-    if not responses.size:  # a user's own propagation may store none
+    if not responses.size:  # a user's own propagation may store no responses
         return
     columns = observed.reshape(len(observed), -1).T
     simulated = responses.reshape(len(responses), -1).T
@@ -46,7 +46,7 @@ def warn_out_of_range(
     triples = zip(output_labels(name, outputs), columns, simulated, strict=True)
     for label, column, values in triples:
         measured, finite = column[np.isfinite(column)], values[np.isfinite(values)]
-        if not measured.size or finite.size < 16:  # few responses do not show the range
+        if not measured.size or finite.size < 16:  # too few responses to know the range
             continue
         low, high = measured.min(), measured.max()
         lowest, highest = finite.min(), finite.max()
@@ -82,7 +82,7 @@ def outlier_findings(
     only codes are reported.
     """
     columns = observed.reshape(len(observed), -1).T
-    # A user's own propagation may store no response.
+    # A user's own propagation may store no responses.
     simulated = responses.reshape(len(responses), -1).T if responses.size else np.empty((0, 0))
     labels = output_labels(name, outputs)
     findings = []
@@ -104,7 +104,7 @@ def outlier_findings(
         else:
             rest = values
         finite = simulated[k][np.isfinite(simulated[k])] if len(columns) == len(simulated) else rest
-        if gross_errors or len(rest) < 8 or len(finite) < 16:  # few do not show the range
+        if gross_errors or len(rest) < 8 or len(finite) < 16:  # too few values to know the range
             continue
         far = _separate(rest, apart, share)
         far = far[(far < finite.min()) | (far > finite.max())]
@@ -116,8 +116,9 @@ def outlier_findings(
 
 
 def _separate(values: Floats, apart: float, share: float) -> Floats:
-    """Return values at an end, at most a share of all, behind the largest gap that is wide."""
-    for count in range(int(share * len(values)) or 1, 0, -1):  # of (n,) in ascending order
+    """Return the largest group of values at an end, at most a share of all, behind a wide gap."""
+    # Values, (n,), are in ascending order.
+    for count in range(int(share * len(values)) or 1, 0, -1):
         for far, rest in (
             (values[:count], values[count:]),
             (values[-count:], values[:-count]),
@@ -136,7 +137,8 @@ def check_constant(
     Weights of equal stored responses make no difference. Responses of a propagation that simulates
     again may be equal by chance, as counts can be.
     """
-    # A user's own propagation may store none, and with +inf the data may be failures alone.
+    # A user's own propagation may store no responses. With +inf among the responses all specimens
+    # may have failed.
     if not responses.size or np.isposinf(responses).any():
         return ()
     values = responses.reshape(len(responses), -1)
@@ -174,13 +176,13 @@ def check_failing_region(
     measured there, so that the response should not fail. Raises DesignError if the share of such
     specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
     """
-    if not responses.size or not points:  # a user's own propagation may store none
+    if not responses.size or not points:  # a user's own propagation may store no responses
         return ()
     values = responses.reshape(len(responses), -1)
     is_finite = np.isfinite(values)
     if is_finite.all():
         return ()
-    from scipy.stats import rankdata  # takes a third of the import of the package
+    from scipy.stats import rankdata  # the import takes a third of the package's import time
 
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
@@ -199,7 +201,8 @@ def check_failing_region(
         first = np.clip(nearest - 4, 0, outputs.size - 9)
         steps = np.diff(outputs)[first[:, None] + np.arange(8)]
         distance = np.abs(column - outputs[nearest])
-        with np.errstate(invalid="ignore"):  # an output that failed, or was not measured
+        # Outputs that failed or were not measured are not finite.
+        with np.errstate(invalid="ignore"):
             is_apart[:, j] = beside[nearest] & (distance > apart * np.median(steps, axis=1))
         is_apart[:, j] &= np.isfinite(column)
     count = int(is_apart.any(axis=1).sum())
@@ -225,7 +228,7 @@ def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
     """
     rows = observed.reshape(len(observed), -1)
     distinct, counts = np.unique(rows, axis=0, return_counts=True)
-    # Of six specimens, duplicates of all are no chance.
+    # With six or more specimens it cannot be chance that every value occurs twice.
     if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
         return ()
     return (
@@ -239,30 +242,32 @@ def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
 
 
 def _has_few_steps(column: Floats) -> bool:
-    """Return whether n values, (n,), are rounded to less than n steps."""
+    """Return whether n values, (n,), are on a scale of fewer than n steps."""
     values = column[np.isfinite(column)]
     step = resolution(values)
     has_few = step > 0 and np.ptp(values) / step < len(column)
     return bool(has_few) or len(np.unique(values)) < 3
 
 
-# Rounding, censoring and repeats.
+# Checks for rounding, censoring and repeated values.
 
 
 @dataclass(frozen=True)
 class DataCheckOptions:
     """Thresholds of the checks."""
 
-    # Largest step of rounded values, in standard deviations, for a monotone response. At .25 the
-    # standard deviation is .05 posterior standard deviations too large with 200 specimens, at .5
-    # .21.
+    # Largest step of rounded values, in standard deviations, that is accepted if the response is
+    # monotone. With 200 specimens a step of .25 increases the estimated standard deviation by .05
+    # posterior standard deviations, a step of .5 by .21.
     step: float = 0.25
-    # The same for a response with a turning point. At .02 the bias is .02 posterior standard
-    # deviations with 200 specimens, at .05 .08 (folded response).
+    # Largest step that is accepted if the response has a turning point. With 200 specimens a step
+    # of .02 gives a bias of .02 posterior standard deviations, a step of .05 gives .08 (folded
+    # response).
     step_at_turning_point: float = 0.02
-    censored: float = 0.05  # largest p-value of a pile at an end
-    repeated: float = 0.01  # largest p-value of repeats among specimens rounded in all outputs
-    draws: int = 399  # bootstrap samples of each p-value
+    censored: float = 0.05  # p-value below which repeated values at an end are reported as censored
+    # P-value below which repeated specimens are reported, if all outputs are rounded.
+    repeated: float = 0.01
+    draws: int = 399  # number of bootstrap samples for each p-value
     seed: int = 0
 
 
@@ -277,13 +282,13 @@ def resolution(y: Floats, tolerance: float = 1e-6) -> float:
     accuracy = 4 * np.finfo(np.float64).eps * np.abs(y).max()
     values = np.unique(y)
     gaps = np.diff(values)
-    gaps = gaps[gaps > accuracy]  # equal up to the last digits
+    gaps = gaps[gaps > accuracy]  # smaller gaps are rounding errors
     if len(gaps) < 2:
         return 0.0
-    for divisor in range(1, 11):  # the smallest gap may itself be several steps
+    for divisor in range(1, 11):  # the smallest gap may consist of several steps
         step = float(gaps.min()) / divisor
         multiples = (values - values[0]) / step
-        if multiples.max() > 1e4:  # almost any number is close to a multiple of so fine a step
+        if multiples.max() > 1e4:  # so fine a step fits almost any numbers by chance
             return 0.0
         error = np.abs(multiples - np.round(multiples)).max()
         if error < tolerance * max(1.0, multiples.max()) + accuracy / step:
@@ -310,7 +315,8 @@ def count_at_ends(
     n, high, low = len(y), y.max(), y.min()
     if not step:
         at_end = np.array([np.sum(y == high), np.sum(y == low)])
-        # Copies of specimens repeat values between the ends, too.
+        # Copied specimens also repeat values between the ends, so that these repeats are the
+        # reference.
         _, repeats = np.unique(y[(y > low) & (y < high)], return_counts=True)
         p_values = np.where(at_end > repeats.max(initial=1), 1 / (draws + 1), 1.0)
     else:
@@ -409,14 +415,15 @@ def data_findings(
     m = y.shape[1]
     labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
     largest_step = options.step_at_turning_point if several_roots else options.step
-    # Copies of a specimen would pile up at the ends of its outputs.
+    # Copies of a specimen count once, because they would look like censored values at the ends.
     copies = [i for group in identical_specimens(y) for i in group[1:]]
     counted = np.ones(len(y), dtype=bool)
     counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
     findings: list[Finding] = []
-    rounded_outputs: list[tuple[str, float, float]] = []  # label, step and its share
+    # Label, step, and step in standard deviations.
+    rounded_outputs: list[tuple[str, float, float]] = []
     steps = np.zeros(m)
-    exact = y.copy()  # NaN at a limit, where specimens are equal by censoring
+    exact = y.copy()  # NaN at a censoring limit, where specimens may be equal without being copies
     for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):
         values = y[np.isfinite(y[:, j]), j]
         if len(values) < 3:
@@ -472,7 +479,7 @@ def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: floa
     return Finding("rounded-data", text, "likelihood.md#rounded-data")
 
 
-# Runs of a response, for the log-likelihood by specimen.
+# Checks of the runs, for the log-likelihood by specimen.
 
 
 def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
@@ -541,7 +548,7 @@ def unreached(outputs: Floats, readings: Readings) -> str:
 
 
 def _n_beyond(runs: Floats, readings: Floats) -> int:
-    """Return how many readings of two outputs, (N, 2), lie beyond all runs (n, 2) in a direction.
+    """Return the number of readings of two outputs (N, 2) beyond all runs (n, 2) in a direction.
 
     The direction is that of the linear discriminant between the runs and the readings.
     """
@@ -578,7 +585,7 @@ def refuse_unused_inputs(
 
 
 def _singular_vectors(jacobian: Floats) -> tuple[Floats, Floats]:
-    """Return singular values, (k, d), and right singular vectors, (k, d, d)."""
+    """Return singular values (k, d) and right singular vectors (k, d, d) of finite Jacobians."""
     finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     if finite.shape[1] < finite.shape[2]:
         return np.empty((0, 0)), np.empty((0, 0, 0))
@@ -598,7 +605,7 @@ def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) 
     )
 
 
-# The emulator of a response.
+# Checks of the emulator of a response.
 
 
 def misfit_findings(
@@ -615,7 +622,7 @@ def misfit_findings(
     The largest misfit in nats is still an error of the emulator: ten standard deviations, (m,).
     With gross errors in the likelihood half of the specimens may have such readings.
     """
-    # The first root of each specimen with the smallest misfit.
+    # For each specimen take the mode with the smallest misfit.
     order = np.lexsort((modes.misfit, modes.specimen))
     specimens, first = np.unique(modes.specimen[order], return_index=True)
     best = order[first]

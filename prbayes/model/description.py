@@ -28,11 +28,11 @@ from prbayes.response.inputs import argument_names, unit_of
 from prbayes.response.outputs import Outputs
 from prbayes.response.pymc_dims import is_random
 
-# Fields of the description of a variable, and of a simulator.
+# Fields in the description of a variable, and in that of a simulator.
 _VARIABLE = ("name", "role", "distribution")
 _SIMULATOR = ("name", "response", "metric", "propagation", "n_points", "specimens")
 
-_CONSTANT = "<constant>"  # PyMC's text for an array
+_CONSTANT = "<constant>"  # PyMC prints this text instead of an array
 
 
 def describe(model: pm.Model) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
             described.append((rv, "observed", _distribution(rv, named)))
     simulators = []
     for node in by_metric.values():
-        runs = type(node.propagation).__name__  # of a user's own class, which may have no n
+        runs = type(node.propagation).__name__  # a user's own propagation may have no attribute n
         if hasattr(node.propagation, "n"):
             use = ", once; weighted" if node.bound.stored else ""
             runs = f"{node.propagation.n} runs{use} for each population"
@@ -83,10 +83,11 @@ def _simulator(
     runs: str,
 ) -> dict[str, Any]:
     """Return the description of a simulator."""
-    inputs = []  # [name, unit, distribution or value] of each; without a name a text alone
+    # [name, unit, distribution or value] of each input; an unnamed input is a text alone.
+    inputs = []
     names = argument_names(simulator.inputs, simulator.responses.function)
     for name, argument in zip(names, simulator.inputs.arguments, strict=True):
-        if isinstance(argument, int):  # the place of an aleatory input
+        if isinstance(argument, int):  # the argument is the index of an aleatory input
             x = simulator.inputs.aleatory[argument]
             is_known = argument in simulator.inputs.conditions
             unit = f" ({unit_of(x)})" if unit_of(x) else ""
@@ -106,7 +107,8 @@ def _simulator(
     if simulator.specimens is not None:
         labels = list(dict.fromkeys(map(str, simulator.specimens.tolist())))
         n_specimens = f"{len(labels)} specimens"
-        specimens = f"{n_specimens}: {', '.join(labels[:40])}"  # three lines of a report
+        # 40 labels take about three lines of a report.
+        specimens = f"{n_specimens}: {', '.join(labels[:40])}"
         if len(labels) > 40:
             specimens += f", and {len(labels) - 40} more"
     return {
@@ -138,7 +140,7 @@ def as_attribute(model: pm.Model) -> dict[str, str]:
 
 def json_attribute(name: str, content: Mapping[str, Any]) -> dict[str, str]:
     """Return JSON as an attribute of an HDF5 file; none where it is too long, near 64 KiB."""
-    # JSON writes letters beyond ASCII as six characters of a byte each: its characters are bytes.
+    # JSON escapes letters beyond ASCII, so that its length in characters is the length in bytes.
     text = json.dumps(content)
     return {name: text} if len(text) <= 60_000 else {}
 
@@ -156,7 +158,7 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
 
 
 def _stored_simulator(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the description of a simulator in a file; 1.0.0rc1 stored inputs as one text."""
+    """Return a stored description of a simulator; 1.0.0rc1 has stored the inputs as one text."""
     texts = {key: str(stored[key]) for key in _SIMULATOR}
     inputs = stored["inputs"]
     rows = [["", "", inputs]] if isinstance(inputs, str) else inputs
@@ -188,7 +190,7 @@ def _distribution(rv: Any, named: Set[Any]) -> str:
 
 
 def _constants(rv: Any) -> list[str]:
-    """Return the texts of the parameters of a distribution that are arrays of constants."""
+    """Return the parameters of a distribution that are constant arrays, as texts."""
     try:
         parameters = rv.owner.op.dist_params(rv.owner)
     except (AttributeError, TypeError, ValueError):  # some distributions have no such method
@@ -196,8 +198,8 @@ def _constants(rv: Any) -> list[str]:
     texts = []
     for parameter in parameters:
         while parameter.owner is not None and len(parameter.owner.inputs) == 1:
-            (parameter,) = parameter.owner.inputs  # with other axes
-        if is_random(parameter):  # such as standard deviations of a covariance
+            (parameter,) = parameter.owner.inputs  # operations with one input only change the axes
+        if is_random(parameter):  # such as the distribution of standard deviations in a covariance
             texts += _constants(parameter)
             continue
         value = getattr(parameter, "data", None)
@@ -315,12 +317,12 @@ def labelled_responses(
 
 
 def _with_output_names(data: xr.Dataset, name: str, outputs: Outputs) -> xr.Dataset:
-    """Return responses with one simulator's outputs named, unless the model names them."""
+    """Return responses with a dimension that names the outputs, unless the model names it."""
     last = str(data[name].dims[-1])
     if last != f"{name}_dim_1":
         return data
     labels = np.asarray(outputs.labels)
-    if labels.dtype.kind not in "iuf":  # a file stores numbers and texts
+    if labels.dtype.kind not in "iuf":  # a file can store numbers and texts only
         labels = np.array(outputs.names)
     dim = outputs.dim
     if dim in data.coords:
@@ -328,6 +330,7 @@ def _with_output_names(data: xr.Dataset, name: str, outputs: Outputs) -> xr.Data
     else:
         is_free = dim not in data.dims and dim not in data.data_vars
     if not is_free:
-        dim = f"{name}_{dim}"  # another simulator has other outputs
+        # The dimension's name is in use for another simulator with other outputs.
+        dim = f"{name}_{dim}"
     renamed = data[name].rename({last: dim})
     return data.drop_vars(name).assign({name: renamed}).assign_coords({dim: labels})

@@ -43,14 +43,14 @@ from prbayes.specimens.emulation import Surface
 class EmulatedPopulationSizes:
     """Sizes of emulated samples."""
 
-    # Specimens of a population in plots and scores, so many that the error of a quantile is far
+    # Number of specimens of a population in plots and scores. The error of a quantile is then far
     # below the width of a posterior band.
     specimens: int = 1024
-    # Populations, and specimens of each population, in the weighted sample of a decision. Twice as
-    # many change probabilities by less than their reported error.
+    # Number of populations, and number of specimens of each, in the weighted sample of a decision.
+    # Twice as many change probabilities by less than their reported error.
     populations: int = 64
     of_each: int = 64
-    blocks: int = 8  # parts of the sample whose differences give its error
+    blocks: int = 8  # number of batches of the sample, whose scatter gives the Monte Carlo error
 
 
 _SIZES = EmulatedPopulationSizes()
@@ -66,8 +66,9 @@ class EmulatedResponse:
     surface: Surface  # surface through the finite runs
     columns: slice  # columns of the surface that belong to the response
     event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
-    error: Floats  # (m,): root mean square error of left-out runs, near the specimens
-    is_continued: bool = True  # whether there is a response beyond the runs' range
+    error: Floats  # (m,): root mean square cross-validation error near the specimens
+    # Whether responses beyond the runs' range are those at its end, or NaN.
+    is_continued: bool = True
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
@@ -91,10 +92,11 @@ class EmulatedResponse:
         z = self.coordinates.of(inputs, 1)
         ends = self._in_range(z)
         beyond = z - ends
-        # Slopes are differences to points further inside, by 2 % of the range at most.
+        # Slopes are differences to points further inside, by up to 2 % of the range.
         share = 0.02 / np.maximum((np.abs(beyond) / self._width).max(axis=1), 1e-12)
         inner = self._in_range(ends - share[:, None] * beyond)
-        with np.errstate(invalid="ignore"):  # infinite values have no difference
+        # Infinite outputs, of failed specimens, have no difference.
+        with np.errstate(invalid="ignore"):
             difference = (self._at(ends) - self._at(inner)).reshape(values.shape)
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
@@ -112,41 +114,6 @@ class EmulatedResponse:
         """Return the outputs at coordinates within the runs' range, (n, m)."""
         values = self.surface.values(z)[:, self.columns]
         return with_failures(values, z / self._width, self.z / self._width, self.y)
-
-
-def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
-    """Compute another response at the points of a likelihood's runs, and interpolate it.
-
-    Raises a DesignError if fewer than eight runs have a finite response.
-    """
-    preparation = prepared(likelihood)
-    run_z = preparation.emulation.z
-    runs = likelihood.coordinates.inputs(run_z)
-    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
-    values = responses(points, [])
-    coordinates = Coordinates.of_prior(responses.inputs)
-    z = coordinates.of(points, 1)
-    y = values.reshape(len(z), -1)
-    is_finite = np.isfinite(y).all(axis=1)
-    if is_finite.sum() < 8:
-        raise DesignError(
-            f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
-            f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
-            "prb.predict, which computes responses at new specimens"
-        )
-    # Left-out errors count at runs within the range of the specimens' roots, or at all runs if few
-    # are there.
-    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
-    if is_near.sum() < 16:
-        is_near = np.ones(len(run_z), dtype=bool)
-    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
-    rows = np.flatnonzero(is_finite)[distinct]
-    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
-    surface = fit_emulator(z[rows], y[rows], near)
-    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
-    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 
 def values_of_inputs(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
@@ -176,15 +143,15 @@ class EmulatedSimulator:
     inputs: Inputs = field(init=False)
     responses: Responses = field(init=False)
     outputs: Outputs = field(init=False)
-    # Whether responses of a population's specimens are known without further runs.
+    # Whether responses of a population's specimens are available without further runs.
     has_specimens: bool = field(init=False)
 
-    # A `Node` has its design here.
+    # A `Node` has its design in this attribute; emulated responses need no design.
     reweighted: ClassVar[None] = None
-    max_lost: float = field(init=False)  # largest share of a population without response
+    max_lost: float = field(init=False)  # largest accepted share of a population without response
 
     def __post_init__(self) -> None:
-        """Set the attributes of the measurement, or of one of its groups."""
+        """Copy the attributes of the measurement, or of one of its groups."""
         m, groups = self.measurement, self.measurement.inputs.groups
         name, group, rows = m.name, "", np.arange(len(m.observed))
         if groups is not None and self.place is not None:
@@ -208,15 +175,9 @@ class EmulatedSimulator:
             has_specimens=self.likelihood.has_table or not self.likelihood.calls_response,
         )
 
-    @property
-    def conditions(self) -> Floats | None:
-        """The conditions of the specimens, (N, C), None without one."""
-        conditions = self.measurement.conditions
-        return None if conditions is None else conditions[self.rows]
-
     @cached_property
-    def _emulated(self) -> EmulatedResponse:
-        """The emulator of the simulator's outputs; its first use computes the runs."""
+    def emulated(self) -> EmulatedResponse:
+        """The emulator of the simulator's outputs; the first access computes the runs."""
         emulation = prepared(self.likelihood).emulation
         columns = output_columns(self.likelihood, self.measurement)
         return EmulatedResponse(
@@ -230,36 +191,14 @@ class EmulatedSimulator:
             is_continued=not self.likelihood.has_table,
         )
 
-    def emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return a response of the same inputs as a function of them.
-
-        The simulator's own response costs no run. Another one is computed at the points of the
-        emulator's runs.
-        """
-        if responses.same_as(self.responses):
-            emulated = self._emulated
-            runs = self.likelihood.coordinates.inputs(emulated.z)
-            points = values_of_inputs(runs, self.likelihood.inputs, responses.inputs)
-            values = emulated.y.reshape(len(emulated.z), *emulated.event)
-            responses.refuse_change(points, values, self.responses)
-            return emulated
-        return _emulate_at_runs(self.likelihood, responses)
-
     def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return emulated responses and weights of populations, (k, n) or (k, n, m) and (k, n).
 
         The quasi-random numbers are the same for all calls.
         """
         size, n = len(parents[0]), _SIZES.specimens
-        values = self._emulated(self.draw_specimens(parents, n))
+        values = self.emulated(draw_specimens(self, parents, n))
         return values.reshape(size, n, *self.measurement.event), np.full((size, n), 1 / n)
-
-    def draw_specimens(self, parents: Sequence[Floats], n: int) -> list[Floats]:
-        """Return n specimens of each of k populations, (k n, *event) by input."""
-        rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
-        specimens = at_conditions(self.inputs, specimens, self.conditions)
-        return [x.reshape(-1, *x.shape[2:]) for x in specimens]
 
     def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
         """Return the discrepancies of populations from a prepared metric, (k,)."""
@@ -267,9 +206,58 @@ class EmulatedSimulator:
         weights = responding_weights(values, weights)
         return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(values))])
 
-    def weighted_sample(self, parents: Sequence[Floats]) -> EmulatedSample:
-        """Return specimens whose weights make populations near those at parents."""
-        return EmulatedSample.of(self, parents)
+
+def draw_specimens(simulator: EmulatedSimulator, parents: Sequence[Floats], n: int) -> list[Floats]:
+    """Return n specimens of each of k populations, (k n, *event) by input."""
+    inputs, conditions = simulator.inputs, simulator.measurement.conditions
+    if conditions is not None:
+        conditions = conditions[simulator.rows]
+    rng = np.random.default_rng(0)
+    specimens, _ = new_specimens(simulator.name, inputs, list(parents), n, rng)
+    specimens = at_conditions(inputs, specimens, conditions)
+    return [x.reshape(-1, *x.shape[2:]) for x in specimens]
+
+
+def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedResponse:
+    """Return a response of a simulator's inputs as a function of them.
+
+    The simulator's own response costs no run. Another one is computed at the points of the
+    emulator's runs. Raises a DesignError if fewer than eight of these have a finite response.
+    """
+    likelihood = simulator.likelihood
+    preparation = prepared(likelihood)
+    run_z = preparation.emulation.z
+    runs = likelihood.coordinates.inputs(run_z)
+    points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
+    if responses.same_as(simulator.responses):
+        emulated = simulator.emulated
+        values = emulated.y.reshape(len(run_z), *emulated.event)
+        responses.refuse_change(points, values, simulator.responses)
+        return emulated
+    values = responses(points, [])
+    coordinates = Coordinates.of_prior(responses.inputs)
+    z = coordinates.of(points, 1)
+    y = values.reshape(len(z), -1)
+    is_finite = np.isfinite(y).all(axis=1)
+    if is_finite.sum() < 8:
+        raise DesignError(
+            f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
+            f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
+            "prb.predict, which computes responses at new specimens"
+        )
+    # Cross-validation errors count at runs within the range of the specimens' likely inputs, or at
+    # all runs if this range contains few runs.
+    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    if is_near.sum() < 16:
+        is_near = np.ones(len(run_z), dtype=bool)
+    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
+    rows = np.flatnonzero(is_finite)[distinct]
+    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
+    surface = fit_emulator(z[rows], y[rows], near)
+    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
+    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
@@ -301,17 +289,19 @@ class EmulatedSample:
     """
 
     simulator: EmulatedSimulator
-    points: list[Floats]  # (n, *event): values of each input
+    points: list[Floats]  # values of each input, (n, *event)
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
-    blocks: NDArray[np.intp]  # (n,): index of the eighth, which represents the mixture itself
+    # (n,): batch of each specimen; each of the eight batches represents the mixture itself.
+    blocks: NDArray[np.intp]
     inputs: Inputs  # inputs of the simulator
     n_points: int  # number of specimens
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
-    max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
-    has_runs: ClassVar[Literal[False]] = False  # whether points are runs, as those of a design
-    on_line: ClassVar[bool] = False  # whether the points are a quadrature rule
-    is_continued: ClassVar[bool] = True  # whether responses are constant beyond the runs
+    max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
+    # Whether the points are runs, as those of a design are. Otherwise responses beyond the runs are
+    # those at the end of their range.
+    has_runs: ClassVar[Literal[False]] = False
+    on_line: ClassVar[bool] = False  # whether the points form a quadrature rule
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
@@ -321,7 +311,7 @@ class EmulatedSample:
         parents = [parent[rows] for parent in parents]
         of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
         of_each *= _SIZES.blocks
-        flat = simulator.draw_specimens(parents, of_each)
+        flat = draw_specimens(simulator, parents, of_each)
         log_p = _population_log_densities(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
@@ -345,14 +335,15 @@ class EmulatedSample:
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
 
-    def n_runs_of(self, responses: Responses) -> int:
-        """Return the number of runs behind a response."""
-        return len(self._emulator(responses).z)
+    @property
+    def n_runs(self) -> int:
+        """Number of runs of the emulator of any response."""
+        return len(self.simulator.emulated.z)
 
     def _emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return the emulator of a response, which the first call for the response fits."""
+        """Return the emulator of a response; the first call for the response fits the emulator."""
         if responses not in self._emulators:
-            self._emulators[responses] = self.simulator.emulator(responses)
+            self._emulators[responses] = emulator_of(self.simulator, responses)
         return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
@@ -379,7 +370,7 @@ class EmulatedSample:
 def _population_log_densities(
     inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
 ) -> Floats:
-    """Return log-densities of specimens in populations, (k, n)."""
+    """Return log-densities of n specimens in k populations, (k, n)."""
     function = compiled_log_density(inputs)
     step = max(1, AT_ONCE // len(points[0]))
     parts = []

@@ -46,7 +46,7 @@ from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, with_shared_arrays
 from prbayes.response.inputs import Inputs, is_known, read_inputs
 
-# Points of a design from which on samplers start with an eighth of them.
+# Number of points of a design from which on samplers start with an eighth of the points.
 _LARGE = SIZES.first
 
 
@@ -54,12 +54,12 @@ _LARGE = SIZES.first
 class Evaluation:
     """Terms of the log posterior of a batch of thetas."""
 
-    log_prior: Floats  # (P,): with the Jacobian of the transforms
+    log_prior: Floats  # (P,): log-density of the prior, with the Jacobian of the transforms
     log_other: Floats  # (P,): log-likelihood of ordinary observed variables, and potentials
-    # (P, k): one column per simulator; +inf where a population is invalid or has no support.
+    # (P, k): a column for each simulator; +inf where a population is invalid or has no support.
     discrepancies: Floats
-    # (P, k): weight of a population on points without response; NaN where the population is
-    # invalid, and for stored responses, whose support reports it.
+    # (P, k): share of a population's weight on points without response. It is NaN where the
+    # population is invalid, and for stored responses, whose support reports the share.
     lost: Floats
 
     def log_likelihood(self, epsilon: Floats) -> Floats:
@@ -75,29 +75,32 @@ class Evaluator:
     model: pm.Model
     hyperparameters: Hyperparameters  # names, transforms and prior of theta
     nodes: tuple[Node, ...]  # simulators with a metric of distributions
-    # Simulators with a log-likelihood by specimen, by group, whose populations are emulated.
+    # Simulators with a log-likelihood by specimen, whose populations are emulated; an entry for
+    # each group.
     emulated: tuple[EmulatedSimulator, ...]
-    # Whether the nodes have the data and designs of the model, whose graph is the objective then.
+    # Whether the nodes have the data and designs of the model. Then the graph of the model is the
+    # objective.
     has_graph: bool = True
-    functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
-    likelihoods: tuple[SpecimenLikelihood, ...] = field(init=False)  # one for common specimens
-    measurements: tuple[Measurement, ...] = field(init=False)  # simulators with all of their groups
-    # The nodes, then simulators whose responses are emulated, by group.
+    # Compiled functions, shared by copies.
+    functions: dict[Any, Any] = field(default_factory=dict, repr=False)
+    # Likelihoods; simulators with common specimens share one.
+    likelihoods: tuple[SpecimenLikelihood, ...] = field(init=False)
+    # Simulators with a log-likelihood by specimen, not divided into groups.
+    measurements: tuple[Measurement, ...] = field(init=False)
+    # The nodes, then an entry for each group of the simulators whose responses are emulated.
     simulators: list[PopulationSimulator] = field(init=False, repr=False)
-    reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
+    # Designs with stored runs by the simulator's name.
+    reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)
     responses_per_theta: int = field(init=False)  # number of scalar responses of one theta
-    # Observed variables without a metric of distributions, and potentials.
-    other_terms: list[Any] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Set the attributes of all simulators, and of the other terms."""
+        """Set the attributes that follow from the simulators and the model."""
         vars(self).update(
             likelihoods=tuple(dict.fromkeys(e.likelihood for e in self.emulated)),
             measurements=tuple(dict.fromkeys(e.measurement for e in self.emulated)),
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
             responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
-            other_terms=[*_ordinary(self.model), *self.model.potentials],
         )
 
     @classmethod
@@ -105,7 +108,8 @@ class Evaluator:
         """Return the evaluator of a model with at least one `Simulator`."""
         require_simulator(model)
         refuse_replaced_expressions(model)
-        hyperparameters = Hyperparameters.of(model)  # refuses a model before its first runs
+        # Raises for an invalid model before its first runs.
+        hyperparameters = Hyperparameters.of(model)
         computed = tuple(nodes(model).values())
         evaluator = cls(model, hyperparameters, computed, tuple(emulated_simulators(model)))
         for likelihood in evaluator.likelihoods:
@@ -113,7 +117,7 @@ class Evaluator:
         return evaluator
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the model by cloudpickle: models of PyMC have no plain pickle."""
+        """Pickle the model by cloudpickle, because models of PyMC cannot be pickled otherwise."""
         import cloudpickle
 
         targets = None if self.has_graph else [node.target for node in self.nodes]
@@ -127,7 +131,8 @@ class Evaluator:
     @property
     def n_responses(self) -> int:
         """Number of scalar responses that were computed; shared responses count once."""
-        counts: dict[int, int] = {}  # by runs
+        # Number of responses by the id of the runs, which simulators may share.
+        counts: dict[int, int] = {}
         for node in self.nodes:
             runs = id(node.responses.runs)
             counts[runs] = max(node.responses.count, counts.get(runs, 0))
@@ -138,7 +143,7 @@ class Evaluator:
         total = np.zeros(len(thetas))
         for likelihood in self.likelihoods:
             values = variables_at(self.hyperparameters, thetas)
-            # Populations in blocks, so that memory stays constant with many specimens.
+            # Populations are evaluated in blocks, so that memory stays bounded with many specimens.
             step = max(1, 4 * AT_ONCE // len(likelihood.readings))
             for first in range(0, len(thetas), step):
                 rows = slice(first, first + step)
@@ -240,14 +245,6 @@ class Evaluator:
 
         return counted
 
-    def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
-        """Return an evaluator of the same model with other prepared metrics, by simulator."""
-        if len(targets) > 1:
-            targets = [with_unbiased_areas(target) for target in targets]
-        pairs = zip(self.nodes, targets, strict=True)
-        changed = tuple(replace(node, target=target) for node, target in pairs)
-        return replace(self, nodes=changed, has_graph=False)
-
     def observing(
         self,
         data: dict[str, Floats],
@@ -267,7 +264,7 @@ class Evaluator:
                 counted = node.weights
             target = (metric or node.metric).against(observed, counted)
             targets.append(target.metric.for_inputs(target, node.bound.inputs.dimensions))
-        return self.with_targets(common_targets(self.nodes, targets))
+        return with_targets(self, common_targets(self.nodes, targets))
 
     def parents(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
@@ -301,7 +298,7 @@ class Evaluator:
             bound = node.reweighted
             if bound is None:
                 continue
-            # Some populations at a time: their weights at all points take memory.
+            # Populations are evaluated in blocks, because their weights at all points need memory.
             step = max(1, IN_CACHE // bound.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
@@ -314,12 +311,26 @@ class Evaluator:
 
 
 def _unpickled(payload: bytes) -> Evaluator:
-    """Return an evaluator that was pickled."""
+    """Restore an evaluator from its pickle."""
     import cloudpickle
 
     model, targets = cloudpickle.loads(payload)
     evaluator = Evaluator.of(model)
-    return evaluator if targets is None else evaluator.with_targets(targets)
+    return evaluator if targets is None else with_targets(evaluator, targets)
+
+
+def with_targets(evaluator: Evaluator, targets: list[Discrepancy]) -> Evaluator:
+    """Return an evaluator of the same model with other prepared metrics, by simulator."""
+    if len(targets) > 1:
+        targets = [with_unbiased_areas(target) for target in targets]
+    pairs = zip(evaluator.nodes, targets, strict=True)
+    changed = tuple(replace(node, target=target) for node, target in pairs)
+    return replace(evaluator, nodes=changed, has_graph=False)
+
+
+def has_other_terms(model: pm.Model) -> bool:
+    """Return whether a model has terms other than metrics of distributions, and priors."""
+    return bool(_ordinary(model) or model.potentials)
 
 
 def _ordinary(model: pm.Model) -> list[Any]:
@@ -359,7 +370,7 @@ def refuse_replaced_expressions(model: pm.Model) -> None:
 
 
 def _inputs_of_simulators(model: pm.Model) -> list[Inputs]:
-    """Return the inputs of the simulators of a model, computed or not."""
+    """Return the inputs of all simulators of a model, whether or not their runs are computed."""
     records = [*simulators(model).values(), *measurements_of(model).values()]
     return [record.responses.inputs for record in records]
 
@@ -368,7 +379,7 @@ def _inputs_of_simulators(model: pm.Model) -> list[Inputs]:
 
 
 def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
-    """Return the parents of the nodes in the evaluator's model, which may be a clone."""
+    """Return the parents of each node in the evaluator's model, which may be a clone."""
     params = []
     for node in evaluator.nodes:
         application = evaluator.model.named_vars[node.name].owner
@@ -376,7 +387,7 @@ def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
     return params
 
 
-# Terms beside the discrepancies.
+# Terms of the log posterior other than discrepancies.
 
 
 def _log_other(model: pm.Model, variables: list[Any]) -> Any:
@@ -397,7 +408,7 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
         params += [model[str(v.name)] for v in likelihood.variables() if not is_known(v)]
     direct = {v for v in ancestors(params, blockers=free) if v in free}
     joined = free & set(ancestors(list(direct)))
-    # A variable comes after those that it depends on.
+    # `free_RVs` is in topological order, so that a variable comes after its parents.
     for rv in model.free_RVs:
         if joined.intersection(ancestors([rv])):
             joined.add(rv)
@@ -455,7 +466,7 @@ def is_current(evaluator: Evaluator) -> bool:
 
 def n_design_runs(evaluator: Evaluator) -> int:
     """Return the number of runs of all designs; shared runs count once."""
-    counts: dict[int, int] = {}  # by runs
+    counts: dict[int, int] = {}  # number of runs by the id of the runs, which simulators may share
     for bound in evaluator.reweighted.values():
         runs = id(bound.responses.runs)
         counts[runs] = max(bound.n_runs, counts.get(runs, 0))
@@ -495,22 +506,26 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
 class Requirement:
     """How well a design has to support populations."""
 
-    ess: float  # median weight effective sample size, as a share of the design's required one
-    lowest_ess: float  # the same at the 5% quantile
-    # Bounds of the mean raw weight, which is one if the design covers the population.
+    # Median effective sample size of the weights, as a share of the design's required one.
+    ess: float
+    lowest_ess: float  # 5% quantile of the effective sample size, in the same unit
+    # Bounds of the mean importance weight, which is one if the design covers the population.
     mass: tuple[float, float]
-    tails: bool  # whether 5% and 95% quantiles of the mean raw weight are bounded, or the median
+    # Whether both the 5% and the 95% quantile of the mean weight are bounded, or the median only.
+    tails: bool
 
 
-# Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
-# 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
-# optimum by .05 standard errors; twice is more than 1024 points give with two inputs.
+# Requirement of the optimiser and the samplers, whose designs grow until they meet it. A mean
+# weight of 0.8 to 1.25 misses at most a fifth of the population's mass. With half the effective
+# sample size an optimum moves by .05 standard errors. Twice the effective sample size cannot be
+# reached by 1024 points with two inputs.
 ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
-# Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
-# supported than its centre, and resampling needs no derivative.
+# Requirement of predictions, whose designs do not grow. It is less strict, because a design covers
+# draws at the edge of a posterior less well than the centre, and because resampling needs no
+# derivative.
 TOLERABLE = Requirement(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
-# Of plots: a curve may be worse than an estimate. A curve of fewer than ten responses, a fifth of
-# the smallest requirement, would show the design.
+# Requirement of plots, where a curve may be less accurate than an estimate. A curve from fewer than
+# ten responses, a fifth of the smallest requirement, would show the single points.
 VISIBLE = Requirement(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 
 
@@ -518,8 +533,8 @@ VISIBLE = Requirement(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 class Shortcoming:
     """Requirements that a design does not meet for populations."""
 
-    text: str  # what was got and expected, as the end of a sentence
-    is_lost: bool  # whether too much weight is on points without response
+    text: str  # end of a sentence: what was got, and what was expected
+    is_lost: bool  # whether the shortcoming is too much weight on points without response
 
     def __str__(self) -> str:
         """Return the text."""
@@ -544,7 +559,7 @@ def supports_each(
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     least, most = requirement.mass
     covered = (mass >= least) & (mass <= most)
-    # A sum of zero weights may be rounded.
+    # A sum of weights that are zero may differ from zero by rounding.
     lost_little = lost <= max(max_lost, 1e-12)
     return np.asarray((ess >= requirement.ess * required_ess) & covered & lost_little)
 
@@ -569,10 +584,10 @@ def shortcoming(
             is_lost=True,
         )
     complaints = []
-    # Single populations far out may fall short.
+    # Quantiles are compared, because single extreme populations may have a small sample size.
     low, middle = np.quantile(ess, [0.05, 0.5])
     least, need = requirement.lowest_ess * required_ess, requirement.ess * required_ess
-    # A comparison with NaN is false: the design falls short.
+    # A comparison with NaN is false, so that NaN is a shortcoming.
     if not (middle >= need and low >= least):
         complaints.append(
             f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) "

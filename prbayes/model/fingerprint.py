@@ -33,15 +33,16 @@ from prbayes.response.inputs import Inputs
 class Level(IntEnum):
     """How much of two problems has to be the same; each level includes those before it."""
 
-    # Hyperparameters, data, inputs and responses: populations agree. Responses at the same points
-    # are compared; `require_same_responses` continues where the points differ.
+    # Hyperparameters, data, inputs and responses are the same, so that populations agree. Responses
+    # are compared at the same points; `require_same_responses` compares them if the points differ.
     POPULATIONS = 1
-    PRIORS = 2  # and priors and other likelihood terms
-    # And metrics and propagations, and whether the prior was minimised. A design that has grown
-    # since is the same problem.
+    PRIORS = 2  # priors and other likelihood terms are the same as well
+    # Metrics and propagations are the same as well, and whether the prior was minimised. A design
+    # that has grown since then counts as the same.
     OPTIMUM = 3
-    POSTERIOR = 4  # and epsilons
-    RUN = 5  # and designs: all that draws depend on, except the sampler's settings
+    POSTERIOR = 4  # epsilons are the same as well
+    # Designs are the same as well: everything that draws depend on, except the sampler's settings.
+    RUN = 5
 
 
 _REMEDIES = {
@@ -64,14 +65,16 @@ class SimulatorIdentity:
     inputs: str  # the response's arguments, as PyMC prints them
     metric: str
     propagation: str
-    n_points: int = 0  # runs of the design
-    batches: int = 1  # how often points of the design were drawn
-    epsilon: float = 1.0  # NaN while unset
-    responses: tuple[float, ...] = ()  # the first ones
-    discrepancies: tuple[float, ...] = ()  # at fixed thetas; empty where they would cost responses
-    # Aleatory inputs of the first two responses; empty where the response has epistemic ones.
+    n_points: int = 0  # number of runs of the design
+    batches: int = 1  # number of batches in which the design's points were drawn
+    epsilon: float = 1.0  # epsilon, NaN while it is not set
+    responses: tuple[float, ...] = ()  # first responses
+    # Discrepancies at fixed thetas; empty if they would need further responses.
+    discrepancies: tuple[float, ...] = ()
+    # Aleatory inputs of the first two responses; empty if the response has epistemic inputs.
     points: tuple[tuple[float, ...], ...] = ()
-    # Of a specimen likelihood: digests of data, weights and labels as a metric has them.
+    # Digests of data, weights and labels as a metric of distributions would have them; only for a
+    # log-likelihood by specimen.
     with_metric: tuple[str, ...] = ()
 
 
@@ -79,14 +82,16 @@ class SimulatorIdentity:
 class Identity:
     """What identifies a problem."""
 
-    shapes: dict[str, tuple[int, ...]]  # of value variables by name, such as 'sigma_log__'
+    shapes: dict[str, tuple[int, ...]]  # shapes of value variables by name, such as 'sigma_log__'
     priors: dict[str, str]  # distributions of free variables, as PyMC prints them
     terms: tuple[str, ...]  # other observed variables, and names of potentials
     simulators: tuple[SimulatorIdentity, ...]
-    prior_minimised: bool | None = None  # None for what was not minimised
-    # Fixed points of the prior, elements in the order of the alphabet; empty without numbers.
+    # Whether the prior was minimised; None if nothing was minimised.
+    prior_minimised: bool | None = None
+    # Fixed points of the prior, with elements in alphabetical order; empty if no numbers are
+    # computed.
     thetas: tuple[tuple[float, ...], ...] = ()
-    log_prior: tuple[float, ...] = ()  # at these points
+    log_prior: tuple[float, ...] = ()  # log-density of the prior at these points
     log_other: tuple[float, ...] = ()  # log-likelihood of other terms at these points
 
 
@@ -101,7 +106,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
         shapes = hyperparameters.shapes
         parts: list[Node | Measurement] = [*problem.nodes, *problem.measurements]
         simulators = list(map(_simulator_identity, parts))
-        # A power of two: Sobol points are balanced then.
+        # Four points, because Sobol points are balanced if their number is a power of two.
         thetas, order = fixed_points(hyperparameters, 4)
         for k, node in enumerate(problem.nodes):
             if node.bound.stored:
@@ -131,7 +136,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
         shapes=shapes,
         priors={str(rv.name): as_pymc_writes(rv, named) for rv in model.free_RVs},
         terms=tuple(sorted(terms)),
-        # Clones may order variables in other ways.
+        # Simulators are sorted, because clones may order variables differently.
         simulators=tuple(sorted(simulators, key=attrgetter("name"))),
         prior_minimised=prior_minimised,
         **numbers,
@@ -153,7 +158,7 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             "n_points": bound.n_runs,
             "batches": batches,
             "epsilon": simulator.epsilon_value,
-            # A design grows at its end: the first responses stay the same.
+            # A design grows at its end, so that the first responses do not change.
             "responses": _tuples(bound.first_responses[:8].ravel()),
             "points": _first_points(simulator),
         }
@@ -177,7 +182,7 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
 
 
 def _in_fixed_order(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
-    """Return data in an order of their own: a metric's result does not depend on theirs."""
+    """Return data in sorted order, because a metric does not depend on the order of specimens."""
     order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
     return observed[order], weights[order], None if labels is None else labels[order]
 
@@ -216,19 +221,19 @@ def _inputs(inputs: Inputs) -> str:
 
 
 def _digest(*contents: Any) -> str:
-    """Return a digest of arrays and texts; None is empty."""
+    """Return a digest of arrays and texts, without those that are None."""
     data = [x.encode() if isinstance(x, str) else x.tobytes() for x in contents if x is not None]
     return hashlib.sha256(b"".join(data)).hexdigest()[:16]
 
 
 def _tuples(values: Any) -> Any:
-    """Return nested sequences and arrays of numbers or texts as tuples."""
+    """Return nested sequences and arrays of numbers or texts as nested tuples."""
     if isinstance(values, np.ndarray):
         values = values.astype(np.float64).tolist()
     return tuple(map(_tuples, values)) if isinstance(values, list | tuple) else values
 
 
-# In files.
+# Storage of an identity as text.
 
 
 def as_text(identity: Identity) -> str:
@@ -262,7 +267,7 @@ def identity_from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
         return None
 
 
-# Comparison.
+# Comparison of two problems.
 
 
 def require_same(
@@ -378,7 +383,8 @@ def _simulator_differences(
 ) -> dict[Level, list[str]]:
     """Return the differences of two simulators by level."""
     data = "observed values", "weights of observed values", "labels of specimens"
-    # One with a metric, and one with the log-likelihood by specimen.
+    # Whether one simulator has a metric of distributions and the other a log-likelihood by
+    # specimen.
     mixed = bool(a.with_metric) != bool(b.with_metric)
     digests = [
         x.with_metric if mixed and x.with_metric else (x.data, x.weights, x.specimens)
@@ -389,9 +395,9 @@ def _simulator_differences(
         for text, *pair in zip(data, *digests, strict=True)
         if pair[0] != pair[1]
     ]
-    # Names of inputs do not matter to a population.
+    # Names of inputs are removed, because a population does not depend on them.
     inputs = [re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", simulator.inputs) for simulator in (a, b)]
-    # Design points are drawn through the priors: other priors give other responses.
+    # The points of a design depend on the priors, so that other priors give other responses.
     has_same_points = same_priors and a.propagation == b.propagation and not mixed
     if inputs[0] != inputs[1]:
         populations.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
@@ -427,7 +433,7 @@ def _agree(got: Any, expected: Any) -> bool:
     """Return whether numbers are the same up to rounding, relative to the largest of them."""
     a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     size = np.abs(a[np.isfinite(a)]).max(initial=0.0)
-    # As much as another machine, or another version of NumPy, may change.
+    # The tolerance allows for another machine, or another version of NumPy.
     return a.shape == b.shape and bool(
         np.allclose(a, b, rtol=0.0, atol=1e-6 * size, equal_nan=True)
     )

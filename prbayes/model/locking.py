@@ -34,7 +34,8 @@ def locked[**P, T](function: Callable[P, T]) -> Callable[P, T]:
         if not models and context is not None:
             models = {id(context.root): context.root}
         with ExitStack() as stack:
-            for _, model in sorted(models.items()):  # one order for all threads: no deadlock
+            # Models are locked in a fixed order, so that threads cannot deadlock.
+            for _, model in sorted(models.items()):
                 stack.enter_context(lock(model))
             return function(*arguments, **keywords)
 

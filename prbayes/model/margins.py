@@ -20,13 +20,13 @@ from prbayes.response.inputs import aleatory_names, unit_of
 class Margin:
     """One number that varies from specimen to specimen."""
 
-    # Name of the distribution, or of the response's argument; with the index of an element.
+    # Name of the distribution or of the response's argument, with the index of the element.
     name: str
-    dist: TensorVariable  # the ``.dist()``
+    dist: TensorVariable  # distribution of the input, made by ``.dist()``
     node: int  # index of the simulator
-    position: int  # among the simulator's aleatory inputs
-    index: tuple[int, ...]  # element of a multivariate input
-    group: str = ""  # the group whose population it is, if there are groups
+    position: int  # index among the simulator's aleatory inputs
+    index: tuple[int, ...]  # index of the element in a multivariate input
+    group: str = ""  # name of the group whose population it is, empty without groups
 
     @property
     def axis(self) -> Hashable:

@@ -39,14 +39,14 @@ class Measurement:
     name: str
     metric: LogLikelihood
     observed: Floats  # (N,) or (N, m): measured responses
-    weights: Floats | None  # (N,): factors of the specimens' log-likelihoods, which sum to N
+    weights: Floats | None  # (N,): factors of the specimens' log-likelihoods, of sum N
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
     inputs: Inputs
     responses: Responses
     propagation: Propagation
     outputs: Outputs
     groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
-    # Values, (N,) by name, of the conditions on which the population of a specimen depends.
+    # Conditions on which the population of a specimen depends, as values (N,) by name.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
     # Model variables of the measurement: ``error`` and ``gross_errors``.
@@ -101,15 +101,17 @@ class Measurement:
 class StackedReadings:
     """Readings of S specimens in the M outputs of all simulators."""
 
-    # Readings, where the weighted mean stands for repeated readings of an output.
+    # Readings of each specimen; a weighted mean replaces repeated readings of an output.
     readings: Readings
-    # (S, M): standard deviation of the readings' error, in units of an unknown error.
+    # (S, M): standard deviation of the reading error, relative to the unknown error if there is
+    # one.
     scale: Floats
     repeats: Repeats | None  # scatter of repeated readings; None if there are none
-    numbers: tuple[NDArray[np.intp], ...]  # (N,): specimen of each row, by simulator
+    # For each simulator, (N,): index of the specimen of each row.
+    numbers: tuple[NDArray[np.intp], ...]
     groups: NDArray[np.intp] | None  # (S,): index of each specimen's group
     covariates: Floats  # (C, S): values of the conditions that populations depend on
-    # (S,): log-density of a gross error, uniform over twice the range of each output.
+    # (S,): log-density of a gross error, which is uniform over twice the range of each output.
     log_gross: Floats
     conditions: Floats | None  # (S, C): values of the conditions that are inputs
     coordinates: Floats | None  # (S, C): coordinates of these conditions
@@ -165,7 +167,7 @@ class StackedReadings:
 def _averaged(
     measurement: Measurement, numbers: NDArray[np.intp], size: int
 ) -> tuple[Readings, Floats, Repeats]:
-    """Return the readings of one simulator by specimen, their scale and their repeats."""
+    """Return the averaged readings of one simulator by specimen, their scale and their repeats."""
     readings = measurement.readings
     present = readings.is_measured | readings.is_censored
     count = np.zeros((size, present.shape[1]), dtype=np.intp)
@@ -200,7 +202,7 @@ def _value_by_specimen(
     numbers: Sequence[NDArray[np.intp]],
     size: int,
 ) -> Floats:
-    """Return a number of each specimen, (S,), from those of the rows of each simulator, (N,)."""
+    """Return a value for each specimen, (S,), from values for the rows of each simulator, (N,)."""
     result = np.full(size, np.nan)
     for measurement, of_rows, index in zip(measurements, values, numbers, strict=True):
         conflicts = ~np.isnan(result[index]) & (result[index] != of_rows)
@@ -223,11 +225,11 @@ class SpecimenLikelihood:
     model: Any = None  # weak reference to a pymc.Model
     shared_emulation: Emulation | None = None  # emulator that was fitted for other data
     options: SpecimenOptions = field(default_factory=SpecimenOptions)
-    # Values that are computed at their first use, such as the points of the specimens.
+    # Cache of values that are computed at their first use, such as the points of the specimens.
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Replace the weak reference to the model, which has no pickle, by the model."""
+        """Replace the weak reference by the model, because weak references have no pickle."""
         derived = ("hyperparameters", "reading density")
         cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
@@ -335,36 +337,29 @@ class SpecimenLikelihood:
             )
         return Hyperparameters.of(model)
 
-    def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
+    def observing(self, data: Mapping[str, Any], model: Any = None) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.
 
-        It is the same object where the values are the same.
+        ``model`` is a copy of the model. The likelihood is the same object if the values are the
+        same, unless `pymc.do` or `pymc.observe` left other free variables in the copy, for whose
+        posterior points are drawn.
         """
         changed = tuple(
             m if data.get(m.name) is None else m.observing(data[m.name]) for m in self.measurements
         )
-        if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
+        models = [m for m in (self.model(), model) if m is not None] if model is not None else []
+        names = [{str(rv.name) for rv in m.free_RVs} for m in models]
+        is_same_model = model is None or names[1:] == names[:1]
+        is_same_data = all(a is b for a, b in zip(changed, self.measurements, strict=True))
+        if is_same_model and is_same_data:
             return self
-        return replace(self, measurements=changed, shared_emulation=self._emulation)
-
-    def in_model(self, model: Any) -> SpecimenLikelihood:
-        """Return the likelihood in a copy of the model, with the same runs.
-
-        It is the same object unless `pymc.do` or `pymc.observe` left other free variables, for
-        whose posterior points are drawn.
-        """
-        original = self.model()
-        if original is not None:
-            names = [{str(rv.name) for rv in m.free_RVs} for m in (original, model)]
-            if names[0] == names[1]:
-                return self
-        return replace(self, model=weakref.ref(model), shared_emulation=self._emulation)
-
-    @property
-    def _emulation(self) -> Emulation | None:
-        """The emulator, if there is one."""
         prepared = self.cache.get("preparation")
-        return prepared.emulation if prepared else self.shared_emulation
+        return replace(
+            self,
+            measurements=changed,
+            model=self.model if is_same_model else weakref.ref(model),
+            shared_emulation=prepared.emulation if prepared else self.shared_emulation,
+        )
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:

@@ -95,12 +95,12 @@ def read_data(
 
 
 def _length(values: Floats) -> int:
-    """Return the number of specimens; one number is one specimen."""
+    """Return the number of specimens; a scalar is one specimen."""
     return len(values) if np.ndim(values) else 1
 
 
 def _present_numbers(name: str, observed: Any) -> Any:
-    """Return the present numbers of `pymc.Data`."""
+    """Return the current values of `pymc.Data`."""
     values = None if hasattr(observed.type, "dims") else known_value(observed)
     if values is None:
         raise TypeError(
@@ -112,7 +112,7 @@ def _present_numbers(name: str, observed: Any) -> Any:
 def _rows_of_frequencies(
     name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
 ) -> NDArray[np.intp]:
-    """Return the observed row of each specimen, where weights are frequencies."""
+    """Return the observed row of each specimen if the weights are frequencies."""
     frequencies = np.asarray(weights)
     if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
         raise ValueError(
@@ -132,7 +132,7 @@ def _rows_of_frequencies(
 def _checked_dims(
     name: str, dims: object, shape: tuple[int, ...], model: pm.Model
 ) -> tuple[str, ...]:
-    """Return names of the observed dimensions, which the model has in the lengths of the data."""
+    """Return names of the observed dimensions; raise if their lengths in the model differ."""
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
         raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
@@ -216,7 +216,7 @@ def observed_at_conditions(
 def _refuse_other_order(
     name: str, observed: Any, metric: Metric | None, inputs: Sequence[Any]
 ) -> None:
-    """Raise if conditions, errors or limits with labels are in another order than observed."""
+    """Raise if labelled conditions, errors or limits are in another order than observed values."""
     for values in getattr(metric, "_labelled", ()):
         refuse_other_order(values, observed, f"{name}: LogLikelihood")
     for variable in ancestors([x for x in inputs if isinstance(x, Variable)]):
@@ -226,7 +226,7 @@ def _refuse_other_order(
 
 
 def _at_columns(array: Any, condition: ReadingsCondition, missing: float = np.nan) -> Floats:
-    """Return values of readings, (N, T), at the columns of their values, (N, G)."""
+    """Return an array of readings, (N, T), at the columns of their values, (N, G)."""
     columns = condition.columns
     result = np.full((len(columns), len(condition.data)), missing)
     rows, places = np.nonzero(columns >= 0)

@@ -35,7 +35,7 @@ from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 from prbayes.response.pymc_dims import values_of, with_dims, without_dims
 
-# Size of a sample of thetas from a prior or a posterior; thetas cost time, but no response.
+# Number of thetas in a sample from a prior or a posterior. More thetas take time, but no response.
 THETAS = 256
 
 
@@ -45,11 +45,14 @@ class Hyperparameters:
 
     model: pm.Model
     point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
-    shapes: dict[str, tuple[int, ...]] = field(init=False)  # of the value variables, as in theta
+    # Shapes of the value variables, in their order in theta.
+    shapes: dict[str, tuple[int, ...]] = field(init=False)
     initial: Floats = field(init=False)  # the initial point as theta, (d,)
-    size: int = field(init=False)  # of theta, d
-    names: list[str] = field(init=False)  # of elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'
-    readable_names: list[str] = field(init=False)  # by untransformed variables, such as 'sigma'
+    size: int = field(init=False)  # length d of theta
+    # Names of the elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'.
+    names: list[str] = field(init=False)
+    # Names of the elements without transforms, such as 'sigma'.
+    readable_names: list[str] = field(init=False)
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the model and the point."""
@@ -120,7 +123,7 @@ class Hyperparameters:
     @cached_property
     @interpreted()
     def _log_prior(self) -> Any:
-        """The log-density of each free variable, in its own units, and the Jacobian of all."""
+        """Log-density of each free variable, untransformed, and the Jacobian of transforms."""
         model = self.model
         with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
@@ -133,14 +136,6 @@ class Hyperparameters:
                 jacobian += values_of(transform.log_jac_det(value, *rv.owner.inputs)).sum()
         graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
         return self.compile([*(term.sum() for term in terms), *graphs])
-
-    def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
-        """Return the log-density of each free variable in the user's own units, shapes (P,)."""
-        values = self._log_prior(np.ascontiguousarray(thetas))[:-1]
-        return {
-            str(rv.name): np.array(np.broadcast_to(value, len(thetas)))
-            for rv, value in zip(self.model.free_RVs, values, strict=True)
-        }
 
     def log_prior(self, thetas: Floats) -> Floats:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
@@ -160,7 +155,7 @@ class Hyperparameters:
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
-        if not size:  # PyTensor transforms no empty matrices
+        if not size:  # PyTensor cannot transform empty arrays
             single = self.constrained(self.initial[None])
             return {name: value[:0] for name, value in single.items()}
         variables = self.model.unobserved_RVs
@@ -225,7 +220,7 @@ class Hyperparameters:
 
     @cached_property
     def _prior_sampler(self) -> PriorSampler:
-        """Draws of the free variables from the prior."""
+        """The sampler of the free variables from the prior."""
         return PriorSampler(self.model.free_RVs)
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
@@ -239,7 +234,7 @@ class Hyperparameters:
         The unit of parameters. One is returned where it is zero or not finite.
         """
         thetas = self.prior_thetas(THETAS, seed=0)
-        # Levels of a normal distribution one standard deviation above and below its mean.
+        # Normal quantiles at one standard deviation above and below the mean.
         upper, lower = np.quantile(thetas, [0.84, 0.16], axis=0)
         spread = (upper - lower) / 2
         return np.where((spread > 0) & np.isfinite(spread), spread, 1.0)
@@ -261,6 +256,15 @@ class Hyperparameters:
             return self.prior_thetas(size, seed)
         thetas = self.thetas_of(self.quantiles(sobol(size, self.quantiles.size, seed)))
         return np.where(np.isfinite(thetas), thetas, self.initial)
+
+
+def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+    """Return the log-density of each free variable in the user's own units, shapes (P,)."""
+    values = hyperparameters._log_prior(np.ascontiguousarray(thetas))[:-1]
+    return {
+        str(rv.name): np.array(np.broadcast_to(value, len(thetas)))
+        for rv, value in zip(hyperparameters.model.free_RVs, values, strict=True)
+    }
 
 
 def fixed_values(model: pm.Model) -> dict[str, Floats]:
@@ -342,7 +346,7 @@ def parent_values(
     return result
 
 
-# Names.
+# Names of elements.
 
 
 def element_name(name: str, index: Sequence[object]) -> str:
@@ -382,7 +386,7 @@ def coordinates(model: Any, name: str) -> tuple[Any, ...]:
 
 
 def _element_names_of(name: Any, value: Any) -> list[str]:
-    """Return the names of the elements of arrays (n, *shape), with their coordinates."""
+    """Return the names of the elements of an array (n, *shape), with their coordinates."""
     labels = []
     if isinstance(value, xr.DataArray):
         labels = [value.coords[d].values if d in value.coords else None for d in value.dims]
@@ -425,11 +429,11 @@ def table_elements(values: Mapping[Any, Any]) -> list[str]:
         array = np.asarray(value)
         is_shown = np.ones(array.shape[1:], dtype=bool)
         if is_shown.ndim == 2 and is_shown.shape[0] == is_shown.shape[1] and len(array):
-            # A few operations change a few units in the last place.
+            # Rounding may change the last digits of elements that are constant.
             rounding = 1e-12 * np.abs(array).max(axis=0)
             is_fixed = np.ptp(array, axis=0) <= rounding
             is_symmetric = (np.abs(array - array.swapaxes(1, 2)) <= rounding).all()
-            if not is_fixed.all():  # else nothing moved: show that
+            if not is_fixed.all():  # if all elements are constant, all of them are shown
                 is_shown = np.triu(~is_fixed) if is_symmetric else ~is_fixed
         names = np.array(_element_names_of(name, value), dtype=object)
         elements += names[is_shown.ravel()].tolist()
@@ -441,7 +445,7 @@ def optimum_elements(point: Mapping[Any, xr.DataArray], stderr: Mapping[Any, Any
     bounds = {}
     for name, value in point.items():
         error = np.asarray(stderr[name])
-        # An unknown error is not zero: any number does.
+        # An unknown standard error may not count as zero, so that any positive number will do.
         error = np.where(np.isfinite(error), error, 1.0)
         pair = np.stack([value.values - error, value.values + error])
         bounds[name] = value.expand_dims(bound=2).copy(data=pair)
@@ -468,7 +472,7 @@ def readable_elements(elements: Iterable[str]) -> list[str]:
     return [element for element, variable in variables.items() if variable in readable]
 
 
-# Draws.
+# Draws from a posterior.
 
 
 def stacked_draws(

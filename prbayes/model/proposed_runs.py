@@ -135,7 +135,7 @@ class ProposedRuns(Shown, pd.DataFrame):  # type: ignore[misc]  # pandas has no 
 def _arguments(
     model: pm.Model, responses: Responses, likelihood: SpecimenLikelihood | None, seed: int
 ) -> list[Any]:
-    """Return a response's arguments, (n, *event), for specimens of the prior."""
+    """Return specimens drawn from the prior as the response's arguments, (n, *event)."""
     inputs = responses.inputs
     if likelihood is not None:
         populations = SpecimenPopulations(likelihood)
@@ -152,7 +152,7 @@ def _arguments(
 def _near_data(
     arguments: list[Any], responses: Responses, runs: Runs, observed: Floats, of_each: int = 16
 ) -> Floats:
-    """Return inputs, (k, d), of specimens with responses near each measured one."""
+    """Return inputs, (k, d), of the specimens whose responses are nearest to each measured one."""
     columns, batch = runs.surrogate.domain.columns(arguments)
     values, _ = checked(continued(runs, *arguments), batch, arguments, responses.outputs)
     values = values.reshape(len(columns), -1)
@@ -165,6 +165,7 @@ def _near_data(
         squares[np.isnan(values).any(axis=1)] = np.inf
         rows.append(np.argpartition(squares, of_each)[:of_each])
     near = columns[np.unique(rows)]
-    # A quarter farther beyond the ranges, so that specimens at the end are inside them.
+    # Points beyond the ranges are moved farther by a quarter of their distance, so that specimens
+    # at the end are inside the new ranges.
     inside = np.clip(near, runs.surrogate.domain.low, runs.surrogate.domain.high)
     return np.clip(near + 0.25 * (near - inside), columns.min(axis=0), columns.max(axis=0))

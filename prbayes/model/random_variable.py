@@ -70,26 +70,25 @@ class Node:
     target: Discrepancy  # the metric, prepared against the observed responses
     bound: Bound  # the propagation, prepared for this simulator
     propagation: Propagation  # configuration of the propagation
-    epsilon: Any  # shared scalar; NaN while it is not set
+    epsilon: Any  # epsilon as a shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
-    # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
-    same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = SINGLE_OUTPUT  # outputs of a run
-    group: str = ""  # name of the group of its specimens
+    outputs: Outputs = SINGLE_OUTPUT  # outputs of the response: names, units and shape
+    group: str = ""  # name of the group of specimens, empty without groups
 
-    # Attributes of the target and of the bound.
+    # Attributes that are copied from the target and from the bound.
     metric: Metric = field(init=False)
     observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
     weights: Floats = field(init=False)  # (N,): weights of the specimens, of sum one
     inputs: Inputs = field(init=False)
     responses: Responses = field(init=False)  # the response, and how it is called
-    # Whether responses of a population's specimens are known without further runs.
+    # Whether responses of a population's specimens are available without further runs.
     has_specimens: bool = field(init=False)
-    max_lost: float = field(init=False)  # largest share of a population without response
-    reweighted: ReweightedBound | None = field(init=False)  # the bound, if it has a design
+    max_lost: float = field(init=False)  # largest accepted share of a population without response
+    # The bound, if it has a design with stored runs.
+    reweighted: ReweightedBound | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Set the attributes of the target and of the bound."""
+        """Copy the attributes of the target and of the bound."""
         vars(self).update(
             metric=self.target.metric,
             observed=self.target.observed,
@@ -109,11 +108,6 @@ class Node:
         """Return the discrepancies of populations from a prepared metric, (k,)."""
         return self.bound.discrepancies(parents, target)
 
-    def weighted_sample(self, parents: Sequence[Floats]) -> ReweightedBound:
-        """Return specimens whose weights make populations: those of the design."""
-        assert self.reweighted is not None
-        return self.reweighted
-
     @property
     def epsilon_value(self) -> float:
         """The value of epsilon, NaN while it is not set."""
@@ -124,32 +118,28 @@ class Node:
         """Effective number of specimens: repeated observations of a specimen count once."""
         return effective_specimens(self.target, self.specimens)
 
-    def observing(self, data: Any) -> Node:
-        """Return the same simulator with other observed responses; it computes no response.
 
-        It is the same object where the values are the same. Raise TypeError or ValueError if the
-        metric does not take the values, or weights or labels belong to another number of them.
-        """
-        target, bound = self.target, self.bound
-        data = np.asarray(data)
-        if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
-            return self
-        is_aligned = self.specimens is not None or bool(np.ptp(target.weights) > 0)
-        values = new_observed(self, data, "specimens= or weights=", is_aligned=is_aligned)
-        is_same_size = len(values) == len(target.weights)
-        try:
-            target = self.metric.against(values, target.weights if is_same_size else None)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"{self.name}: {error}") from None
-        changed = with_target(self, target.metric.for_inputs(target, bound.inputs.dimensions))
-        if has_default_epsilon(self):
-            changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
-        return changed
+def with_observed(node: Node, data: Any) -> Node:
+    """Return the same simulator with other observed responses; it computes no response.
 
-    def copied(self) -> Node:
-        """Return the same simulator with its own design, count of responses and epsilon."""
-        epsilon = shared_epsilon(self.name, self.epsilon_value)
-        return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+    It is the same object where the values are the same. Raise TypeError or ValueError if the metric
+    does not take the values, or weights or labels belong to another number of them.
+    """
+    target = node.target
+    data = np.asarray(data)
+    if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
+        return node
+    is_aligned = node.specimens is not None or bool(np.ptp(target.weights) > 0)
+    values = new_observed(node, data, "specimens= or weights=", is_aligned=is_aligned)
+    is_same_size = len(values) == len(target.weights)
+    try:
+        target = node.metric.against(values, target.weights if is_same_size else None)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{node.name}: {error}") from None
+    changed = with_target(node, target.metric.for_inputs(target, node.inputs.dimensions))
+    if has_default_epsilon(node):
+        changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
+    return changed
 
 
 def with_target(node: Node, target: Discrepancy) -> Node:
@@ -168,26 +158,30 @@ class Specification:
     responses: Responses
     propagation: Propagation
     epsilon: Any  # shared scalar; NaN while it is not set
-    specimens: NDArray[Any] | None  # (N,): labels
-    same_inputs: tuple[str, ...] = ()
+    specimens: NDArray[Any] | None  # (N,): labels of the specimens
     outputs: Outputs = SINGLE_OUTPUT
     group: str = ""
     progressbar: bool = True
-    original: Specification | None = None  # of a clone, which takes the runs of the original
-    node: Node | None = field(default=None, init=False)  # set at the first use
+    # Simulator that this clone was copied from, and whose runs it takes.
+    original: Specification | None = None
+    # Simulator with its first responses, set at the first use.
+    node: Node | None = field(default=None, init=False)
 
     @property
     def metric(self) -> Metric:
         """The metric of the target."""
         return self.target.metric
 
-    def copied(self) -> Specification:
-        """Return the same simulator with its own epsilon, for a clone of the model."""
-        epsilon = shared_epsilon(self.name, float(self.epsilon.get_value()))
-        return replace(self, epsilon=epsilon, original=self.original or self)
-
 
 type AnySimulator = Specification | Node
+
+
+def copied(simulator: AnySimulator) -> AnySimulator:
+    """Return the same simulator with its own design, count and epsilon, for a clone of a model."""
+    epsilon = shared_epsilon(simulator.name, float(simulator.epsilon.get_value()))
+    if isinstance(simulator, Node):
+        return replace(simulator, bound=simulator.bound.copied(), epsilon=epsilon)
+    return replace(simulator, epsilon=epsilon, original=simulator.original or simulator)
 
 
 def computed(simulator: AnySimulator) -> Node:
@@ -201,10 +195,12 @@ def computed(simulator: AnySimulator) -> Node:
         if simulator.node is not None:
             return simulator.node
         if simulator.original is not None:
-            node = replace(computed(simulator.original).copied(), epsilon=simulator.epsilon)
+            node = computed(simulator.original)
+            node = replace(node, bound=node.bound.copied(), epsilon=simulator.epsilon)
         else:
             propagation, target = simulator.propagation, simulator.target
-            # Counts and notes of an attempt that fails are dropped with the copy.
+            # The copy counts calls and collects notes. Both are dropped with the copy if an attempt
+            # fails.
             responses = simulator.responses.copied()
             responses.runs = simulator.responses.runs
             setting = type(propagation).__name__
@@ -232,7 +228,8 @@ def computed(simulator: AnySimulator) -> Node:
                 simulator.name, target.observed, bound.first_responses, outputs.names
             )
             bound.findings = report(*constant, *findings, *outliers)
-            if simulator.specimens is None:  # reported where the simulator was written
+            # Duplicates with labels were reported when the simulator was defined.
+            if simulator.specimens is None:
                 bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(
                 simulator.name,
@@ -241,7 +238,6 @@ def computed(simulator: AnySimulator) -> Node:
                 propagation,
                 simulator.epsilon,
                 simulator.specimens,
-                simulator.same_inputs,
                 outputs,
                 simulator.group,
             )
@@ -261,7 +257,7 @@ def log_first_runs(
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
     if cost.per_theta and np.isnan(seconds):
-        return  # known after the first call
+        return  # the cost is logged after the first call, when its time is known
     responses.on_start = None
 
     counts = []
@@ -279,14 +275,14 @@ def log_first_runs(
     )
 
 
-# Epsilon.
+# Epsilon, the scale of a discrepancy in the log-density.
 
 
 def has_default_epsilon(simulator: AnySimulator) -> bool:
     """Return whether epsilon is the default, the 1/N of a metric on a likelihood's scale."""
     target = simulator.target
     epsilon = float(simulator.epsilon.get_value())
-    # Weights that were normalised again differ by rounding.
+    # Normalising the weights a second time changes them by rounding.
     is_default = abs(epsilon * effective_specimens(target, simulator.specimens) - 1) < 1e-12
     return is_likelihood(target) and is_default
 
@@ -297,7 +293,7 @@ def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> flo
         return target.n_effective
     _, number = np.unique(labels.astype(str), return_inverse=True)
     weights = np.bincount(number.ravel(), target.weights)
-    # All different: the same number to the last digit.
+    # If all labels differ, the number is the same to the last digit.
     if weights.size == target.weights.size:
         return target.n_effective
     return float(1 / (weights**2).sum())
@@ -313,7 +309,7 @@ def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
     return -discrepancy / epsilon
 
 
-# The operation.
+# The operation of an observed variable.
 
 
 class ObservedRV(RandomVariable):
@@ -326,7 +322,7 @@ class ObservedRV(RandomVariable):
     model or a compiled function, and weakly by the operation itself.
     """
 
-    __props__ = ("name", "signature", "dtype", "inplace", "reference")
+    __props__ = ("name", "signature", "dtype", "inplace", "reference", "simulators")
 
     def __init__(
         self,
@@ -336,8 +332,11 @@ class ObservedRV(RandomVariable):
         inplace: bool = False,
         *,
         reference: weakref.ref[Any],
+        simulators: tuple[str, ...],
     ) -> None:
         self.reference = reference
+        # Names of the simulators with the same specimens; this simulator is the last one.
+        self.simulators = simulators
         label = "Simulator of {} by {}".format(*self._response_and_metric)
         super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
 
@@ -382,20 +381,20 @@ class ObservedRV(RandomVariable):
         apply.tag.record = record
 
     def __str__(self) -> str:
-        """Show the name and the signature, without the record."""
+        """Show the name and the signature, without the simulator."""
         return f'prbayes_Simulator_rv{{"{self.signature}"}}'
 
     def __getstate__(self) -> dict[str, Any]:
-        """Replace the weak reference, which has no pickle, by the record."""
+        """Replace the weak reference by the record, since weak references have no pickle."""
         return {**self.__dict__, "reference": self.record}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the weak reference; the application references the record."""
+        """Restore the weak reference; the application keeps the record alive."""
         self.__dict__.update(state)
         self.reference = weakref.ref(state["reference"])
 
     def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
-        """Return the number of outputs of a specimen."""
+        """Return the shape of one draw: the number of outputs of a specimen."""
         return [pt.constant(n, dtype="int64") for n in self.simulator.outputs.event]
 
 
@@ -405,11 +404,12 @@ class SimulatorRV(ObservedRV):
     The simulator is a `Specification` until `nodes` computes its first responses.
     """
 
-    owner: weakref.ref[Any] | None = None  # the application in the model
+    # Application of this operation in the model, as a weak reference.
+    owner: weakref.ref[Any] | None = None
     _warned = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
+        """Leave out the owner, because a copy that is unpickled belongs to another model."""
         return {**super().__getstate__(), "owner": None}
 
     def assign(self, apply: Apply[Any, Any], record: Any) -> None:
@@ -419,13 +419,13 @@ class SimulatorRV(ObservedRV):
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
-        if self.simulator.same_inputs and not self._warned:
+        *others, name = self.simulators
+        if others and not self._warned:
             self._warned = True
-            names = ", ".join(self.simulator.same_inputs)
             report(
                 Finding(
                     "independent-draws",
-                    f"{self.simulator.name} and {names} have the inputs of the same specimens, but "
+                    f"{name} and {', '.join(others)} have the inputs of the same specimens, but "
                     "PyMC's predictive sampling draws each variable independently: use "
                     "prb.predict for responses of the same specimens.",
                 )
@@ -437,7 +437,7 @@ class SimulatorRV(ObservedRV):
         ndims = [parent.type.ndim for parent in bound.inputs.parents]
         batch, params = broadcast_batch(params, ndims)
         values = np.empty((*(batch if size is None else size), *event))
-        # A population for each element of a batch; its specimens are along axes of length one.
+        # Each element of a batch is a population. Its specimens are along axes of length one.
         for index in np.ndindex(batch):
             places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
             shape = values[places].shape
@@ -453,7 +453,7 @@ class SimulatorRV(ObservedRV):
 
 def response_name(function: Any) -> str:
     """Return the name of a response, or the arguments of a lambda function."""
-    inner = getattr(function, "function", function)  # of `scalar`
+    inner = getattr(function, "function", function)  # unwrap a function that `scalar` has wrapped
     name = str(getattr(inner, "__name__", type(inner).__name__))
     if name != "<lambda>":
         return name
@@ -462,7 +462,8 @@ def response_name(function: Any) -> str:
 
 # The log-density.
 
-# The terms for which densities are built: PyMC builds those of all variables, also for a part.
+# Terms for which densities are built. PyMC builds the densities of all variables even if only a
+# part of the terms is asked for.
 TERMS: ContextVar[str] = ContextVar("terms that are built", default="all")
 
 
@@ -480,9 +481,10 @@ def building(terms: str) -> Iterator[None]:
 def _metric_log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-density of the observed data: a graph of the parents and of epsilon.
+    """Return the log-density of the observed data, a graph of the parents and of epsilon.
 
-    Empty for `pymc.compute_log_likelihood`: no part of it belongs to one specimen.
+    The graph is empty for `pymc.compute_log_likelihood`, because the log-density is not a sum over
+    specimens.
     """
     if pm.compute_log_likelihood.__code__ in [frame.f_code for frame, _ in walk_stack(None)]:
         text = (
@@ -496,7 +498,7 @@ def _metric_log_density(
     data = known_value(value)
     node = computed(op.simulator)
     if data is not None:
-        node = node.observing(data)
+        node = with_observed(node, data)
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
@@ -506,7 +508,8 @@ def _metric_log_density(
     )
     if np.isnan(node.epsilon_value):
         report(unset, level=logging.DEBUG)
-        # nutpie would show only the number of an error; other samplers show the message themselves.
+        # Raise at once for nutpie, which would show only the number of a later error. Other
+        # samplers show the message themselves.
         modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_stack(None)]
         if any(module.partition(".")[0] == "nutpie" for module in modules):
             raise ValueError(str(unset))
@@ -549,7 +552,7 @@ def known_value(value: Any) -> Any:
         return value.get_value()
     leaves = [v for v in ancestors([value]) if v.owner is None]
     if all(isinstance(leaf, Constant | SharedVariable) for leaf in leaves):
-        return value.eval(mode=PLAIN)  # as whole numbers that became real ones
+        return value.eval(mode=PLAIN)  # such as whole numbers after a cast to floats
     return None
 
 
@@ -564,7 +567,8 @@ def shape_without_draw(fgraph: Any, apply: Apply[Any, Any]) -> list[Any] | None:
     return [pt.stack([pt.cast(size, "int64") for size in shape])]
 
 
-# In all modes: pictures of a model compile shapes without any other rewrite.
+# The rewrite is part of all modes, because pictures of a model compile shapes without any other
+# rewrite.
 optdb.register("prbayes_shape", out2in(shape_without_draw), "minimum_compile", position=0)
 
 
@@ -615,9 +619,10 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
         if isinstance(apply.op, SimulatorRV):
             if apply.op.owner is None:
                 apply.op.owner = weakref.ref(apply)
-            # Clones of a model share the operation with the original.
+            # A clone of a model shares the operation with its original, and gets a copy of the
+            # simulator.
             if apply.op.owner() is not apply:
-                apply.op.assign(apply, apply.op.simulator.copied())
+                apply.op.assign(apply, copied(apply.op.simulator))
             by_variable[rv] = apply.op.simulator
     return by_variable
 
@@ -630,7 +635,7 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     """
     by_variable = {}
     for rv, simulator in simulators(model).items():
-        node = computed(simulator).observing(known_value(model.rvs_to_values[rv]))
+        node = with_observed(computed(simulator), known_value(model.rvs_to_values[rv]))
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
         by_variable[rv] = node

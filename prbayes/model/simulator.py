@@ -57,7 +57,7 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.response.condition import refuse_covariates, refuse_vectors_of_specimens
+from prbayes.response.condition import refuse_vectors_of_specimens
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -238,7 +238,7 @@ class _Arguments:
 
 def _new_name(name: str, model: pm.Model) -> str:
     """Return the name of a variable that the model does not have yet."""
-    # A nested model puts its name before the names of its variables.
+    # A nested model prefixes the names of its variables with its own name.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     if model.name_for(name) in model.named_vars:
         raise ValueError(
@@ -251,7 +251,7 @@ def _new_name(name: str, model: pm.Model) -> str:
 def _read_summary(
     name: str, summary: Summary, unused: Sequence[Any], propagation: Propagation
 ) -> tuple[Metric, Floats]:
-    """Return metric and values of a data sheet; raise for what has no use without specimens."""
+    """Return metric and values of a data sheet; raise for arguments that need specimens."""
     names = ("metric=", "epsilon=", "weights=", "specimens=", "dims=", "groups")
     arguments = [text for text, value in zip(names, unused, strict=True) if value is not None]
     if arguments:
@@ -272,7 +272,7 @@ def _read_summary(
 def _read_inputs(
     name: str, response: Callable[..., Any], inputs: Sequence[Any], model: pm.Model
 ) -> Inputs:
-    """Return the inputs of a response; raise if they are not as described."""
+    """Return the inputs of a response; raise if the arguments are invalid."""
     refuse_uncallable(name, response)
     variables = read_inputs(name, inputs, model)
     if isinstance(response, Runs):
@@ -297,7 +297,7 @@ def _with_units(
     response: Callable[..., Any],
     outputs: Outputs,
 ) -> Outputs:
-    """Store the units of the inputs with them, and return the outputs with theirs."""
+    """Store the units of the inputs with them, and return the outputs with their units."""
     if units is None:
         return outputs
     texts(units, f"{name}: units")
@@ -305,7 +305,8 @@ def _with_units(
     names = [*set_units(inputs, response, units), name, *outputs.names]
     unknown = [key for key in units if key not in names]
     if unknown:
-        # A response with arguments of other names is the likelier mistake.
+        # Check the names of the response's arguments first, since wrong names are the likelier
+        # mistake.
         refuse_misfit(name, response, inputs.sizes, outputs)
         raise KeyError(
             f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
@@ -332,7 +333,8 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
     weights = data.weights
     if weights is not None:
         weights = sample_weights(weights, len(values), f"{name}: weights")
-        weights /= (weights**2).sum()  # Their sum is the effective number of specimens (Kish).
+        # The sum of the weights is now the effective number of specimens (Kish).
+        weights /= (weights**2).sum()
     conditions = data.known_values([inputs.aleatory[place] for place in inputs.conditions])
     measurement = Measurement(
         name,
@@ -375,7 +377,7 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
 def _with_common_specimens(
     name: str, labels: NDArray[Any] | None, model: pm.Model
 ) -> list[SpecimenLikelihood]:
-    """Return the likelihoods of a model with specimens of these labels."""
+    """Return the likelihoods of a model whose specimens have these labels."""
     if labels is None:
         return []
     by_metric = list(simulators(model).values())
@@ -402,7 +404,7 @@ def _with_common_specimens(
 def _inputs_of_partners(
     name: str, inputs: Inputs, partners: Sequence[SpecimenLikelihood]
 ) -> Inputs:
-    """Return the inputs in the order of those of simulators with the same specimens."""
+    """Return the inputs in the order in which simulators with the same specimens have them."""
     for partner in partners:
         if set(inputs.aleatory) != set(partner.inputs.aleatory):
             raise ValueError(
@@ -421,7 +423,7 @@ def _inputs_of_partners(
 def _joint_likelihood(
     measurement: Measurement, partners: Sequence[SpecimenLikelihood], model: pm.Model
 ) -> SpecimenLikelihood:
-    """Return the likelihood of a simulator and of those with the same specimens.
+    """Return the joint likelihood of a simulator and of others with the same specimens.
 
     Raises a ValueError if their measurements cannot be combined.
     """
@@ -468,9 +470,9 @@ def _joint_likelihood(
 def _measurement_variables(
     name: str, model: pm.Model, metric: Any, partners: Sequence[SpecimenLikelihood]
 ) -> dict[str, TensorVariable]:
-    """Return the model variables of the measurement by their role; adds the one of gross errors.
+    """Return the measurement's model variables by role, after adding the share of gross errors.
 
-    Simulators with the same specimens have the same one.
+    Simulators with the same specimens use the same share of gross errors.
     """
     extras: dict[str, TensorVariable] = {}
     for role in ("error", "gross_errors"):
@@ -492,7 +494,7 @@ def _measurement_variables(
 def _refuse_by_specimen(
     name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation
 ) -> None:
-    """Raise where the log-likelihood by specimen does not apply, and name the metric that does."""
+    """Raise if the log-likelihood by specimen does not apply, and name a metric that does."""
     remedy = "use metric=prb.AreaMetric()"
     if epsilon is not None:
         raise ValueError(
@@ -561,7 +563,12 @@ def _add_by_metric(
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
-    refuse_covariates(name, inputs.covariates)
+    if inputs.covariates:
+        raise TypeError(
+            f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "
+            "expected one population, as a metric compares distributions; use "
+            "metric=prb.LogLikelihood(), or prb.response.group for few different values"
+        )
     target = _prepared_metric(name, metric, data.values, data.weights)
     if data.labels is not None:
         _refuse_ambiguous_labels(name, data.labels, list(simulators(model).values()))
@@ -599,7 +606,7 @@ def _add_specification(
     observed: Any,
     dims: tuple[str, ...] | None,
 ) -> TensorVariable:
-    """Add an observed variable with a metric of distributions; place is that of its group."""
+    """Add an observed variable with a metric of distributions; ``place`` is its group's index."""
     name, target, labels = specification.name, specification.target, specification.specimens
     responses, inputs = specification.responses, specification.responses.inputs
     earlier = list(simulators(model).values())
@@ -614,26 +621,28 @@ def _add_specification(
     else:
         _warn_shared_specimens(specification, labels, earlier)
     aleatory = set(inputs.aleatory)
-    same_inputs = [
+    same_inputs = tuple(
         simulator.name
         for simulator in earlier
         if simulator.group == specification.group
         and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
-    ]
+    )
     group = pt.constant(place, dtype="int64")
     params = [group if is_group(v) else v for v in inputs.parents]
     signature = rv_signature([p.type.ndim for p in params], len(target.event))
-    simulator = replace(specification, same_inputs=tuple(same_inputs))
-    operation = SimulatorRV(signature=signature, reference=weakref.ref(simulator))
+    reference = weakref.ref(specification)
+    names = (*same_inputs, name)
+    operation = SimulatorRV(signature=signature, reference=reference, simulators=names)
     rv = SimulatorDistribution(name, *params, operation=operation, observed=observed, dims=dims)
-    rv.owner.op.owner = weakref.ref(rv.owner)  # at once, since a clone of the model may claim it
+    # The owner is set at once, because a clone of the model could become the owner otherwise.
+    rv.owner.op.owner = weakref.ref(rv.owner)
     return rv
 
 
 def _parts_by_group(
     target: Discrepancy, groups: Groups, data: ObservedData
 ) -> list[tuple[str, Discrepancy, NDArray[Any] | None, str]]:
-    """Return name, target, labels and group of each group."""
+    """Return name, prepared metric, labels and group name of each group."""
     name, labels, places = data.name, data.labels, np.asarray(data.groups)
     if data.dims is not None:
         raise ValueError(
@@ -662,7 +671,7 @@ def _parts_by_group(
 def _prepared_metric(
     name: str, metric: Metric, observed: Floats, weights: ArrayLike | None
 ) -> Discrepancy:
-    """Return the metric, prepared against the observed responses; errors begin with the name."""
+    """Return the metric, prepared for the observed responses; errors begin with the name."""
     if not isinstance(metric, Metric):
         raise TypeError(
             f"{name}: metric: got {called(metric)}, expected a metric object such as "
@@ -702,7 +711,7 @@ def try_function(target: Discrepancy) -> None:
 def _warn_shared_specimens(
     simulator: AnySimulator, labels: NDArray[Any], earlier: list[AnySimulator]
 ) -> None:
-    """Warn if default epsilons count specimens more than once."""
+    """Warn if default epsilons of several simulators count the same specimens more than once."""
     for second in earlier:
         if second.specimens is None or set(labels.tolist()).isdisjoint(second.specimens.tolist()):
             continue
@@ -721,7 +730,7 @@ def _warn_shared_specimens(
 def _refuse_ambiguous_labels(
     name: str, labels: NDArray[Any], earlier: Sequence[AnySimulator | Measurement]
 ) -> None:
-    """Raise where labels look alike and differ, as 1 and "1": they would be two specimens."""
+    """Raise if labels look alike but differ, as 1 and "1", which would be two specimens."""
     first_use: dict[str, tuple[str, object]] = {}
     labels_of = [(simulator.name, simulator.specimens) for simulator in earlier]
     for simulator, specimens in [*labels_of, (name, labels)]:
@@ -736,7 +745,7 @@ def _refuse_ambiguous_labels(
 
 
 def _label_text(label: object) -> str:
-    """Return a label as a reader sees it."""
+    """Return a label as readers see it."""
     if isinstance(label, bytes):
         return label.decode(errors="replace").strip()
     if isinstance(label, float) and label.is_integer():

@@ -56,7 +56,7 @@ def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
     if "arrays" not in likelihood.cache:
         points, name = prepared(likelihood).points, likelihood.name
         coordinates = likelihood.coordinates
-        # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
+        # The proposal is a density of z, so that A has the Jacobian: p(x) dx = p(x(z)) |dx/dz| dz.
         log_a = points.log_a if likelihood.error_is_known else -points.log_proposal
         log_a = log_a + coordinates.log_jacobian(points.z)
         x = [np.ascontiguousarray(values) for values in coordinates.inputs(points.z)]
@@ -67,7 +67,7 @@ def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
 
 
 def _array_values(likelihood: SpecimenLikelihood) -> tuple[list[Floats], Floats]:
-    """Return the present values of `arrays`: refits put those of other specimens there."""
+    """Return the current values of `arrays`, which refits replace by those of other specimens."""
     shared, log_a = arrays(likelihood)
     return [variable.get_value(borrow=True) for variable in shared], log_a.get_value(borrow=True)
 
@@ -108,7 +108,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
 def _with_gross_errors(
     likelihood: SpecimenLikelihood, values: Mapping[str, Floats], logs: Floats, rows: Any
 ) -> Floats:
-    """Return log-likelihoods of specimens, (P, n), that may have a gross error."""
+    """Return log-likelihoods of specimens, (P, n), as mixtures with gross errors."""
     share = _gross_share(likelihood.measurements[0], values)
     if share is False:
         return logs
@@ -139,14 +139,14 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
             logs.append(_with_gross_errors(likelihood, values, of_points, rows))
         with np.errstate(invalid="ignore"):
             difference = logs[0] - logs[1]
-        with np.errstate(over="ignore"):  # far from the data: an infinite error
+        with np.errstate(over="ignore"):  # an error that overflows, far from the data, is infinite
             halves = np.where(np.isfinite(difference), difference / 2, 0)
             variance += np.nansum(halves**2, axis=1)
     return np.sqrt(variance)
 
 
 def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
-    """Return the unknown error of each output, (P, M), one where it is known."""
+    """Return the unknown error of each output, (P, M); one where the error is known."""
     size = len(next(iter(values.values())))
     columns = []
     for m in likelihood.measurements:
@@ -158,7 +158,7 @@ def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Flo
 
 
 def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
-    """Return the share of specimens with a gross error, a number or (P,), or False."""
+    """Return the share of specimens with a gross error, a number or (P,); False without them."""
     share = measurement.gross_errors
     return values[str(share.name)] if isinstance(share, TensorVariable) else share
 
@@ -174,7 +174,7 @@ def _of_points(
 ) -> Floats:
     """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M).
 
-    The points are ``columns`` of all points.
+    Only the points in the slice ``columns`` are used.
     """
     if likelihood.error_is_known:
         return points.log_likelihoods(parents)
@@ -198,7 +198,7 @@ def log_likelihood_graph(
     flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
     log_p = _log_density(likelihood, params, flat, pt.repeat(pt.arange(n), count))
     terms = log_p.reshape((n, count)) + log_a
-    errors = []  # (M,): the unknown error of each output, one where it is known
+    errors = []  # (M,): unknown error of each output, one where the error is known
     for m in likelihood.measurements:
         error = params[m.extras["error"]] if "error" in m.extras else 1.0
         errors.append(error + pt.zeros(m.rows.shape[1]))
@@ -215,7 +215,8 @@ def log_likelihood_graph(
         gross_share = params.get(gross_share, gross_share)
         gross = pt.log(gross_share) + stacked.log_gross
         result = pt.logaddexp(pt.log1p(-gross_share) + result, gross)
-    weights = likelihood.measurements[0].weights  # of one simulator without repeated readings
+    # Weights exist for one simulator without repeated readings only.
+    weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights
 
 
@@ -224,17 +225,18 @@ def _log_density(
 ) -> Any:
     """Return the log-density of points, (n, *event), in the populations of specimens (n,).
 
-    Values of the inputs' parents are by variable.
+    The values in ``params`` are by parent of the inputs.
     """
     inputs, stacked = likelihood.inputs, likelihood.stacked
     of_specimens = dict(zip(inputs.covariates, stacked.covariates, strict=True))
     of_specimens |= dict.fromkeys(filter(is_group, inputs.parents), stacked.groups)
-    # Vectors of groups and covariates make vectors of the distributions' parameters.
+    # Vectors of groups and covariates turn the distributions' parameters into vectors.
     vectors = {parent: pt.as_tensor(values)[specimens] for parent, values in of_specimens.items()}
     symbols = [vectors.get(parent, parent).type() for parent in inputs.parents]
     dists, _ = inputs.rebuilt(symbols)
     log_p = log_density(inputs, dists, points)
-    # After the densities are built: PyMC may clone parameters that are random.
+    # The values replace symbols after the densities are built, because PyMC may clone random
+    # parameters.
     values = {
         symbol: vectors.get(parent, params.get(parent))
         for symbol, parent in zip(symbols, inputs.parents, strict=True)
@@ -246,7 +248,7 @@ def _log_density(
 def _log_share(
     likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
 ) -> Any:
-    """Return the graph of log S, the log share with a response, by specimen, (S,)."""
+    """Return the graph of the log share of each population with a response, by specimen, (S,)."""
     coordinates, contexts = likelihood.coordinates, [rows for _, rows in likelihood.by_context]
     size = len(contexts)
     context = np.empty(len(likelihood.readings), dtype=np.intp)
@@ -287,7 +289,7 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
     return pt.switch(is_empty, -np.inf, log_total)
 
 
-# Draws.
+# Draws of inputs and readings.
 
 
 def draw_inputs(
@@ -354,7 +356,8 @@ def draw_readings(
     numbers = np.arange(len(likelihood.readings))
     if measurement is not None:
         numbers = specimen_numbers(likelihood, measurement)
-    like = np.resize(numbers, n)  # observed specimens with the same group and covariates
+    # Observed specimens whose groups and covariates the drawn specimens have.
+    like = np.resize(numbers, n)
     conditions = likelihood.stacked.conditions
     conditions = None if conditions is None else conditions[like]
     by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
@@ -376,12 +379,12 @@ def draw_readings(
                 whole[:, columns] = part
         inputs = at_conditions(likelihood.inputs, inputs, conditions)
         flat = [x[:, specimens].reshape(-1, *x.shape[2:]) for x in inputs]
-        # Beyond the runs' range an input has the response at the end of the range.
+        # Beyond the runs' range the response is that at the end of the range.
         z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
         return emulation.values(z).reshape(size, n, -1)
 
     outputs = draw_outputs()
-    # Specimens without a response are not measured.
+    # Specimens without a response are drawn again, because they would not be measured.
     for _ in range(32):
         is_missing = np.isnan(outputs).any(axis=-1)
         if not is_missing.any():
@@ -403,7 +406,7 @@ def _with_reading_errors(
     measurements: Sequence[Measurement],
     values: Mapping[str, Floats],
 ) -> Floats:
-    """Return readings of outputs, (P, n, m): with error, rounding and gross errors."""
+    """Return readings of outputs, (P, n, m), with reading errors, rounding and gross errors."""
     size, n, count = outputs.shape
     sd: Any = np.resize(readings.error, (n, count))
     if len(measurements) == 1 and "error" in measurements[0].extras:
@@ -428,17 +431,12 @@ def _with_reading_errors(
 class SpecimenRV(ObservedRV):
     """The operation of a simulator with a log-likelihood by specimen; its record is that."""
 
-    __props__ = (*ObservedRV.__props__, "simulators")  # type: ignore[assignment]
-    __str__ = ObservedRV.__str__  # PyTensor makes one of its own from the properties
-
-    def __init__(self, *arguments: Any, simulators: tuple[str, ...], **keywords: Any) -> None:
-        # This one, after those with the same specimens, whose observed variables are parameters.
-        self.simulators = simulators
-        super().__init__(*arguments, **keywords)
-
     @property
     def measurements(self) -> list[Measurement]:
-        """The measurements of `simulators`; the last is that of this simulator."""
+        """The measurements of `simulators`; the last is that of this simulator.
+
+        The observed variables of the others are parameters of this operation.
+        """
         by_name = {m.name: m for m in self.record.measurements}
         return [by_name[name] for name in self.simulators]
 
@@ -457,7 +455,7 @@ class SpecimenRV(ObservedRV):
         """Draw responses of specimens; their shape is the last of the arguments."""
         *params, size = arguments
         measurement = self.simulator
-        # Readings of other simulators, the last parameters, are not part of the population.
+        # The last parameters, readings of other simulators, are not parameters of the population.
         pairs = zip(self.variables, params, strict=False)
         parents = {parent: param for parent, param in pairs if not is_known(parent)}
         leading = [
@@ -466,7 +464,8 @@ class SpecimenRV(ObservedRV):
         batch = np.broadcast_shapes(*leading)
         shape = batch if size is None else tuple(int(s) for s in size)
         n = len(measurement.observed) if not shape else shape[-1]
-        # The last batch axis is that of the specimens, along which parameters have length one.
+        # The last batch axis is that of the specimens. Parameters of populations have length one
+        # along this axis.
         flat = {}
         for parent, param in parents.items():
             ndim = parent.type.ndim
@@ -482,7 +481,11 @@ class SpecimenRV(ObservedRV):
 def _log_density_of_vector(
     op: SpecimenRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-likelihoods of the specimens, (S,); none where a later simulator has them."""
+    """Return the log-likelihoods of the specimens, (S,).
+
+    Of simulators that share specimens only the last one has the likelihood; the others return an
+    empty vector.
+    """
     (value,) = values
     if TERMS.get() == "priors" or op.simulator is not op.record.measurements[-1]:
         return pt.zeros(0)
@@ -512,7 +515,7 @@ def _log_density_of_vector(
 
 
 def _without_marks(variable: Any) -> Any:
-    """Return a parameter without the marks by which PyMC separates variables that have a value."""
+    """Return a parameter without the operations by which PyMC marks variables that have a value."""
     marks = {
         v: v.owner.inputs[0]
         for v in ancestors([variable])
@@ -531,7 +534,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
     result = {rv: rv.owner.op.record for rv in rvs}
-    current = {old: old.observing(data).in_model(model.root) for old in result.values()}
+    current = {old: old.observing(data, model.root) for old in result.values()}
     for rv, old in result.items():
         if current[old] is not old:
             rv.owner.op.assign(rv.owner, current[old])

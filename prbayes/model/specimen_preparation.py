@@ -64,10 +64,12 @@ class Preparation:
 
     emulation: Emulation
     points: SpecimenPoints
-    proposals: Proposals  # of the points
-    thetas: Floats  # (S, p): posterior draws at which the halves of the points agree
-    findings: tuple[Finding, ...]  # about the data and the runs, before the fit
-    share: ResponseShare | None = None  # of a population with a response, if it matters
+    proposals: Proposals  # proposals from which the points were drawn
+    # (S, p): posterior draws at which the estimates from both halves of the points agree.
+    thetas: Floats
+    findings: tuple[Finding, ...]  # findings about the data and the runs, before the fit
+    # Share of a population with a response; None if it hardly changes the log-likelihood.
+    share: ResponseShare | None = None
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
@@ -128,7 +130,7 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
 
 
 def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
-    """Compute runs, emulator and points; log how many runs there are."""
+    """Compute runs, emulator and points; log the number of runs."""
     responses = [m.responses for m in likelihood.measurements]
     cost = emulator_cost(likelihood)
     n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
@@ -140,7 +142,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
         refined, share = response_share(
-            # A call of a table's surface is no run.
+            # Calls of a table's surface do not count as runs.
             OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
             data,
             first.emulation,
@@ -156,7 +158,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                 "number there, such as the limit of the measurement, or narrow the priors"
             )
         if refined is not first.emulation and not likelihood.has_table:
-            # Specimens beside the failing region have points on its right side now.
+            # The refined emulator is accurate beside the region where runs fail, so that points of
+            # specimens there are on the right side of its boundary.
             first = _emulate(runs, data, refined)
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
@@ -165,7 +168,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
         cause = unreached(outputs, likelihood.readings)
         if not cause and runs.outputs:
-            # Later runs may be far from the priors.
+            # The first runs are checked alone, because later runs may be far from the priors.
             cause = unreached(runs.outputs[0], likelihood.readings)
         if not cause:
             checked = _data_findings(likelihood, outputs, several_roots=False)
@@ -181,8 +184,8 @@ class CheckedRuns:
     """Outputs of runs at coordinates; checks the first ones for range and influence."""
 
     likelihood: SpecimenLikelihood
-    outputs: list[Floats] = field(default_factory=list)  # (n, M) by batch
-    findings: tuple[Finding, ...] = ()  # about the first runs
+    outputs: list[Floats] = field(default_factory=list)  # outputs of each batch of runs, (n, M)
+    findings: tuple[Finding, ...] = ()  # findings about the first runs
 
     def __call__(self, z: Floats) -> Floats:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
@@ -219,7 +222,7 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 
 def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
-    """Return factors of the readings' errors that span 98 % of the prior of an unknown error."""
+    """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
         if "error" in m.extras:
@@ -242,8 +245,9 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         known[:, coordinates.is_condition] = conditions
     options = replace(likelihood.options, n_first=first_run_count(likelihood))
     if np.isfinite(coordinates.ends).any() and len(coordinates.inputs_of_population) == 1:
-        # The error of an input counts beside its distance from an end. With several inputs the
-        # normal equations would lose the digits.
+        # Near the end of an input's range, the error of the input counts relative to the distance
+        # from the end, so that the surface has to be more accurate. With several inputs the normal
+        # equations would lose these digits.
         options = replace(options, floor=1e-3 * options.floor)
     return SpecimenData(
         likelihood.readings,
@@ -267,7 +271,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
 
 
 def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
-    """Return the emulator, the points and findings of both."""
+    """Fit the emulator and place the points; return both with their findings."""
     likelihood = runs.likelihood
     if likelihood.has_table:
         emulation, points, proposals, draws = points_of_tables(data, likelihood)
@@ -280,37 +284,23 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         points, proposals, draws = specimen_points(data, emulation, population)
     else:
         emulation, points, proposals, draws = emulate(runs, data, emulation)
-    findings = tuple(_preparation_findings(likelihood, emulation, points, proposals))
-    return Preparation(emulation, points, proposals, draws.thetas, findings)
-
-
-def _preparation_findings(
-    likelihood: SpecimenLikelihood,
-    emulation: Emulation,
-    points: SpecimenPoints,
-    proposals: Proposals,
-) -> list[Finding]:
-    """Return findings of the data, and of the emulator at the roots of the specimens, if any."""
     name, readings, error = likelihood.name, likelihood.readings, emulation.error
-    return [
-        *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
-        *misfit_findings(
-            name,
-            readings,
-            proposals.modes,
-            error,
-            gross_errors=likelihood.measurements[0].gross_errors is not False,
-        ),
+    several_roots = bool((points.n_roots > 1).any())
+    gross_errors = likelihood.measurements[0].gross_errors is not False
+    findings = (
+        *_data_findings(likelihood, emulation.y, several_roots=several_roots),
+        *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error),
-    ]
+    )
+    return Preparation(emulation, points, proposals, draws.thetas, findings)
 
 
 def _data_findings(
     likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
 ) -> tuple[Finding, ...]:
-    """Return findings of outliers, and of rounded, censored and repeated exact readings.
+    """Return findings about outliers, and about rounded, censored and repeated exact readings.
 
-    None of outputs, (n, M), that are the same in all runs.
+    Outputs, (n, M), that are the same in all runs have no findings.
     """
     findings: list[Finding] = []
     finite = outputs[np.isfinite(outputs).all(axis=1)]
@@ -325,7 +315,7 @@ def _data_findings(
             is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0
             values = np.where(is_constant, np.nan, values)
         steps: Any = m.readings.step.max(axis=0)
-        # A reading error that the user gives covers rounding.
+        # A reading error that the user states includes rounding.
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
             values,
@@ -426,7 +416,7 @@ class SpecimenPopulations:
         coordinates = self.likelihood.coordinates
         sample = coordinates.of(sampler(parents, specimens, rng)[0], 2)
         sample = sample[..., ~coordinates.is_condition]
-        # Populations far from the prior may have inputs whose squares overflow.
+        # Populations far from the prior may have inputs so large that their squares overflow.
         is_finite = (np.abs(sample) < 1e100).all(axis=(1, 2))
         sample[~is_finite] = 0.0
         mean = sample.mean(axis=1, keepdims=True)
@@ -464,7 +454,7 @@ class SpecimenPopulations:
         def log_likelihood(thetas: Floats) -> Floats:
             logs = self.log_likelihoods(thetas, z, log_a, smoothing)
             if self.likelihood.measurements[0].gross_errors is not False:
-                # A share of specimens that leaves outliers without influence on the population.
+                # With a share of 10 % gross errors, outliers have no influence on the population.
                 log_gross = np.log(0.1) + self.likelihood.stacked.log_gross
                 logs = np.logaddexp(np.log(0.9) + logs, log_gross)
             total = logs.sum(axis=1)
@@ -492,7 +482,7 @@ class SpecimenPopulations:
 
 
 def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
-    """Return normalised weights, tempered to an effective sample size, and the temper."""
+    """Return normalised weights and the exponent that gives them a least effective sample size."""
     if not np.isfinite(log_weights).any():
         raise ValueError(
             "log-likelihood: got no population of the prior that reaches the specimens, expected "

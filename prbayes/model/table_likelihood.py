@@ -46,7 +46,7 @@ class OfTables:
         return cls(likelihood.coordinates, tuple(responses))
 
     def __call__(self, z: Floats) -> Floats:
-        """Return values by output; no run is counted."""
+        """Return values by output; these calls do not count as runs."""
         inputs = self.coordinates.inputs(z)
         with unlimited():
             parts = [response(inputs, []).reshape(len(z), -1) for response in self.responses]
@@ -68,8 +68,9 @@ def points_of_tables(
     if inside.sum() >= 4:
         misfit = OfTables.of(likelihood, left_out_nearby)(z[inside])
         error, bias = error_and_bias(data, emulation, likely, z[inside], specimens[inside], misfit)
-        # The error of the comparison, if it is too large, narrows the population by half its share
-        # of the variance. Beside a turning point its linear form would be far too large.
+        # If the error is too large in this comparison, it narrows the population by half its share
+        # of the variance. Beside a turning point a linear approximation of the error would be far
+        # too large.
         share = float((error / data.readings.robust_spread()).max())
         narrowing = np.sqrt(len(data.readings) / 2) * share**2
         emulation = replace(emulation, error=error, bias=max(bias, narrowing))
@@ -90,7 +91,7 @@ def points_of_tables(
 
 
 def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
-    """Return the surface through the runs, with a wider box of the search, and their ranges."""
+    """Return the surface through the runs, in a wider box of the search, and the runs' ranges."""
     coordinates, bounds = likelihood.coordinates, likelihood.coordinates.bounds
     runs, lows, highs = [], [], []
     for m in likelihood.measurements:
@@ -102,7 +103,7 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
         lows.append(coordinates.of([domain.inputs[place].low for place in places], 0))
         highs.append(coordinates.of([domain.inputs[place].high for place in places], 0))
     low, high = np.max(lows, axis=0), np.min(highs, axis=0)
-    # An input with a logarithmic coordinate may be negative in the table.
+    # An input may be negative in the table, though its coordinate is logarithmic.
     low = np.where(np.isfinite(low), low, bounds[0])
     ranges = np.stack([low, high])
     box = np.stack([np.maximum(bounds[0], low - (high - low) / 2), bounds[1]])
@@ -123,13 +124,14 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
     residuals = OfTables.of(likelihood, left_out_nearby)(z[near_readings(y, data.readings)])
     error = 2 * np.sqrt((residuals**2).mean(axis=0))
     error = np.maximum(error, data.options.floor * data.readings.spread())
-    # The noise of a process in double precision is far below its change over a thousandth.
+    # The step of the differences is a thousandth, over which the surface changes by far more than
+    # the rounding noise of a Gaussian process.
     surface = DifferencedResponse(OfTables.of(likelihood, continued), step=1e-3)
     return Emulation(z, y, surface, error, 0.0, ranges), ranges
 
 
 def _is_inside(z: Floats, ranges: Floats) -> NDArray[np.bool_]:
-    """Return which coordinates (..., d) are within the ranges of the runs, up to rounding."""
+    """Return which coordinates (..., d) are within the runs' ranges, up to rounding."""
     slack = 1e-9 * (ranges[1] - ranges[0])
     return np.asarray(((z >= ranges[0] - slack) & (z <= ranges[1] + slack)).all(axis=-1))
 
@@ -141,7 +143,7 @@ def _require_cover(
     specimens: Floats,
     ranges: Floats,
 ) -> None:
-    """Raise if the likelihood of a specimen, or 5 % of that of all, is from outside the ranges."""
+    """Raise if the likelihood of a specimen, or 5 % of that of all, is outside the ranges."""
     is_inside = _is_inside(points.z, ranges)
     whole = draws.log_likelihoods(points.z, points.log_a)
     inside = draws.log_likelihoods(points.z, np.where(is_inside, points.log_a, -np.inf))
@@ -160,7 +162,7 @@ def _require_cover(
 
 
 def _asked(likelihood: SpecimenLikelihood, specimens: Floats, ranges: Floats) -> str:
-    """Return the inputs that the data ask for beyond the ranges of the runs."""
+    """Return a text on the inputs beyond the runs' ranges that the data require."""
     coordinates = likelihood.coordinates
     ends = _as_inputs(coordinates, ranges)
     asked = np.quantile(_as_inputs(coordinates, specimens), [0.005, 0.995], axis=0)
@@ -177,7 +179,7 @@ def _asked(likelihood: SpecimenLikelihood, specimens: Floats, ranges: Floats) ->
 def _require_accurate(
     likelihood: SpecimenLikelihood, data: SpecimenData, emulation: Emulation
 ) -> None:
-    """Raise if the error of the surface is as large as the scatter, or shifts populations."""
+    """Raise if the error of the surface is as large as the scatter, or if it shifts populations."""
     share = float((emulation.error / data.readings.robust_spread()).max())
     if emulation.bias <= data.options.bias and share < 1:
         return
@@ -196,7 +198,7 @@ def _table(measurement: Measurement) -> Runs:
 
 
 def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
-    """Return the name of each aleatory number, as in the table."""
+    """Return the name of each aleatory number in the table."""
     m = likelihood.measurements[0]
     names: list[str] = []
     table = _table(m)
@@ -207,6 +209,6 @@ def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 
 def _as_inputs(coordinates: Coordinates, z: Floats) -> Floats:
-    """Return the inputs of coordinates in columns, (k, d)."""
+    """Return the inputs at coordinates z, as columns (k, d)."""
     parts: Sequence[Floats] = coordinates.inputs(z)
     return np.concatenate([x.reshape(len(z), -1) for x in parts], axis=1)

@@ -26,13 +26,15 @@ from prbayes.specimens.points import SpecimenPoints
 class ReadingDensity:
     """Log-density of the readings of S specimens at their K points, for errors (M,) of outputs."""
 
-    readings: Readings  # (S, k): of outputs without a sum of squares
-    outputs: Floats  # (S, K, k)
+    readings: Readings  # (S, k): readings of the outputs without a sum of squares
+    outputs: Floats  # (S, K, k): outputs at the points
     unit: Floats  # standard deviation of a reading in units of its error; broadcasts to outputs
-    emulator_variance: Floats  # broadcasts to outputs
-    columns: NDArray[np.intp] | None  # (S, k): which outputs; None for all in their order
-    # By unknown error: an output that has it, sums of squares (S, K), numbers of readings (S, 1),
-    # and the variance of the emulator's error in units of the scales.
+    emulator_variance: Floats  # variance of the emulator's error; broadcasts to outputs
+    # (S, k): indices of the outputs; None if these are all outputs in their order.
+    columns: NDArray[np.intp] | None
+    # For each unknown error of plain readings a tuple: index of an output that has the error, sums
+    # of squared residuals (S, K), numbers of readings (S, 1), and variance of the emulator's error
+    # in units of the scales.
     sums: Sequence[tuple[int, Floats, Floats, float]]
     constant: Floats  # (S, 1): minus the sum of the logarithms of scales
 
@@ -42,7 +44,7 @@ class ReadingDensity:
     ) -> ReadingDensity:
         """Return the density at points; ``emulator_error``, (M,), is that of the outputs."""
         readings, scale = likelihood.readings, likelihood.stacked.scale
-        # Points that fill up the array have any output.
+        # Entries that only fill up the array of points get an arbitrary output.
         outputs = np.where(np.isfinite(points.outputs), points.outputs, 1e30)
         is_missing = ~(readings.is_measured | readings.is_censored)
         sums, constant = [], np.zeros((len(readings), 1))
@@ -59,7 +61,8 @@ class ReadingDensity:
                 :, of_simulator
             ]
             is_plain &= ~readings.is_censored[:, of_simulator]
-            # A density changes by less than 1e-4 nats at an eighth of the largest plausible error.
+            # With this tolerance a log-density changes by less than 1e-4 at an eighth of the
+            # largest plausible error.
             is_plain &= relative <= 1e-6 * (readings.error[:, of_simulator] / unit) ** 2
             if not is_plain[is_measured].all():
                 continue
@@ -116,7 +119,7 @@ class ReadingDensity:
             return
         at_nodes: dict[int, Floats] = {}
         for place, cell in zip(places, cells, strict=True):
-            # Lagrange's polynomial through two nodes on each side.
+            # Interpolate by Lagrange's polynomial through two nodes on each side.
             nodes = range(cell - 1, cell + 3)
             for node in nodes:
                 if node not in at_nodes:

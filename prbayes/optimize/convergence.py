@@ -316,7 +316,8 @@ def _follow_gradients(search: Search, fit: Fit) -> Fit:
     limit = _SIMPLEX_EVALUATIONS * fit.theta.size
     objective.max_evaluations = min(objective.max_evaluations, limit)
     best, lowest, result, details = fit.theta, fit.lowest, fit.result, ""
-    # distance in prior standard deviations, wider than the kinks of a thousand points
+    # Step of the differences in prior standard deviations. It is wider than the distance between
+    # the kinks of an objective that is an average over a thousand points.
     apart = 0.0025
     try:
         for _ in range(5):

@@ -157,11 +157,11 @@ _UNSUPPORTED = Finding(
 
 
 def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
-    """Return which optima have a log-likelihood that is known to half a nat.
+    """Return which optima have a log-likelihood with a Monte Carlo error of at most half a nat.
 
-    Where points lie farther apart than a population is wide, a few points that lie close to each
-    other make a spurious maximum. Of many specimens with rounded readings, which are known to .06
-    nats, each may be uncertain by a tenth of a nat.
+    A larger error shows a spurious maximum: a population that is narrower than the distances
+    between points can have most of its density at a few points. With many specimens the limit is a
+    tenth of a nat for each, in quadrature. The error for rounded readings is .06 nats a specimen.
     """
     size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     largest = max(0.5, 0.1 * float(np.sqrt(size)))

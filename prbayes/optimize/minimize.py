@@ -165,7 +165,8 @@ def refine(
     with shown(progressbar), explained(model, "prb.refine"), limited(max_seconds, max_runs):
         evaluator = Evaluator.of(model)
         for bound in evaluator.reweighted.values():
-            bound.refuse_change(bound.responses.used_by("prb.refine"))
+            # Raises if the response has changed since the runs.
+            bound.values_of(bound.responses.used_by("prb.refine"))
         if thetas is None:
             require_finished(find_optimum(evaluator, Minimisation()))
         else:

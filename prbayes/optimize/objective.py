@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 
 # function of theta, (d,), that returns value, gradient (d,) or None, and number of evaluations
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
@@ -121,7 +121,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     terms = ""
     if prior:
         terms = "minus the log prior (prior=True)"
-    elif evaluator.other_terms:
+    elif has_other_terms(evaluator.model):
         # Terms that only exclude hyperparameters are constant elsewhere, and do not count.
         values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
         finite = values[np.isfinite(values)]

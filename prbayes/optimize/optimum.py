@@ -22,7 +22,7 @@ from prbayes.inference.refits import (
     sampling_obstacle,
     sampling_of_functions,
 )
-from prbayes.metrics.multivariate import components_summary
+from prbayes.metrics.multivariate import components_of
 from prbayes.model.description import (
     as_attribute,
     failures_dataset,
@@ -33,6 +33,7 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import (
     Evaluator,
+    has_other_terms,
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
@@ -397,11 +398,12 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     elif is_flat:
         result = Result.NO_INFORMATION
     elif is_affordable and not search.settings.prior and stored_overlap(evaluator, theta) < OVERLAP:
-        # Without overlap the minimum is one of the mass beyond the metric's grid, and no fit.
+        # Without overlap the minimum is not a fit, because the data lie beyond the metric's grid,
+        # and the discrepancy measures only the mass there.
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.settings.prior or evaluator.other_terms:
+    elif len(scales) > 1 or search.settings.prior or has_other_terms(evaluator.model):
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales
@@ -498,7 +500,8 @@ def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
     size = np.abs(gradients)
     is_touched = np.einsum("...i,ij,...j->...", size, is_infinite.astype(float), size) > 0
-    # At a bound of the support the gradient of a function vanishes, and its error is not known.
+    # At a bound of the support a function of theta may have a gradient of zero. Then its standard
+    # error is unknown, not zero.
     is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
     variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
     return np.sqrt(np.where(is_at_bound, np.nan, variance))
@@ -593,7 +596,7 @@ def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
         {
             "simulator": node.name,
             "metric": without_addresses(node.metric),
-            "compared": components_summary(node.target),
+            "compared": "; ".join(c.summary for c in components_of(node.target)),
             "is_likelihood": 0,
             "n_runs": node.bound.n_runs,
         }

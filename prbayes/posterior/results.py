@@ -30,7 +30,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
-from prbayes.model.parameters import variables_at
+from prbayes.model.parameters import log_prior_terms, variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import by_simulator, simulator_records
@@ -108,13 +108,12 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 
 
 def _calibration(
-    evaluator: Evaluator, chains: Chains, by_specimen: xr.Dataset | None
+    evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset | None
 ) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
 
-    ``by_specimen`` has the log-likelihoods of specimens, if these have been computed.
-
-    Log-likelihoods by specimen are the last; their discrepancies are minus log-likelihoods.
+    ``log_likelihoods`` are those of specimens, if they have been computed. Their simulators come
+    last, and have minus log-likelihoods as discrepancies.
     """
     records = simulator_records(evaluator)
     n_chains, n_draws, d = chains.thetas.shape
@@ -143,13 +142,12 @@ def _calibration(
             records[k]["required_ess"] = node.reweighted.required_ess
     if evaluator.measurements:
         failing = failing_share(evaluator, rows.mean(axis=0))
-        log_likelihoods = (
-            _log_likelihood_by_specimen(evaluator, chains) if by_specimen is None else by_specimen
-        )
+        if log_likelihoods is None:
+            log_likelihoods = _log_likelihood_by_specimen(evaluator, chains)
     for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
         name = measurement.name
         # Of simulators that share specimens the last one has their log-likelihood.
-        if name in log_likelihoods:
+        if log_likelihoods is not None and name in log_likelihoods:
             discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=-1)
         else:
             discrepancies[:, :, k] = 0.0
@@ -188,7 +186,7 @@ def arviz_groups(evaluator: Evaluator, chains: Chains, seed: int | None) -> dict
     rng = np.random.default_rng(seed)
     prior_seed = int(rng.integers(2**31))
     prior = evaluator.hyperparameters.prior_thetas(n_draws, prior_seed)[None]
-    log_priors = evaluator.hyperparameters.log_prior_terms(thetas.reshape(-1, d))
+    log_priors = log_prior_terms(evaluator.hyperparameters, thetas.reshape(-1, d))
     coords = {"chain": np.arange(n_chains), "draw": np.arange(n_draws)}
     variables = {
         name: (["chain", "draw"], values.reshape(n_chains, n_draws))

@@ -31,7 +31,7 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator, coarser_evaluator
+from prbayes.model.evaluator import Evaluator, coarser_evaluator, with_targets
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
@@ -227,7 +227,7 @@ def _minimised_on_population(
     for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)
         targets.append(prepared_on_population(node.target, responses[0], weights[0]))
-    prepared = evaluator.with_targets(targets)
+    prepared = with_targets(evaluator, targets)
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)

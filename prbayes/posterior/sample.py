@@ -20,14 +20,18 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.modes import Laplace, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.minimize import find_optimum, require_finished
-from prbayes.optimize.objective import Minimisation
-from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.optimize.optimum import Optimum
 from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
 from prbayes.posterior.results import Chains, require_selection, selected
-from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
-from prbayes.posterior.target import Target, posterior_target, require_density
+from prbayes.posterior.smc import (
+    Likelihood,
+    SamplingSettings,
+    evaluator_of,
+    required_optimum,
+    result_of,
+)
+from prbayes.posterior.target import Target, posterior_target
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -139,12 +143,8 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed."""
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    optimum = settings.optimum
-    if evaluator.nodes:
-        require_density(evaluator)
-        if optimum is None:
-            optimum = require_finished(find_optimum(evaluator, Minimisation()))
-        settings = replace(settings, optimum=require_sampling(optimum, "sample"))
+    optimum = required_optimum(evaluator, settings, "sample")
+    settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
         chains = None
         for _ in range(MAX_ROUNDS + 1):
@@ -157,7 +157,8 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
                 optima = getattr(optimum, "local_optima", ())
                 is_ambiguous = any(mode["comparable"] for mode in optima)
                 has_one_mode = len(modes) == 1 and not is_ambiguous
-                if has_one_mode and not evaluator.nodes and evaluator.has_graph:
+                is_exact = settings.kind(evaluator) is Likelihood.SPECIMENS
+                if has_one_mode and is_exact and evaluator.has_graph:
                     chains = _nuts_chains(evaluator, modes[0], settings)
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)

@@ -19,7 +19,7 @@ from prbayes._validate import Floats, Seed, executes, flag, positive_integer, se
 from prbayes.inference.refits import summary_obstacle
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -120,7 +120,7 @@ def simulation_based_calibration(
     obstacle = simulation_obstacle(evaluator)
     if evaluator.nodes:
         obstacle = summary_obstacle(evaluator)
-        if obstacle is None and evaluator.other_terms:
+        if obstacle is None and has_other_terms(model):
             raise ValueError(
                 "simulation_based_calibration: got a model with likelihood terms or potentials "
                 "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes "
@@ -214,7 +214,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and variables outside of it."""
     from arviz_stats.ecdf_utils import ecdf_pit
 
-    prob = 0.95  # that of ArviZ's own pictures of ranks
+    prob = 0.95  # the probability in ArviZ's own pictures of ranks
     ecdfs, outside = {}, []
     values = {name: variable[0] for name, variable in ranks.data_vars.items()}
     for name, column in split_elements(values).items():

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from itertools import zip_longest
 from os import PathLike
 from typing import Any, Literal
@@ -237,6 +238,14 @@ def sample_smc(
         return selected(tree, names, keywords)
 
 
+class Likelihood(Enum):
+    """The likelihood of a posterior."""
+
+    SPECIMENS = auto()  # log-likelihoods by specimen
+    ESTIMATE = auto()  # density of the metrics' estimate
+    PSEUDO = auto()  # exp(-discrepancy / epsilon)
+
+
 @dataclass(frozen=True, eq=False)
 class SamplingSettings:
     """Arguments of `sample_smc` and `sample`."""
@@ -255,9 +264,11 @@ class SamplingSettings:
     progressbar: bool = False
     with_groups: bool = False  # whether the result has the groups of `arviz_groups`
 
-    def is_pseudo(self, evaluator: Evaluator) -> bool:
-        """Return whether draws are those of the pseudo-posterior exp(-discrepancy / epsilon)."""
-        return bool(evaluator.nodes) and self.adjustment is None
+    def kind(self, evaluator: Evaluator) -> Likelihood:
+        """Return which likelihood the prior is multiplied by."""
+        if not evaluator.nodes:
+            return Likelihood.SPECIMENS
+        return Likelihood.PSEUDO if self.adjustment is None else Likelihood.ESTIMATE
 
 
 def require_adjustment(adjustment: object) -> None:
@@ -284,8 +295,8 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
 
 def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    is_pseudo = settings.is_pseudo(evaluator)
-    if settings.epsilon is not None and not is_pseudo:
+    kind = settings.kind(evaluator)
+    if settings.epsilon is not None and kind is not Likelihood.PSEUDO:
         raise ValueError(
             f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
             "choose; leave epsilon= out, or pass adjustment=None with a metric"
@@ -295,18 +306,12 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     epsilons = evaluator.epsilon
     try:
         with designs_as_before(evaluator) as restore_designs:
-            optimum = settings.optimum
-            if is_pseudo:
+            if kind is Likelihood.PSEUDO:
                 optimum = _set_epsilons(evaluator, settings)
-            elif evaluator.nodes:
-                require_density(evaluator)
-                if optimum is None:
-                    search = Minimisation(refine=settings.refine)
-                    optimum = require_finished(find_optimum(evaluator, search))
-                require_sampling(optimum, "sample_smc")
-            chains = _chains_on_designs(evaluator, settings, optimum)
-            if is_pseudo:
-                chains = _with_errors(evaluator, chains)
+                chains = _with_errors(evaluator, _chains_on_designs(evaluator, settings, optimum))
+            else:
+                optimum = required_optimum(evaluator, settings, "sample_smc")
+                chains = _chains_on_designs(evaluator, settings, optimum)
             tree = result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
             if chains.stopped:
                 restore_designs()
@@ -314,6 +319,20 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     finally:
         for node, value in zip(evaluator.nodes, epsilons, strict=True):
             node.epsilon.set_value(np.asarray(value))
+
+
+def required_optimum(
+    evaluator: Evaluator, settings: SamplingSettings, caller: str
+) -> Optimum | None:
+    """Return the optimum of the settings, or the one that the density of the estimate needs."""
+    optimum = settings.optimum
+    if settings.kind(evaluator) is Likelihood.SPECIMENS:
+        return optimum
+    require_density(evaluator)
+    if optimum is None:
+        search = Minimisation(refine=settings.refine)
+        optimum = require_finished(find_optimum(evaluator, search))
+    return require_sampling(optimum, caller)
 
 
 def result_of(
@@ -326,7 +345,8 @@ def result_of(
     clock: float,
 ) -> xr.DataTree:
     """Return the DataTree of chains, with discrepancies if these cost no response."""
-    is_pseudo = settings.is_pseudo(evaluator)
+    kind = settings.kind(evaluator)
+    is_estimate = kind is Likelihood.ESTIMATE
     findings: list[Finding] = []
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
@@ -338,14 +358,14 @@ def result_of(
         page = "expensive.md#a-night-is-not-enough"
         findings += report(Finding("budget-spent", text, page))
     thetas = chains.thetas
-    if not is_pseudo:
+    if kind is not Likelihood.PSEUDO:
         lost = _lost_of_some(evaluator, thetas)
         chains = replace(chains, lost=lost, discrepancies=np.full_like(lost, np.nan))
     findings += _lost_findings(evaluator, chains)
     rows = thetas.reshape(-1, evaluator.hyperparameters.size)
     refuse_lost_specimens(evaluator, rows.mean(axis=0))
     with unlimited():
-        if not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
+        if is_estimate and not evaluator.responses_per_theta:
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
             chains = replace(chains, discrepancies=discrepancies)
         groups = {}
@@ -354,18 +374,18 @@ def result_of(
         if optimum is not None:
             # Leave out few-specimens, because draws are as wide as few specimens make them.
             findings += [f for f in optimum.findings if f.code != "few-specimens"]
-            if evaluator.nodes and not is_pseudo:
+            if is_estimate:
                 findings += prior_conflicts(optimum, evaluator, thetas)
         else:
             findings += [f for node in evaluator.nodes for f in node.bound.findings]
-            if not is_pseudo:
+            if kind is not Likelihood.PSEUDO:
                 for likelihood in evaluator.likelihoods:
                     findings += prepared(likelihood).findings
         attrs = {
             "n_responses": evaluator.n_responses - n_before,
             "seconds": time.perf_counter() - clock,
             "random_seed": str(settings.random_seed),
-            "adjustment": "estimate" if evaluator.nodes and not is_pseudo else "none",
+            "adjustment": "estimate" if is_estimate else "none",
             "findings": as_json(findings),
         }
         return posterior_tree(evaluator, chains, attrs, groups)
@@ -502,7 +522,7 @@ def _chains_on_designs(
             refine_at(evaluator, refinements[-1])
             continue
         log_likelihood = None
-        if evaluator.nodes and settings.adjustment is not None:
+        if settings.kind(evaluator) is Likelihood.ESTIMATE:
             assert optimum is not None
             log_likelihood = estimate_target(evaluator, optimum).log_likelihood
         chains = run_chains(
@@ -588,7 +608,7 @@ def run_chains(
     particles, notes = zip(*states, strict=True)
     arrays = {name: np.array([of_chain[name] for of_chain in particles]) for name in particles[0]}
     stats, evidence = _stage_statistics([note["stages"] for note in notes])
-    is_pseudo = settings.is_pseudo(evaluator)
+    is_pseudo = settings.kind(evaluator) is Likelihood.PSEUDO
     return Chains(
         thetas=arrays["thetas"],
         sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC", **evidence},

@@ -34,7 +34,13 @@ from prbayes.inference.refits import (
 )
 from prbayes.inference.resampling import groups, observable, observed_set, sets_along
 from prbayes.metrics.score import prepared_on_population
-from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
+from prbayes.model.evaluator import (
+    TOLERABLE,
+    Evaluator,
+    coarser_evaluator,
+    supports_each,
+    with_targets,
+)
 from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.numerics.modes import LogDensity, far_apart, laplace
 from prbayes.numerics.points import sobol
@@ -318,7 +324,7 @@ def refit_likelihood(
             if target.event:
                 responses, weights = continued.populations(start[None], k)
                 targets[k] = prepared_on_population(target, responses[0], weights[0])
-        evaluator = evaluator.with_targets(targets)
+        evaluator = with_targets(evaluator, targets)
         continued = _continued(evaluator, continuation)
         start = _at_minimiser(continued, start, scales, options).theta
     sampling = _at_minimiser(continued, start, scales, options)

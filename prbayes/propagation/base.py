@@ -38,8 +38,9 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import is_missing
 from prbayes.response.response import Responses, check_call_settings
 
-# Parts of a population's points whose differences estimate its error. Each is a design itself, and
-# the standard error of their spread is about a quarter, 1 / sqrt(2 (8 - 1)).
+# Number of batches of a population's points, whose scatter estimates the Monte Carlo error (batch
+# means). Each batch is a design itself. The estimate from 8 batches has a relative standard error
+# of about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
 
 # Default of the largest share of a population's weight, at an answer, on points without response.
@@ -54,8 +55,8 @@ class DesignError(RuntimeError):
 class Missing:
     """Shares of populations without numbers, shapes (k,)."""
 
-    lost: Floats  # of the weight, on points without response (NaN)
-    failed: Floats  # of the weight that is not lost, on specimens that failed (+inf)
+    lost: Floats  # share of the weight on points without response (NaN)
+    failed: Floats  # share of the remaining weight on specimens that failed (+inf)
 
     @classmethod
     def of(cls, values: Floats, weights: Floats) -> Missing:
@@ -111,18 +112,24 @@ class Bound(ABC):
         The responses there.
     """
 
-    n_per_theta: int = 0  # responses that one evaluation of the discrepancy computes
-    symbolic: bool = False  # whether responses are part of the graph, which does not count them
-    stored: ClassVar[bool] = False  # whether responses are stored: a theta then costs none
-    random: ClassVar[bool] = False  # whether evaluations draw specimens: there is no gradient
-    # Whether points are inside the population's support at some thetas and outside at others.
+    n_per_theta: int = 0  # number of responses that one evaluation of the discrepancy computes
+    # Whether responses are part of the PyTensor graph, so that their calls are not counted.
+    symbolic: bool = False
+    # Whether responses are stored, so that another theta needs no call of the response.
+    stored: ClassVar[bool] = False
+    # Whether each evaluation draws new specimens, so that there is no gradient.
+    random: ClassVar[bool] = False
+    # Whether some points are inside the population's support at one theta and outside at another.
     support_moves: bool = False
-    max_lost: float = MAX_LOST  # largest share, at an answer, of points without response
-    findings: tuple[Finding, ...] = ()  # about the data and the first responses
-    # Seed of the sampler at work, and evaluations since it began, which determine random draws.
+    # Largest accepted share, at an answer, of a population on points without response.
+    max_lost: float = MAX_LOST
+    findings: tuple[Finding, ...] = ()  # findings about the data and the first responses
+    # Seed of the current sampler, and number of evaluations since it started. Both determine the
+    # random draws.
     stream: int = 0
     draws: int = 0
-    # Of the populations evaluated last; NaN of invalid ones, and where responses are stored.
+    # Shares without numbers of the populations in the last evaluation. They are NaN for invalid
+    # populations, and for all populations if responses are stored.
     last_missing: Missing = Missing(np.array(np.nan), np.array(np.nan))
 
     def __init__(
@@ -161,8 +168,8 @@ class Bound(ABC):
 
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the parents' values."""
-        # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be
-        # drawn, not given.
+        # The graph is built with plain symbols, because PyMC may clone random parameters, and would
+        # draw the clones instead of using the given values.
         symbols = self.inputs.placeholders()
         values = map(pt.as_tensor, params)
         swap = dict(zip(symbols, values, strict=True))
@@ -171,7 +178,7 @@ class Bound(ABC):
 
     @abstractmethod
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the discrepancy as a scalar graph of symbols for the parents' values."""
+        """Return the discrepancy as a scalar graph; ``params`` are symbols for the parents."""
 
     @abstractmethod
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
@@ -265,9 +272,9 @@ class Propagation(ABC):
     on_failure: OnFailure = field(default=Abort(), repr=False)
     retry_failed: bool = field(default=False, repr=False)
     timeout: float | None = field(default=None, repr=False)
-    # Whether every evaluation draws specimens: the discrepancy is then random.
+    # Whether each evaluation draws new specimens, so that the discrepancy is random.
     is_random: ClassVar[bool] = False
-    # Whether the response itself is called where an emulator could answer.
+    # Whether the response itself is called at points where an emulator could predict it.
     calls_response: ClassVar[bool] = False
 
     @property
@@ -327,12 +334,13 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
 def cost_by_evaluation(n: int) -> RunCost:
     """Return the runs of a propagation with n runs for each value of the hyperparameters."""
     growth = "each value that the optimiser or sampler asks for; max_runs= and max_seconds= end it"
-    return RunCost(16, n, None, growth)  # the points of `probe`
+    return RunCost(16, n, None, growth)  # `probe` calls the response at 16 points
 
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
     """Return a trial of the response at points of the prior, (2, 8), and their inputs."""
-    draws = PriorSampler(bound.inputs.parents)(64, seed)  # a few of them at least are valid
+    # 64 draws, because some may have invalid parameters.
+    draws = PriorSampler(bound.inputs.parents)(64, seed)
     two = [draw[:2] for draw in valid_parents(bound, draws)]
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)

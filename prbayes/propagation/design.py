@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
-from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import (
     SIZES,
     DesignEmulator,
@@ -39,21 +39,21 @@ class Design:
     """Stored runs, and points whose weights make populations; one that grows is a new record."""
 
     runs: Sample
-    mixture: Mixture  # of the runs: their proposal density
+    mixture: Mixture  # mixture of populations that the runs were drawn from, their proposal density
     batch_sizes: tuple[int, ...]  # number of runs of each batch, in the order of the runs
-    # Roots, shapes (k, *shape), of populations that the points support: the prior's, and those of
-    # interest last.
+    # Populations that the sample has to support, as groups of the parents' values, (k, *shape)
+    # each. The first group is from the prior, the last one has the populations of interest.
     groups: tuple[tuple[Floats, ...], ...]
     # The points that have weights: the runs, or emulated points with or without the runs.
     sample: Sample
-    # The first points of the sample, (M, *event) by input, if their responses are emulated.
+    # Emulated points, (M, *event) by input, which come first in the sample; None without emulator.
     emulated: tuple[Floats, ...] | None = None
     emulator: DesignEmulator | None = None
-    n_emulated_samples: int = 0  # number of times that emulated points were drawn
+    n_emulated_samples: int = 0  # number of emulated samples that have been drawn
     emulated_size: int = SIZES.first  # number of points of the next emulated sample
-    # Positions of the inputs whose support moves with the hyperparameters.
+    # Indices of the inputs whose support depends on the hyperparameters.
     moving: tuple[int, ...] = ()
-    # Whether a specimen is one continuous number, and the points a quadrature rule.
+    # Whether a specimen is one continuous number, so that the points are a quadrature rule.
     on_line: bool = False
 
     @property
@@ -86,8 +86,9 @@ class Design:
     @cached_property
     def weight_arrays(self) -> list[Floats]:
         """Points and log g of the sample, then ends of cells of inputs whose support moves."""
-        # A cell reaches 8 neighbours beside other inputs: points then pass an edge one by one, as
-        # their weights differ. On a line, the cells of neighbours meet.
+        # With several inputs neighbouring points have unequal weights, and would leave a moving
+        # support one by one. Cells that reach over 8 neighbours smooth this. With one input the
+        # cells of neighbours meet.
         reach = 1 if self.on_line else 8
         cells = [cells_around(self.sample.points[i], reach) for i in self.moving]
         return [*self.sample.points, self.sample.log_density, *chain.from_iterable(cells)]
@@ -110,6 +111,10 @@ class Design:
         )
 
 
+class PoorEmulatorError(DesignError):
+    """The emulator of another response of the same specimens is too poor."""
+
+
 @dataclass(eq=False)
 class DesignSampler:
     """Points of designs, and their weights: runs, and emulated points if there is an emulator."""
@@ -117,7 +122,27 @@ class DesignSampler:
     mixtures: MixtureSampler
     random_seed: int
     emulator: Any
-    _log_weights: Any = None  # the compiled function, if the support of an input moves
+    # Compiled function of the log-weights, if the support of an input moves.
+    _log_weights: Any = None
+
+    def emulator_of(self, design: Design, at_runs: Floats) -> DesignEmulator:
+        """Return an emulator of another response, fitted to its values at the runs of a design."""
+        assert design.emulator is not None
+        runs = replace(design.runs, values=at_runs)
+        emulator = DesignEmulator.fit(self.emulator, runs, design.emulator.weights)
+        # With a mixing weight of one half the bias of the emulator is as large as the sampling
+        # error of the runs. The runs get the mixing weight that they have for the design's own
+        # response.
+        most = 0.5
+        share = 1.0 if emulator is None else emulator.run_share
+        if emulator is None or share > most + design.emulator.run_share:
+            raise PoorEmulatorError(
+                f"{self.mixtures.name}: got a response of the same specimens whose emulator would "
+                f"leave {share:.0%} of a population to the {len(runs)} runs alone, expected at "
+                f"most {most:.0%} more than for the response of the design; calibrate with "
+                "prb.Reweighted(n, emulator=None), or let one response return both outputs"
+            )
+        return emulator
 
     def with_runs(
         self, design: Design | None, components: Sequence[Floats], n: int, responses: Responses
@@ -125,14 +150,14 @@ class DesignSampler:
         """Return a design with n more runs at points from populations at parents, (k, *shape)."""
         inputs = self.mixtures.inputs
         n_batches = 0 if design is None else len(design.batch_sizes)
-        # A prime: seeds 0, 1, 2, ... of a user share no batch.
+        # The stride is a large prime, so that designs with seeds 0, 1, 2, ... share no batch.
         seed = self.random_seed + 7919 * n_batches
         first = inputs.aleatory[0]
         is_scalar = len(inputs.aleatory) == 1 and first.type.ndim == 0
         on_line = is_scalar and first.dtype.startswith("float")
         draw = self.mixtures.equal_mass if on_line else self.mixtures.draw
         points, mixture = draw(components, n, seed)
-        # Responses that are known to this or another design are reused.
+        # Responses that this or another design has at these points are reused.
         values = responses.runs.at(points)
         if values is not None:
             responses.refuse_change(points, values, responses)
@@ -151,11 +176,12 @@ class DesignSampler:
             values = np.concatenate([design.runs.values, values])
             mixture = design.mixture.joined(mixture)
             batch_sizes = (*design.batch_sizes, n)
-        # The mixture is that of all batches: its density changes at the old points, too.
+        # Each batch changes the mixture, and with it the density at the points of earlier batches.
         log_g = self.mixtures.log_density(mixture, points)
         if on_line:
             blocks = np.arange(len(log_g)) % N_BLOCKS
-        else:  # consecutive points of a Sobol sequence, each of whose stretches is a net
+        else:
+            # Each batch of points is a stretch of a Sobol sequence, so evenly distributed itself.
             blocks = np.concatenate([np.arange(size) * N_BLOCKS // size for size in batch_sizes])
         runs = Sample(points, values, log_g, blocks)
         if design is None:
@@ -169,12 +195,12 @@ class DesignSampler:
     ) -> Design:
         """Return a design that supports populations, by emulated points where these are better."""
         runs = design.runs
-        # The prior, the populations before, and these.
+        # Keep the prior's group and the latest of the others, and add the new group.
         groups = (*design.groups[:1], *design.groups[1:][-1:], tuple(components))
         design = replace(design, groups=groups, sample=runs, emulated=None, emulator=None)
         if self.emulator is None:
             return design
-        # 32 populations determine the mixing weight of the emulator.
+        # 32 populations suffice to choose the mixing weight of the runs and the emulated points.
         weights = self.weights(runs, spread_over(components, 32))
         if emulator is None:
             emulator = DesignEmulator.fit(self.emulator, runs, weights)
@@ -182,7 +208,7 @@ class DesignSampler:
             emulator = emulator.for_populations(weights)
         if emulator is None:
             return design
-        # Another prime: no emulated sample shares points with a batch.
+        # The stride is another prime, so that no emulated sample has the points of a batch of runs.
         seed = self.random_seed + 104_729 * (1 + design.n_emulated_samples)
         populations, shares = mixture_of(groups, design.emulated_size)
         points, mixture = self.mixtures.draw(populations, design.emulated_size, seed, shares)

@@ -32,8 +32,8 @@ from prbayes.response.inputs import Inputs
 class Mixture:
     """A finite mixture of populations."""
 
-    components: tuple[Floats, ...]  # (k, *shape), by root
-    counts: Floats  # (k,): number of points from each component, its weight
+    components: tuple[Floats, ...]  # (k, *shape): values of each parent, a row for each population
+    counts: Floats  # (k,): number of points from each population, its mixing weight
 
     def joined(self, more: Mixture) -> Mixture:
         """Return the mixture of the points of both."""
@@ -45,7 +45,7 @@ class Mixture:
 class MixtureSampler:
     """Quasi-random points from mixtures of populations of some inputs."""
 
-    name: str  # of the simulator, for messages
+    name: str  # name of the simulator, for messages
     inputs: Inputs
     density: PopulationDensity
 
@@ -60,7 +60,8 @@ class MixtureSampler:
         self, components: Sequence[Floats], n: int, seed: int
     ) -> tuple[tuple[Floats, ...], Mixture]:
         """Return n points of one input that cut the mixture into parts of equal mass."""
-        # 16 draft points for each, without a response; 2^18 are a grid for any design.
+        # Draw 16 candidates for each point, which needs no response. 2^18 candidates are a fine
+        # grid for any design.
         n_draft = min(16 * n, 1 << 18)
         (draft,), drawn = self._drawn(components, n_draft, seed, None)
         mixture = Mixture(drawn.components, drawn.counts * (n / drawn.counts.sum()))
@@ -69,8 +70,8 @@ class MixtureSampler:
         grid, n_equal = np.unique(finite, return_counts=True)
         levels = (np.arange(n) + shift) / n
         log_density = self.log_density(drawn, [grid])
-        # A value with probability itself, such as a bound of a censored input, is more frequent
-        # than two points of the design, and has a finite density.
+        # A value that more than two points of the design would have, and that has a finite density,
+        # has positive probability, such as a bound of a censored input.
         is_frequent = n_equal > 2 * n_draft / n
         if np.any(is_frequent & np.isfinite(log_density)):
             ranks = (levels * finite.size).astype(int)
@@ -81,9 +82,9 @@ class MixtureSampler:
             trapezoids = 0.5 * (density[1:] + density[:-1]) * np.diff(grid)
             mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
             difference = np.abs(mass / mass[-1] - cumulated).max()
-        # Trapezoids are finer than the empirical distribution function of the grid, unless the
-        # density is infinite at an edge, or has peaks between points: both then differ more than
-        # random points.
+        # The integral by trapezoids is more accurate than the empirical distribution function of
+        # the grid, unless the density is infinite at an edge or has peaks between grid points. In
+        # these cases the two functions differ by more than the sampling error.
         if difference < 1 / np.sqrt(grid.size):
             points = np.interp(levels * mass[-1], mass, grid)
         else:
@@ -111,10 +112,10 @@ class MixtureSampler:
     def _drawn(
         self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None
     ) -> tuple[list[Floats], Mixture]:
-        """Return points and their mixture.
+        """Return points and the mixture from which they were drawn.
 
-        Scrambled Sobol points go through the inverse distribution functions where they exist. One
-        of their axes selects the population: populations are stratified.
+        Scrambled Sobol points are transformed by the inverse distribution functions where these
+        exist. One of the Sobol axes selects the population, so that populations are stratified.
         """
         k = len(components[0])
         selector, uniforms = base_points(self.inputs.event_shapes, n, seed)
@@ -128,7 +129,7 @@ class MixtureSampler:
             points = list(self._quantiles(*parents, *uniforms))
             if any(np.isnan(x).any() for x in points):
                 raise TypeError("an inverse distribution function without a number")
-        except TypeError:  # a distribution without inverse distribution function
+        except TypeError:  # without an inverse distribution function points are drawn at random
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(parents, 1, rng)
             points = [x[:, 0] for x in draws]
@@ -137,7 +138,7 @@ class MixtureSampler:
         return points, Mixture(tuple(components), counts)
 
     def _off_the_edges(self, points: Sequence[Floats], mixture: Mixture) -> tuple[Floats, ...]:
-        """Return points, moved by a rounding where the density is infinite.
+        """Return points, after a shift by a rounding unit of those where the density is infinite.
 
         Quantiles may be rounded to the edge of a support, where densities such as that of
         ``Beta.dist(1, 0.5)`` have no finite value.
@@ -154,7 +155,7 @@ class MixtureSampler:
 
     @cached_property
     def _quantiles(self) -> Any:
-        """The compiled inverse distribution functions of parents and uniform numbers."""
+        """Compiled function from parents and uniform numbers to quantiles of the inputs."""
         symbols = self.inputs.placeholders()
         shapes = [x.type.shape for x in self.inputs.aleatory]
         uniforms = [pt.tensor(dtype="float64", shape=shape) for shape in shapes]
@@ -205,13 +206,15 @@ def through_inverses(
 class EmulatedSizes:
     """Sizes of emulated samples, whose points cost no run; few populations fill space evenly."""
 
-    first: int = 8192  # points
-    largest: int = 65536  # points
-    prior_share: float = 1 / 16  # of the points, beside populations that matter
-    from_prior: int = 96  # populations, beside others that matter
-    near: int = 30  # populations of another group, in a sample of the first size
-    # Shares of the runs in a population above which the runs stay alone, and below which they are
-    # left out: a mixture has the least error in between.
+    first: int = 8192  # number of points of the first emulated sample
+    largest: int = 65536  # number of points of the largest emulated sample
+    # Share of points from the prior, if there are populations of interest.
+    prior_share: float = 1 / 16
+    # Number of populations from the prior, if there are populations of interest.
+    from_prior: int = 96
+    near: int = 30  # number of populations from each other group, in a sample of the first size
+    # Mixing weight of the runs above which only the runs are used, and below which only the
+    # emulated points are used. In between a mixture of both has the least error.
     runs_alone: float = 0.95
     runs_negligible: float = 0.05
 
@@ -223,10 +226,10 @@ SIZES = EmulatedSizes()
 class Sample:
     """Points with their responses and proposal density, for importance weights."""
 
-    points: tuple[Floats, ...]  # (n, *event), by aleatory input
-    values: Floats  # (n,) or (n, m); NaN without a response
-    log_density: Floats  # (n,): of the mixture that the points were drawn from
-    blocks: NDArray[np.intp]  # (n,): which of eight coarser samples a point belongs to
+    points: tuple[Floats, ...]  # (n, *event): points, an array for each aleatory input
+    values: Floats  # (n,) or (n, m): responses; NaN without a response
+    log_density: Floats  # (n,): log-density of the mixture that the points were drawn from
+    blocks: NDArray[np.intp]  # (n,): index of the batch, of eight, that each point belongs to
 
     def __len__(self) -> int:
         return len(self.values)
@@ -243,12 +246,12 @@ class DesignEmulator:
 
     runs: TrainingRuns
     emulator: Emulator
-    left_out: Floats  # (n, m): predictions of runs that were left out
+    left_out: Floats  # (n, m): cross-validation predictions at the runs
     event: tuple[int, ...]  # shape of one response: () or (m,)
-    weights: Floats  # (T, n): of the runs in the populations that matter
+    weights: Floats  # (T, n): importance weights of the runs in T populations of interest
     run_share: float = 1.0  # mixing weight of the runs among the points of a population
-    # Root mean square error of the worst output at runs that were left out, in units of its spread
-    # in the populations that matter.
+    # Root mean square cross-validation error of the worst output, in units of the output's spread
+    # in the populations of interest.
     error: float = np.nan
     worst_output: int = 0
 
@@ -320,7 +323,7 @@ class DesignEmulator:
         blocks = np.arange(m) * N_BLOCKS // m
         if not self.run_share:
             return Sample(points, values, log_density, blocks)
-        # Weights are p / g: the mean over all points together is one.
+        # Importance weights are p / g. These constants make their mean over all points one.
         of_points = log_density - np.log((1 - self.run_share) * (m + n) / m)
         of_runs = runs.log_density - np.log(self.run_share * (m + n) / n)
         return Sample(
@@ -350,7 +353,7 @@ def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floa
     """Return the populations of an emulated sample, and their shares; the prior comes first."""
     prior, *posteriors = groups
     if not posteriors:
-        count = 384  # more cost time and change nothing
+        count = 384  # more populations take time and do not change the results
         return spread_over(prior, count), np.full(count, 1 / count)
     near = SIZES.near * size // SIZES.first
     parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in posteriors)]

@@ -37,7 +37,8 @@ def moving_inputs(
     k = len(components[0])
     moving = []
     for i, (dist, x) in enumerate(zip(dists, values, strict=True)):
-        if isinstance(dist.owner.op, ELLIPTICAL):  # positive everywhere
+        # Elliptical distributions have a positive density everywhere.
+        if isinstance(dist.owner.op, ELLIPTICAL):
             continue
         outside = pt.isneginf(pm.logp(dist, x, warn_rvs=False))
         compiled = compile_batched(symbols, [outside], [x])
@@ -45,7 +46,8 @@ def moving_inputs(
         for start in range(0, len(points[i]), step):
             block = points[i][start : start + step]
             (result,) = compiled(*components, block)
-            # By element, or for a vector that is drawn as a whole.
+            # The result has an axis for the elements, or none for a vector that is drawn as a
+            # whole.
             is_outside = np.broadcast_to(result, (k, *block.shape[: outside.type.ndim]))
             if np.any(is_outside.any(axis=0) & ~is_outside.all(axis=0)):
                 _refuse_unaverageable(name, dist)
@@ -89,13 +91,15 @@ def refuse_moving_atoms(
     number = population.max() + 1
     for dist, x in zip(inputs.aleatory, points, strict=True):
         if not dist.dtype.startswith("float"):
-            continue  # one whose support moves is refused, and in others no value does
+            # A moving support of discrete inputs is refused above; other values may repeat.
+            continue
         for column in x.reshape(len(x), -1).T:
             _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)
             pairs = np.unique(value * number + population)
             n_populations = np.bincount(pairs // number)
             is_atom = (repeated > 1) & (n_populations == 1)
-            # Continuous values repeat by rounding, far out: in less than 1 % of the points.
+            # Rounding makes continuous values far in the tails equal, but less than 1 % of the
+            # points.
             if is_atom.sum() >= 8 and repeated[is_atom].sum() > 0.01 * column.size:
                 raise TypeError(_moving_atoms(name, dist, "values"))
 
@@ -118,7 +122,7 @@ def cells_around(points: Floats, reach: int) -> tuple[Floats, Floats]:
         above = rank + reach - 1
         low = half_way[np.maximum(below, 0)]
         high = half_way[np.minimum(above, last)]
-        # The outermost points are in the middle of their cells.
+        # The cells of the first and last points are symmetric around these points.
         low = np.where(below < 0, 2 * ordered - high, low)
         high = np.where(above > last, 2 * ordered - low, high)
         lower[order, k] = low

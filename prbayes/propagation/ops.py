@@ -19,8 +19,8 @@ from prbayes.metrics.grid import Cells
 from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
 
-# Calls of the user's functions have no compiled form; nothing is gained by saying so at every
-# compilation.
+# Calls of the user's functions cannot be compiled, so that Numba's warning would appear at every
+# compilation without being of any use.
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
@@ -32,16 +32,17 @@ class OwnOp(Op):
     """An operation on arrays (..., *event); two are equal if ``__props__`` are the same objects."""
 
     __props__: tuple[str, ...] = ()
-    event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
-    event_shape: tuple[int | None, ...] = ()  # of the result
-    no_gradient: str = ""  # why there is none, and what to do
+    # Number of axes of each input, such as a sample and its weights.
+    event_ndims: Sequence[int] = (1, 1)
+    event_shape: tuple[int | None, ...] = ()  # shape of the result without leading axes
+    no_gradient: str = ""  # error text if the operation has no gradient: reason and remedy
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.__str__ = OwnOp.__str__  # type: ignore[method-assign]  # PyTensor's shows all values
 
     def __str__(self) -> str:
-        """Return the name, and what to do where a backend has no form of it."""
+        """Return the name, and what to do if a backend cannot compile the operation."""
         return (
             f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
             "take prb.Reweighted alone, with a smaller max_points for several outputs; use that, "
@@ -61,7 +62,7 @@ class OwnOp(Op):
         return Apply(self, tensors, [result])
 
 
-# Operations that take leading axes themselves: a batch is one call.
+# These operations accept leading axes themselves, so that a batch of arrays is one call.
 _vectorize_node.register(OwnOp, lambda op, _, *batched: op.make_node(*batched))
 
 

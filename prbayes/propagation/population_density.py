@@ -34,9 +34,10 @@ def _non_negative(x: Floats) -> Floats:
     return np.where(x >= 0, x, np.nan)
 
 
-# Functions of an element, (n,) -> (n,), that are its sufficient statistics, and whether their
-# products are sufficient statistics as well. A function is not finite outside of the support, which
-# does not depend on the parameters. The support of the truncated normal is in the graph.
+# Sufficient statistics of each family, as functions of an element, (n,) -> (n,), and whether
+# products of these functions are sufficient statistics as well. A function is not finite outside of
+# the support, if the support does not depend on parameters. That of the truncated normal does: the
+# graph of the density contains it.
 _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
     type(pm.Normal.rv_op): ((np.positive,), True),
     type(pm.HalfNormal.rv_op): ((_non_negative,), True),
@@ -52,7 +53,10 @@ _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
 def _family_coordinates(
     dist: pt.TensorVariable, values: Floats
 ) -> list[tuple[Floats, bool]] | None:
-    """Return coordinates (c, n) of each element, and if they are quadratic; None without a form."""
+    """Return coordinates (c, n) of each element, and whether products are sufficient statistics.
+
+    Returns None if the distribution is of no known exponential family.
+    """
     if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
     if is_condition(dist):
@@ -86,7 +90,7 @@ def _statistics(coordinates: Floats, is_quadratic: bool) -> Floats:
 
 
 def _standardised(values: Floats) -> Floats:
-    """Return values (c, n) less their means, in standard deviations."""
+    """Return values (c, n) after subtraction of their means, in standard deviations."""
     size = values.shape[1]
     centered = values - (values.sum(axis=1) / size)[:, None]
     spread = np.sqrt(np.vecdot(centered, centered) / size)
@@ -126,14 +130,15 @@ class ExponentialForm:
         size = len(at_inside)
         if inside.size < 2 * size:
             return None
-        # Pivoted QR selects anchors that are nearly orthogonal. It selects among the half of the
-        # points near the middle, since log-densities far away have larger roundings.
+        # Pivoted QR selects anchors whose statistics are nearly orthogonal. Only the half of the
+        # points nearest to the centre is eligible, because log-densities far away have larger
+        # rounding errors.
         distance = (at_inside**2).sum(axis=0)
         near = np.argsort(distance, kind="stable")[: inside.size // 2]
         _, _, order = qr(at_inside[:, near], mode="economic", pivoting=True)
         pivots = near[order[:size]]
         at_anchors = at_inside[:, pivots]
-        # Points that coincide, or lie in a plane, determine no natural parameters.
+        # Points that coincide, or that lie in a plane, do not determine the natural parameters.
         if np.linalg.cond(at_anchors) > 1e6:
             return None
         statistics = np.zeros((size, is_inside.size))
@@ -157,7 +162,7 @@ class PopulationDensity:
     """Populations of some inputs, compiled once: log-densities and draws."""
 
     inputs: Inputs
-    # Points of the last call, and the form of their log-density, if there is one.
+    # Points of the last call and the form of their log-density, or None if there is no form.
     _form: tuple[Any, ExponentialForm | None] = (None, None)
 
     @cached_property
@@ -175,8 +180,8 @@ class PopulationDensity:
         previous, form = self._form
         if previous is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
-            # The form is not used at the end of a support, where PyMC's density may be finite or
-            # infinite, nor with covariates, which give each point a population of its own.
+            # PyMC's density at the end of a support may be finite or infinite, and covariates give
+            # each point a population of its own. In these cases the form is not used.
             if form is not None and (self.inputs.covariates or not form.is_inside.all()):
                 form = None
             self._form = points[0], form
@@ -189,7 +194,8 @@ class PopulationDensity:
             if form is None:
                 (logs,) = self.log_density(*params, *[x[rows] for x in points])
                 return np.array(logs)
-            # One thread, so that the points of a design do not depend on the number of threads.
+            # One thread, because rounding, and with it the points of a design, would depend on the
+            # number of threads.
             with one_thread():
                 logs = natural @ form.statistics[:, rows]
             if is_rounded.any():

@@ -128,8 +128,8 @@ class ResimulatedBound(Bound):
         self.n_per_theta = config.n
         self.max_lost = config.max_lost
         points = config.base_points(inputs)
-        # PyTensor evaluates constant parts of a graph once and keeps them: fast, unless they are
-        # large.
+        # PyTensor evaluates constant parts of a graph once and stores the results. This is fast for
+        # small arrays only, so that large ones are shared variables.
         is_small = config.n <= AT_ONCE
         self._points: list[Any] = points if is_small else [shared(u) for u in points]
         values, aleatory, epistemic = probe(self, PopulationSampler(inputs), config.random_seed)
@@ -144,7 +144,7 @@ class ResimulatedBound(Bound):
     def _is_a_graph(
         self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]
     ) -> bool:
-        """Return whether the response of PyTensor variables is a graph with the same numbers."""
+        """Return whether the response builds a PyTensor graph that has the same numbers."""
         values = [*aleatory, *epistemic]
         symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in values]
         k = len(aleatory)
@@ -155,9 +155,10 @@ class ResimulatedBound(Bound):
                 return False
             compiled = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")
             result = compiled(*values)
-        except Exception:  # whatever it is: the response is then called with arrays
+        except Exception:
+            # An error of any class means that the response has to be called with arrays.
             return False
-        # Both differ by rounding at most.
+        # The graph and the called response differ by rounding at most.
         same_shape = result.shape == expected.shape
         return same_shape and np.allclose(result, expected, rtol=1e-9, equal_nan=True)
 
@@ -177,7 +178,7 @@ class ResimulatedBound(Bound):
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses, +inf where parameters are invalid."""
         values, parameters_valid = self._response(params)
-        # As `responding_weights`: points without response have no weight.
+        # Points without response have no weight, as in `responding_weights`.
         is_lost = pt.isnan(values)
         if self.target.event:
             is_lost = is_lost.any(axis=-1)
@@ -266,13 +267,14 @@ class FreshBound(Bound):
         probe(self, self._sampler, config.random_seed)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return an operation that draws and evaluates."""
+        """Return the operation that draws specimens and evaluates their discrepancy."""
         return FreshOp(self)(*params)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
         self.draws += 1
-        digest = hashlib.blake2b(digest_size=8)  # of the parents, the same in all processes
+        # Hash of the parents' values, which is the same in all processes.
+        digest = hashlib.blake2b(digest_size=8)
         for values in params:
             digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
         number = int.from_bytes(digest.digest(), "little")

@@ -36,7 +36,6 @@ from prbayes.propagation.base import (
 from prbayes.propagation.design import Design, DesignSampler, log_weight_graph
 from prbayes.propagation.importance import (
     SIZES,
-    DesignEmulator,
     MixtureSampler,
     Sample,
 )
@@ -51,8 +50,8 @@ from prbayes.response.response import (
     deduplicated_responses,
 )
 
-# Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
-# fast, but JAX does not know their operations.
+# Largest number of elements of a basis in a compiled graph, 1 GiB, for the largest design. Above
+# this size metrics take a smaller form, which is as fast, but whose operations JAX cannot compile.
 _MAX_BASIS = 1 << 27
 
 
@@ -208,7 +207,8 @@ class Reweighted(Propagation):
 
     def emulates(self, inputs: Inputs) -> bool:
         """Return whether responses between the runs are emulated."""
-        # With more runs the response is cheap, and of one number they are a quadrature rule.
+        # A response with more runs than this is cheap and needs no emulator. Runs of one input are
+        # a quadrature rule, which is accurate without an emulator.
         if self.emulator is None or (isinstance(self.emulator, str) and self.n > MOST_RUNS):
             return False
         return inputs.dimensions > 1 and {np.dtype(x.dtype).kind for x in inputs.aleatory} == {"f"}
@@ -216,10 +216,6 @@ class Reweighted(Propagation):
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
         return ReweightedBound(name, inputs, target, responses, self)
-
-
-class PoorEmulatorError(DesignError):
-    """The emulator of another response of the same specimens is too poor."""
 
 
 class ReweightedBound(Bound):
@@ -231,8 +227,8 @@ class ReweightedBound(Bound):
     """
 
     stored: ClassVar[bool] = True
-    has_runs: ClassVar[Literal[True]] = True  # as points, unlike emulated specimens
-    is_continued: ClassVar[bool] = False  # whether responses are constant beyond the runs
+    # Whether the points are runs. Responses beyond those of emulated specimens are constant.
+    has_runs: ClassVar[Literal[True]] = True
 
     def __init__(
         self,
@@ -249,13 +245,15 @@ class ReweightedBound(Bound):
         mixtures = MixtureSampler(name, inputs, PopulationDensity(inputs))
         self._sampler = DesignSampler(mixtures, config.random_seed, emulator)
         self._data = {key: np.array(data.get_value()) for key, data in inputs.data.items()}
-        # Arrays of PyMC's graphs, once there is one.
+        # Shared variables in the graph of the PyMC model; empty before the graph is built.
         self._shared: list[Any] = []
-        # The basis of the metric and sample that were evaluated last.
+        # Metric, sample and basis of the last evaluation.
         self._basis: tuple[Any, ...] = (None, None, None)
-        # Other responses at runs: more conditions than a study has, fewer than fill the memory.
+        # Other responses with their values at the runs. A study has fewer than 32 conditions, and
+        # more would fill the memory.
         self._other_responses: deque[tuple[Responses, Sample]] = deque(maxlen=32)
-        # As many components as points would be as good, and cost their square.
+        # As many populations as points would be no more accurate, and their cost grows with the
+        # square.
         components = PriorSampler(inputs.parents)(min(config.n, 512), config.random_seed)
         components = valid_parents(self, components)
         self._design = self._sampler.with_runs(None, components, config.n, responses)
@@ -347,34 +345,26 @@ class ReweightedBound(Bound):
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, (n,) or (n, m).
 
-        Known runs are reused. Raise PoorEmulatorError if the response is emulated poorly between
-        the runs; runs alone need no emulator.
+        Known runs are reused. Raise ValueError if the design's own response has changed since its
+        runs, and PoorEmulatorError if another response is emulated poorly between the runs; runs
+        alone need no emulator.
         """
+        design = self._design
         if responses.same_as(self.responses):
-            self.refuse_change(responses)
-            return self._design.sample.values
+            points = self.points_of(responses.inputs, design.runs.points)
+            responses.refuse_change(points, design.runs.values, self.responses)
+            return design.sample.values
         at_runs = self._at_runs(responses)
-        emulated = self._design.emulated
-        if emulated is None:
+        if design.emulated is None:
             return at_runs
-        values = self._emulator_of(at_runs).at(emulated)
+        values = self._sampler.emulator_of(design, at_runs).at(design.emulated)
         has_runs = len(values) < self.n_points
         return np.concatenate([values, at_runs]) if has_runs else values
-
-    def n_runs_of(self, responses: Responses) -> int:
-        """Return the number of runs behind a response."""
-        return self.n_runs
 
     @property
     def on_line(self) -> bool:
         """Whether the points are a quadrature rule of one continuous number."""
         return self._design.on_line
-
-    def refuse_change(self, responses: Responses) -> None:
-        """Raise if the design's own response gives other values now than at the runs."""
-        runs = self._design.runs
-        points = self.points_of(responses.inputs, runs.points)
-        responses.refuse_change(points, runs.values, self.responses)
 
     def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
         """Return a response at any points of the design's inputs by emulators, (n,) or (n, m).
@@ -385,18 +375,20 @@ class ReweightedBound(Bound):
         if emulator is None:
             return []
         if not responses.same_as(self.responses):
-            emulator = self._emulator_of(self._at_runs(responses))
+            emulator = self._sampler.emulator_of(self._design, self._at_runs(responses))
         return [emulator.at(points), *emulator.without_each_block(points)]
 
     def _at_runs(self, responses: Responses) -> Floats:
-        """Return another response at the runs, (n,) or (n, m)."""
+        """Return values of another response at the runs, (n,) or (n, m)."""
         runs = self._design.runs
         pairs = [pair for pair in self._other_responses if responses.same_as(pair[0])]
         values = np.empty(0)
         if pairs:
-            # The design may have other runs, after the first ones in common.
+            # The design may have changed since the earlier call; its first runs may still be the
+            # same.
             previous, earlier = pairs[0]
-            responses.outputs = responses.outputs or previous.outputs  # names of a mapping
+            # Names of the outputs, if the response returns a mapping.
+            responses.outputs = responses.outputs or previous.outputs
             n = min(len(earlier), len(runs))
             equal = np.ones(n, dtype=bool)
             for x, y in zip(earlier.points, runs.points, strict=True):
@@ -415,27 +407,8 @@ class ReweightedBound(Bound):
             self._other_responses.append((responses, replace(runs, values=values)))
         return values
 
-    def _emulator_of(self, at_runs: Floats) -> DesignEmulator:
-        """Return an emulator of another response, from its values at the runs."""
-        design = self._design
-        assert design.emulator is not None
-        runs = replace(design.runs, values=at_runs)
-        emulator = DesignEmulator.fit(self.config.emulator, runs, design.emulator.weights)
-        # With half of the population, the bias of the emulator is as large as the scatter of runs.
-        # The runs have the share that the design's own response gave them.
-        most = 0.5
-        share = 1.0 if emulator is None else emulator.run_share
-        if emulator is None or share > most + design.emulator.run_share:
-            raise PoorEmulatorError(
-                f"{self.name}: got a response of the same specimens whose emulator would leave "
-                f"{share:.0%} of a population to the {self.n_runs} runs alone, expected at most "
-                f"{most:.0%} more than for the response of the design; calibrate with "
-                "prb.Reweighted(n, emulator=None), or let one response return both outputs"
-            )
-        return emulator
-
     def _graph_basis(self) -> Basis:
-        """Return the basis for compiled graphs; its form stays the same while the design grows."""
+        """Return the basis for compiled graphs; its structure does not change as a design grows."""
         most = self.config.most
         if self._sampler.emulator is not None:
             most = max(most, SIZES.largest)
@@ -447,13 +420,16 @@ class ReweightedBound(Bound):
         n_arrays = len(design.weight_arrays)
         if not self._shared:
             for i, array in enumerate([*design.graph_arrays, *basis.arrays]):
-                # Some samplers know shared variables by their names. Designs may grow.
+                # Some samplers identify shared variables by their names. Lengths are open, as
+                # designs may grow.
                 name, shape = f"{self.name}_design_{i}", (None,) * array.ndim
                 self._shared.append(pytensor.shared(array, name=name, borrow=True, shape=shape))
         logs = log_weight_graph(self.inputs, params, self._shared[:n_arrays], design.moving)
         largest = pt.max(logs)
         supported = largest > -np.inf
-        # PyTensor's softmax has a backend of its own; the largest only guards against overflow.
+        # The softmax is written out, because each backend implements PyTensor's operation
+        # separately. Subtracting the largest logarithm prevents overflow and does not change the
+        # gradient.
         centred = logs - disconnected_grad(largest)
         raw = pt.exp(pt.switch(supported, centred, 0.0))
         weights = raw / raw.sum()
@@ -475,13 +451,14 @@ class ReweightedBound(Bound):
         basis = self._basis[2]
         is_lost = is_missing(sample.values)
         size = len(params[0])
-        # The weights of a block stay in the cache. A product of matrices reads all stored responses
-        # for each block: no fewer than 64 populations, unless the basis of many observed values is
-        # so wide that these would fill the memory.
+        # Populations are evaluated in blocks whose weights fit into the processor's cache. Since
+        # each block reads all stored responses, it has at least 64 populations, unless the basis of
+        # many observed values is so wide that these would fill the memory.
         width = max(array.shape[-1] for array in basis.arrays)
         step = max(1, min(max(64, IN_CACHE // len(sample)), AT_ONCE // width))
         parts = []
-        # A single population leaves little to linear algebra.
+        # The product for a single population is small, so that a limit of threads is not worth its
+        # time.
         with one_thread() if size > 1 else nullcontext():
             for first in range(0, max(1, size), step):
                 parents = [p[first : first + step] for p in params]
@@ -523,7 +500,7 @@ class ReweightedBound(Bound):
 
 
 def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> None:
-    """Report a design with a small effective sample size in populations of the prior."""
+    """Report a design whose effective sample size is small in populations of the prior."""
     runs = bound._design.runs
     step = max(1, IN_CACHE // len(runs))
     sizes = []
@@ -534,10 +511,10 @@ def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> Non
     if ess >= bound.required_ess:
         return
     dimensions = bound.inputs.dimensions
-    # With more inputs weights become very uneven, and another propagation is better.
+    # With more than four inputs weights are very uneven, so that another propagation is better.
     level = logging.WARNING
     if dimensions <= 4:
-        level = logging.INFO  # refinement follows in most calls
+        level = logging.INFO  # most methods refine the design afterwards
         advice = (
             "prb.minimize and prb.sample_smc refine it; before pm.sample call prb.refine(model)"
         )

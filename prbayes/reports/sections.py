@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -116,25 +117,71 @@ def model(m: Material) -> list[Section]:
     return sections
 
 
+@dataclass(frozen=True)
+class _ObjectiveTexts:
+    """What the sections say of the function that calibrations minimise, or maximise."""
+
+    name: str
+    title: str  # title of the section with the values of the results
+    about: str  # text of this section
+    compares: str  # sentence on how measured and simulated responses are compared
+    standard_errors: str  # what standard errors are those of
+    comparable: str  # which models have comparable marginal likelihoods
+    is_named: bool  # whether its name depends on the metric
+    sign: float  # factor of stored discrepancies
+    # Titles of further columns with values of the results, by variable of the calibration.
+    columns: Mapping[str, str]
+    # Sentences on the width of the draws, by the sampler's adjustment.
+    adjustments: Mapping[str, str]
+
+
+_DISCREPANCY = _ObjectiveTexts(
+    "discrepancy",
+    "Metric and epsilon",
+    "Of a posterior the mean discrepancy over its draws is shown.",
+    "The metric measures how far the distribution of the simulated responses is "
+    "from that of the measured ones; smaller is better.",
+    "the estimator over repeated sets of as many specimens",
+    "with the same metric and epsilon",
+    is_named=True,
+    sign=1.0,
+    columns={"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"},
+    adjustments={
+        "estimate": "The posterior is that given the metric's own estimate: prior times density "
+        "of the estimate over repeated sets of specimens.",
+        "none": "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's.",
+    },
+)
+_LOG_LIKELIHOOD = _ObjectiveTexts(
+    "log-likelihood",
+    "Log-likelihood",
+    "Runs are those of the emulator. Of a posterior the mean over its draws is shown.",
+    "The log-likelihood compares specimens: the density of each measured response in the "
+    "population, through the inputs that reproduce it, on an emulator of the response.",
+    "the curvature of the log-likelihood",
+    "of the same data",
+    is_named=False,
+    sign=-1.0,
+    columns={},
+    adjustments={},
+)
+
+
+def _objective_texts(m: Material) -> _ObjectiveTexts:
+    """Return what the sections say of the objective of all calibrations."""
+    return _LOG_LIKELIHOOD if m.is_by_specimen else _DISCREPANCY
+
+
 def comparison_of_responses(m: Material) -> list[Section]:
     """Return how measured and simulated responses are compared."""
     if not (m.calibrations or m.description["simulators"]):
         return []
     labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
-    about = (
-        "The metric measures how far the distribution of the simulated responses is "
-        "from that of the measured ones; smaller is better."
-    )
-    if m.is_by_specimen:
-        about = (
-            "The log-likelihood compares specimens: the density of each measured response in the "
-            "population, through the inputs that reproduce it, on an emulator of the response."
-        )
-    elif m.sheets and len(m.sheets) == len(metrics_of(m)):
-        labels = {}
-        about = "The likelihood is the density of the statistics of the data sheet."
-    text = [about]
-    if labels and not m.is_by_specimen:
+    objective = _objective_texts(m)
+    text = [objective.compares]
+    if m.sheets and len(m.sheets) == len(metrics_of(m)):
+        text = ["The likelihood is the density of the statistics of the data sheet."]
+    elif labels and objective.is_named:
         text.append(f"Here it is the {enumerated(list(labels))}.")
     text += dict.fromkeys(line for t in m.calibrations.values() for line in compared_in(t))
     return [Section("Measured against simulated responses", text, level=3)]
@@ -201,6 +248,7 @@ def failures(m: Material) -> list[Section]:
 
 def metric(m: Material) -> list[Section]:
     """Return the discrepancies and epsilons of the results, or their log-likelihoods."""
+    objective = _objective_texts(m)
     rows: list[dict[str, Any]] = []
     for label, calibration in m.calibrations.items():
         sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
@@ -210,21 +258,15 @@ def metric(m: Material) -> list[Section]:
             row = {"result": label, "simulator": str(name)}
             if "n_runs" in values:
                 row["runs"] = str(int(values["n_runs"]))
-            keys = {"discrepancy_error": "Monte Carlo error", "epsilon": "epsilon"}
-            numbers = {text: float(values[key]) for key, text in keys.items() if key in values}
-            if m.is_by_specimen:
-                rows.append(row | {"log-likelihood": -float(mean)})
-            else:
-                rows.append(row | {"discrepancy": float(mean)} | numbers)
+            keys = objective.columns.items()
+            numbers = {text: float(values[key]) for key, text in keys if key in values}
+            rows.append(row | {objective.name: objective.sign * float(mean)} | numbers)
     if not rows:
         return []
-    if m.is_by_specimen:
-        about = "Runs are those of the emulator. Of a posterior the mean over its draws is shown."
-        return [Section("Log-likelihood", about, rows_table(rows), level=3)]
-    about = "Of a posterior the mean discrepancy over its draws is shown."
+    about = objective.about
     if any("epsilon" in row for row in rows):
         about += " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
-    return [Section("Metric and epsilon", about, rows_table(rows), level=3)]
+    return [Section(objective.title, about, rows_table(rows), level=3)]
 
 
 def optima(m: Material) -> list[Section]:
@@ -249,12 +291,7 @@ def optima(m: Material) -> list[Section]:
             for mode in m.live_optima[label].local_optima:
                 place = labelled(evaluator, mode["point"], {}).data_vars
                 text.append(_other_optimum(mode, place, names))
-        text.append(
-            "Standard errors are those of the curvature of the log-likelihood."
-            if m.is_by_specimen
-            else "Standard errors are those of the estimator over repeated sets of as many "
-            "specimens."
-        )
+        text.append(f"Standard errors are those of {_objective_texts(m).standard_errors}.")
         rows = []
         for name in names:
             value, stderr, *_ = estimates[name]
@@ -286,7 +323,7 @@ def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Seq
 
 def posteriors(m: Material) -> list[Section]:
     """Return a section for each posterior."""
-    sections = []
+    sections, objective = [], _objective_texts(m)
     for label, tree in m.posteriors.items():
         posterior = tree["posterior"]
         chains = counted(int(posterior.sizes["chain"]), "chain")
@@ -294,18 +331,11 @@ def posteriors(m: Material) -> list[Section]:
         text = [f"{chains} of {posterior.sizes['draw']} draws{by}. Intervals have equal tails."]
         # With a metric the width of the draws depends on the sampler's adjustment.
         adjustment = str(posterior.attrs.get("adjustment", ""))
-        if m.is_by_specimen or m.sheets or not adjustment:
-            pass  # The likelihood is exact, and other samplers have no adjustment.
-        elif adjustment == "estimate":
-            text.append(
-                "The posterior is that given the metric's own estimate: prior times density of the "
-                "estimate over repeated sets of specimens."
-            )
-        elif bool((tree["calibration"]["is_likelihood"] == 0).any()):
-            text.append(
-                "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
-            )
-        text += _sampler_sentences(tree, by_specimen=m.is_by_specimen)
+        if adjustment in objective.adjustments and not m.sheets:
+            is_likelihood = bool(tree["calibration"]["is_likelihood"].all())
+            if adjustment == "estimate" or not is_likelihood:
+                text.append(objective.adjustments[adjustment])
+        text += _sampler_sentences(tree, objective.comparable)
         draws = stacked_draws(posterior)
         values = split_elements(draws)
         names = readable_elements(table_elements(draws))
@@ -402,7 +432,7 @@ def support(m: Material) -> list[Section]:
     return [Section("Support by stored responses", about, rows_table(rows), level=3)]
 
 
-def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
+def _sampler_sentences(tree: xr.DataTree, comparable: str) -> list[str]:
     """Return the statistics of `sample_smc`; nothing of other samplers."""
     if "sample_stats" not in tree or "stage" not in tree["sample_stats"].dims:
         return []
@@ -423,8 +453,7 @@ def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
         spread = float(attrs["log_marginal_likelihood_sd"])
         sentences.append(
             f"Log marginal likelihood {plus_minus(value, spread)} (spread between chains); "
-            "comparable between models "
-            f"{'of the same data' if by_specimen else 'with the same metric and epsilon'} only."
+            f"comparable between models {comparable} only."
         )
     return sentences
 
@@ -478,20 +507,6 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
 
 def specimens(m: Material) -> list[Section]:
     """Return measured values and u-values of the specimens of the test, at most a page."""
-    rows = _measured_rows(m)
-    if not rows:
-        return []
-    about = (
-        "u is the share of the predicted responses below the measured one: a specimen with a u "
-        "near 0 or 1 is at the edge of the prediction."
-    )
-    if len(rows) > 40:
-        about += f" The first 40 of {len(rows)} values are shown."
-    return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
-
-
-def _measured_rows(m: Material) -> list[dict[str, Any]]:
-    """Return a row for each specimen and output of the validation data."""
     rows = []
     for condition, tested in m.validation.items():
         labels = _specimen_labels(condition, len(tested.measured), m)
@@ -503,7 +518,15 @@ def _measured_rows(m: Material) -> list[dict[str, Any]]:
                 {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
                 for label, value, u in zip(labels, values, us, strict=True)
             ]
-    return rows
+    if not rows:
+        return []
+    about = (
+        "u is the share of the predicted responses below the measured one: a specimen with a u "
+        "near 0 or 1 is at the edge of the prediction."
+    )
+    if len(rows) > 40:
+        about += f" The first 40 of {len(rows)} values are shown."
+    return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
 
 
 def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:

@@ -192,16 +192,6 @@ def known_covariates(
     return result
 
 
-def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
-    """Raise if there are covariates: a metric compares the specimens with one population."""
-    if covariates:
-        raise TypeError(
-            f"{name}: inputs: got a population that depends on {covariates[0].name}, expected one "
-            "population, as a metric compares distributions; use metric=prb.LogLikelihood(), or "
-            "prb.response.group for few different values"
-        )
-
-
 def refuse_vectors_of_specimens(
     name: str, aleatory: Sequence[Any], parents: Sequence[Variable], size: int
 ) -> None:

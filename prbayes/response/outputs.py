@@ -314,8 +314,7 @@ def refuse_other_order(values: Any, observed: Any, name: str) -> None:
             f"{name}: got the outputs {list(labels)}, expected {list(outputs)}, the order of "
             "observed"
         )
-    is_by_specimen = is_table or not are_outputs
-    if is_by_specimen and in_order_of(values, observed, name) is not values:
+    if (is_table or not are_outputs) and in_order_of(values, observed, name) is not values:
         raise ValueError(
             f"{name}: got values in another order than observed, by their index, expected the "
             "same order; pass values.loc[observed.index]"

@@ -172,6 +172,8 @@ class Responses:
             and policy == Abort()
             and not isinstance(function, scalar)
         )
+        # Tolerance, in standard deviations, for solvers that integrate a batch as one system.
+        self._one_system = 0.01 if self.is_batched else 0.0
         self.count = 0  # number of runs that were needed, computed here or found in the store
         self.caller = caller or name
         self.scatter = scatter
@@ -366,23 +368,11 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _by_itself(self, values: Sequence[Floats], rows: Indices, copies: int) -> Floats:
-        """Compute specimens again; if a function takes no batch of one, as several copies."""
-        try:
-            return self._again(values, rows)
-        except ResponseError:
-            return self._again(values, np.tile(rows, copies))[: len(rows)]
-
     def _place(self, points: Sequence[Floats], row: int) -> str:
         """Return the aleatory inputs of a specimen as a text, with their names."""
         sizes = [math.prod(shape) for shape in self.inputs.event_shapes]
         names = column_names(aleatory_names(self.inputs, self.function), sizes)
         return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
-
-    @property
-    def _one_system(self) -> float:
-        """Tolerance, in standard deviations, for solvers that integrate a batch as one system."""
-        return 0.01 if self.is_batched else 0.0
 
     def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if one of three specimens differs when it is computed again, by itself.
@@ -396,16 +386,23 @@ class Responses:
         rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
         parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
         copies = 3 if len(values) == 2 else 2
+
+        def by_itself(rows: Indices) -> Floats:
+            try:
+                return self._again(specimens, rows)
+            except ResponseError:  # because the function rejects a batch of one specimen
+                return self._again(specimens, np.tile(rows, copies))[: len(rows)]
+
         for part in parts:
             try:
-                again = self._by_itself(specimens, part, copies)
+                again = by_itself(part)
                 again = np.where(np.isnan(again), values[part], again)  # it may fail by chance
                 tolerance = tolerance_of(values, 0.01 if self.scatter is None else self.scatter)
                 changed = first_change(values[part], again, tolerance)
                 if changed is None:
                     continue
-                second = self._by_itself(specimens, part, copies)
-            except ResponseError as error:  # the response takes no small batch
+                second = by_itself(part)
+            except ResponseError as error:  # the response rejects small batches
                 if self.is_batched:
                     self._refuse_one_size(specimens, (len(values),), error)
                 return

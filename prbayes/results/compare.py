@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -105,24 +105,7 @@ def compare(
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
-    for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
-        refuse_model(result, "compare: results")
-    if not isinstance(results, Mapping):
-        raise TypeError(
-            f"compare: results: got {called(results)}, expected a mapping such as "
-            "{'optimum': optimum, 'ABC': idata}"
-        )
-    if metrics is not None and not (
-        isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
-    ):
-        raise TypeError(
-            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
-            "[prb.AreaMetric()]"
-        )
-    if not results:
-        raise ValueError(
-            "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
-        )
+    _refuse_wrong_arguments(results, metrics)
     identities = {label: identity_in(result) for label, result in results.items()}
     try:
         identity = require_together(identities, "compare", model=model)
@@ -134,21 +117,16 @@ def compare(
     trees = [_tree_of(label, result) for label, result in results.items()]
     read = [estimates_of(tree, model=naming) for tree in trees]
     columns, shown = zip(*read, strict=True)
-    in_all = set.intersection(*map(set, columns))
-    shared = [name for name in columns[0] if name in in_all]
-    left_out = [name for column in columns for name in column if name not in in_all]
-    if left_out and shared and None in identities.values():
-        # Other tools may name variables differently.
-        listed = ", ".join(dict.fromkeys(left_out))
-        text = f"compare: left out {listed:.300}, as not all results have these names."
-        report(Finding("names-differ", text))
+    shared = _in_all(columns)
+    if shared and None in identities.values():
+        _report_left_out(columns, shared)
     if model is not None:
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         shared = [name for name in shared if variable_of(name, variables) in variables]
-    in_table = set.intersection(*map(set, shown))
+    in_table = _in_all(shown)
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
-        got = {label: list(column) for label, column in zip(results, columns, strict=True)}
+        got = dict(zip(results, columns, strict=True))
         if model is not None:
             got["the model"] = variables
         texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
@@ -156,14 +134,7 @@ def compare(
             f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
             "names"
         )
-    table = np.array([[column[name] for name in names] for column in columns])
-    estimates, sds = table[..., 0], table[..., 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
-        shift = (estimates - estimates[0]) / sds
-    shift[0] = 0.0
-    dims = ["result", "hyperparameter"]
-    data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_ESTIMATE)}
-    data["shift"] = (dims, shift)
+    data = _estimate_variables(np.array([[column[name] for name in names] for column in columns]))
     for key in COSTS:
         costs = [float(estimates_in(tree).attrs.get(key, np.nan)) for tree in trees]
         data[key] = ("result", costs)
@@ -185,6 +156,53 @@ def compare(
         **as_attributes(identity),
     }
     return Comparison(data, coords=coords, attrs=attrs)
+
+
+def _refuse_wrong_arguments(results: Any, metrics: Any) -> None:
+    """Raise if there are no results, or an argument has a wrong type."""
+    for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
+        refuse_model(result, "compare: results")
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            f"compare: results: got {called(results)}, expected a mapping such as "
+            "{'optimum': optimum, 'ABC': idata}"
+        )
+    if metrics is not None and not (
+        isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
+    ):
+        raise TypeError(
+            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
+            "[prb.AreaMetric()]"
+        )
+    if not results:
+        raise ValueError(
+            "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
+        )
+
+
+def _in_all(columns: Sequence[Iterable[str]]) -> list[str]:
+    """Return the elements that all results have, in the order of the first one."""
+    in_all = set.intersection(*map(set, columns))
+    return [name for name in columns[0] if name in in_all]
+
+
+def _estimate_variables(table: Floats) -> dict[str, Any]:
+    """Return variables with estimates, (results, elements, 4), and shifts from the first result."""
+    estimates, sds = table[..., 0], table[..., 1]
+    with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.
+        shift = (estimates - estimates[0]) / sds
+    shift[0] = 0.0
+    variables = {key: table[..., i] for i, key in enumerate(_ESTIMATE)} | {"shift": shift}
+    return {key: (["result", "hyperparameter"], values) for key, values in variables.items()}
+
+
+def _report_left_out(columns: Sequence[Iterable[str]], shared: Sequence[str]) -> None:
+    """Report elements that not all results have, as other tools may have renamed variables."""
+    left_out = [name for column in columns for name in column if name not in shared]
+    if left_out:
+        listed = ", ".join(dict.fromkeys(left_out))
+        text = f"compare: left out {listed:.300}, as not all results have these names."
+        report(Finding("names-differ", text))
 
 
 class Comparison(Table):
@@ -291,16 +309,15 @@ def _scores(
         lacking = [shortcomings(evaluator, theta[None]) for theta in thetas]
         several = len(evaluator.simulators) > 1
         scores = {}
+        defaults: list[Sequence[Metric]] = [_METRICS] * len(evaluator.nodes)
+        # The log-likelihood by specimen, below, replaces that by kernels.
+        defaults += [_METRICS[:-1]] * len(evaluator.emulated)
         for k, simulator in enumerate(evaluator.simulators):
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
-            default: Sequence[Metric] = _METRICS
-            if simulator.metric.by_specimen:
-                # The log-likelihood by specimen replaces that by kernels.
-                default = _METRICS[:-1]
-            if simulator.observed.ndim > 1:
-                default = [Joint(metric) for metric in default]  # It treats all outputs alike.
-            selection = default if metrics is None else metrics
+            selection = defaults[k] if metrics is None else metrics
+            if metrics is None and simulator.observed.ndim > 1:
+                selection = [Joint(metric) for metric in selection]  # It treats all outputs alike.
             if simulator.metric.exact_likelihood:  # A data sheet has statistics, no specimens.
                 selection = [simulator.metric]
             for metric in selection:

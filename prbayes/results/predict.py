@@ -35,6 +35,7 @@ from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
     PopulationSimulator,
+    emulator_of,
     population_simulators,
 )
 from prbayes.model.evaluator import TOLERABLE, Evaluator, read_inputs_of_copy, shortcoming
@@ -49,8 +50,9 @@ from prbayes.model.parameters import element_name, finite_draws, fixed_values
 from prbayes.model.random_variable import Node, has_default_epsilon, simulators
 from prbayes.optimize.optimum import Optimum, identity_in, refuse_model, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
+from prbayes.propagation.design import PoorEmulatorError
 from prbayes.propagation.importance import new_specimens
-from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 from prbayes.response.condition import is_condition, known_covariates
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.distributions import PopulationSampler
@@ -479,7 +481,7 @@ class _Predicted:
     # an axis after the populations
     values: Floats
     specimens: list[Floats]  # aleatory inputs, (k, n, *event) each
-    source: str  # how specimens were made
+    source: str  # text on how the specimens were made
     error: Floats | None = None  # error of the emulator by output, (m,)
 
 
@@ -518,7 +520,7 @@ def _predicted(
             values = responses(specimens, epistemic)
             results.append(_Predicted(values, specimens, "new specimens"))
             continue
-        emulated = emulated or simulator.emulator(responses)
+        emulated = emulated or emulator_of(simulator, responses)
         values = emulated([x.reshape(-1, *x.shape[2:]) for x in specimens])
         values = values.reshape(len(parents[0]), n, *emulated.event)
         runs = len(emulated.z)

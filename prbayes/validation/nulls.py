@@ -36,7 +36,8 @@ from prbayes.model.random_variable import Node
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
+from prbayes.propagation.design import PoorEmulatorError
+from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings, data_digest, in_order, serving, specimen_names
 from prbayes.validation.pit import Case, Predictive, TestedCondition, between

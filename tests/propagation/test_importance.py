@@ -22,9 +22,10 @@ from prbayes.optimize.design_refinement import (
     refine_at,
 )
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.design import PoorEmulatorError
 from prbayes.propagation.importance import SIZES, MixtureSampler, mixture_of, spread_over
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
 

@@ -50,7 +50,10 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
 
 
 def _tail_index(values: Floats, weights: Floats) -> float:
-    """Return the index of Hill (1975) of the longer tail, the outermost 2 %, from the median."""
+    """Return the tail index of Hill (1975), the smaller one of both tails.
+
+    A tail is the outermost 2 % of the values on a side of the median.
+    """
     is_usable = np.isfinite(values) & (weights > 0)
     values, weights = values[is_usable], weights[is_usable]
     weights = weights / weights.sum()
