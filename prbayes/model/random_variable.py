@@ -497,6 +497,8 @@ def _metric_log_density(
     node = computed(op.simulator)
     if data is not None:
         node = node.observing(data)
+    if node.reweighted is not None and node.responses.may_differ:
+        node.reweighted.refuse_change(node.responses)
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "

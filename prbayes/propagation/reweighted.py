@@ -396,6 +396,7 @@ class ReweightedBound(Bound):
         if pairs:
             # The design may have other runs, after the first ones in common.
             previous, earlier = pairs[0]
+            responses.runs = previous.runs
             responses.outputs = responses.outputs or previous.outputs  # names of a mapping
             n = min(len(earlier), len(runs))
             equal = np.ones(n, dtype=bool)
@@ -411,7 +412,6 @@ class ReweightedBound(Bound):
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
-            responses.runs.users.add(responses.caller)
             self._other_responses.append((responses, replace(runs, values=values)))
         return values
 
