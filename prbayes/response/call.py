@@ -7,6 +7,7 @@ before it waits for the next.
 from __future__ import annotations
 
 import io
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,7 +35,9 @@ from prbayes.response.executors import (
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError, add_digests, stored_digests
-from prbayes.response.variables import changed_names, watched
+from prbayes.response.variables import changed_names, listed, watched
+
+_log = logging.getLogger(__name__)
 
 type Function = Callable[..., Any]  # the user's response, or a part of it
 
@@ -535,7 +538,11 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
 
     # Runs of other code may differ anywhere, not only at their ends.
     digests = watched(settings.function).digests()
-    is_known = any(not changed_names(x, digests) for x in stored_digests(store))
+    changes = [changed_names(stored, digests) for stored in stored_digests(store)]
+    is_known = [] in changes
+    if usable.size and not is_known:
+        names = listed(min(changes, key=len)) if changes else "its code or variables"
+        _log.info("%s: store: a tenth of the runs repeated: other %s", settings.name, names)
     change = changed_run(values[usable], compute, most=5 if is_known else None)
     if change is not None:
         selected, again = change

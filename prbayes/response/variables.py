@@ -7,6 +7,7 @@ the same in every process with the same Python.
 
 from __future__ import annotations
 
+import dis
 import os
 import stat
 import sys
@@ -18,7 +19,7 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from types import CellType, CodeType, FunctionType, MemberDescriptorType, ModuleType
+from types import CodeType, FunctionType, MemberDescriptorType, ModuleType
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -35,7 +36,7 @@ _LIBRARIES = (
     str(Path(__file__).parents[1]),
 )
 # Packages whose objects are resources: they change by themselves, and hold no numbers.
-_RESOURCES = frozenset({"asyncio", "concurrent", "itertools", "logging", "threading"})
+_RESOURCES = frozenset({"asyncio", "concurrent", "distributed", "logging", "threading"})
 
 
 def digests_of(function: object, most: int = 10_000) -> dict[str, str]:
@@ -79,8 +80,6 @@ def _opened(value: Any) -> Opened:
     name = _type_name(value)
     if isinstance(value, FunctionType):
         return _opened_function(value)
-    if isinstance(value, CellType):
-        return name, [("", value.cell_contents)]
     if isinstance(value, CodeType):
         names = value.co_names, value.co_freevars, value.co_argcount, value.co_flags
         return f"{value.co_code!r} {names}", [("", x) for x in value.co_consts]
@@ -107,6 +106,8 @@ def _opened(value: Any) -> Opened:
     parts = list(attributes.items())
     if _is_own(type(value).__module__):
         parts.append((type(value).__name__, type(value)))
+    else:  # a look at a table fills its memory
+        parts = [(k, v) for k, v in parts if not k.endswith("_cache")]
     text, elements = _elements(value, is_plain=not parts)
     return f"{name} {text}", [*parts, *elements]
 
@@ -158,32 +159,50 @@ def _is_own(module: str) -> bool:
 def _opened_function(function: FunctionType) -> Opened:
     """Open a function; the code of a library counts by its file, its closure as that of a user."""
     code = function.__code__
-    parts: list[tuple[str, Any]] = [
-        ("defaults", function.__defaults__), ("defaults", function.__kwdefaults__),
-        *zip(code.co_freevars, function.__closure__ or (), strict=True), *vars(function).items(),
-    ]  # fmt: skip
+    closure = {}
+    for variable, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # the variable has no value yet
+            closure[variable] = cell.cell_contents
+    parts = [*vars(function).items()]
+    parts += [("defaults", x) for x in (function.__defaults__, function.__kwdefaults__)]
     name = f"function {function.__module__}.{function.__qualname__}"
     if not _is_own(str(function.__module__)):
-        return f"{name} {_file_state(code.co_filename)}", parts
-    names = list(dict.fromkeys(_names(code)))
-    # Global variables, then those of the user's modules among them.
-    spaces: list[Mapping[str, Any]] = [{**sys.modules, **function.__globals__}]
-    for space in spaces:
-        variables = [(name, space[name]) for name in names if name in space]
-        for name_, value in variables:
+        return f"{name} {_file_state(code.co_filename)}", [*parts, *closure.items()]
+    read, imported, names = _names_of(code)
+    folder = str(function.__globals__.get("__package__"))
+    modules = {x: sys.modules.get(x) or sys.modules.get(f"{folder}.{x}") for x in imported}
+    # Variables of the closure, global ones, then those of modules, which the code names as
+    # attributes.
+    variables = {**function.__globals__, **modules, **closure}
+    spaces: list[tuple[Iterable[str], Mapping[str, Any]]] = [
+        ([*closure, *read, *modules], variables)
+    ]
+    for wanted, space in spaces:
+        for variable in [x for x in wanted if x in space]:
+            value = space[variable]
             if not isinstance(value, ModuleType):
-                parts.append((name_, value))
-            elif _is_own(value.__name__) and all(vars(value) is not met for met in spaces):
-                spaces.append(vars(value))
+                parts.append((variable, value))
+            elif all(vars(value) is not met for _, met in spaces):
+                spaces.append((names, vars(value)))
     return name, [("", code), *parts]
 
 
-def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names of variables, modules and attributes in code and in functions within it."""
-    yield from code.co_names
+@lru_cache(maxsize=1024)
+def _names_of(code: CodeType) -> tuple[list[str], list[str], list[str]]:
+    """Return names of global variables, of imported modules, and all names in code."""
+    read: list[str] = []
+    imported: list[str] = []
+    names = list(code.co_names)
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            read.append(instruction.argval)
+        elif instruction.opname == "IMPORT_NAME":
+            imported.append(instruction.argval)
     for part in code.co_consts:
         if isinstance(part, CodeType):
-            yield from _names(part)
+            inner = _names_of(part)
+            read, imported, names = read + inner[0], imported + inner[1], names + inner[2]
+    return list(dict.fromkeys(read)), imported, list(dict.fromkeys(names))
 
 
 @lru_cache(maxsize=1024)

@@ -207,6 +207,17 @@ def of_graph() -> tuple[Any, Callable[[], Any]]:
     return lambda x: compiled(np.atleast_1d(x)), lambda: load.set_value(2.0)
 
 
+def of_library() -> tuple[Any, Callable[[], Any]]:
+    module = types.ModuleType("installed")
+    vars(module).update(load=1.0, __file__=np.__file__)
+    return lambda x: module.load * x, lambda: vars(module).update(load=2.0)
+
+
+def of_environment() -> tuple[Any, Callable[[], Any]]:
+    os.environ["LOAD"] = "1.0"
+    return lambda x: float(os.environ["LOAD"]) * x, lambda: os.environ.update(LOAD="2.0")
+
+
 def of_code() -> tuple[Any, Callable[[], Any]]:
     def response(x: Any) -> Any:
         return x * 1.0
@@ -249,6 +260,8 @@ KINDS: dict[str, Callable[[], tuple[Any, Callable[[], Any]]]] = {
     "global array in place": lambda: notebook("array[0] = 2.0"),
     "nested global": lambda: notebook("settings['loads'][0] = 2.0"),
     "global function": lambda: notebook("def helper(x): return 2 * x"),
+    "variable of a module": of_library,
+    "environment": of_environment,
     "global class": lambda: notebook("Part.load = 2.0"),
 }
 
@@ -373,7 +386,7 @@ def test_runs_are_repeated_on_request(
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         observed = np.random.default_rng(3).normal(1, 0.5, 20)
-        response = scalar(lambda x: float(os.environ["LOAD"]) * x)
+        response = scalar(lambda x: float(os.getenv("LOAD", "")) * x)
         prb.Simulator("y", response, x, metric=metric, observed=observed, progressbar=False)
         prb.Simulator("z", response, x, metric=prb.AreaMetric(), observed=observed,
                       propagation=prb.Resimulated(8), progressbar=False)  # fmt: skip
@@ -479,6 +492,30 @@ def test_what_calls_change_is_no_change(kind: str) -> None:
             assert not responses.may_differ
     # Three runs are repeated once.
     assert (stored.n_repeated, other.n_repeated) == (3, 3)
+
+
+def test_a_look_at_a_table_and_other_variables_are_no_change() -> None:
+    table = pd.DataFrame({"load": [1.0, 2.0]}, index=["a", "b"])
+    names: dict[str, Any] = {"table": table, "np": np, "__name__": "__main__"}
+    exec("def f(x):\n    return table['load'].mean() / 1.5 * np.sin(x)", names)
+    stored, values = computed(names["f"])
+    stored.refuse_change([POINTS], values, stored)
+    names.update(mean=3.0, load=4.0, sin=np.cos)  # names of attributes, not of variables
+    assert table["load"].to_numpy()[0] == 1.0
+    assert table.loc["b", "load"] == 2.0
+    assert str(table.describe())
+    stored.function(0.0)
+    assert not stored.may_differ
+    names["np"] = types.SimpleNamespace(sin=np.cos)
+    assert stored.may_differ
+
+
+@pytest.mark.parametrize("kind", ["counter", "generator", "last"])
+def test_calls_by_hand_are_no_change(kind: str) -> None:
+    stored, _ = computed(harmless(kind))
+    for _ in range(2):
+        stored.function(0.5)
+        assert not stored.may_differ
 
 
 def test_a_variable_that_is_loaded_at_the_first_call_may_not_change_later() -> None:
