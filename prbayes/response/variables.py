@@ -31,10 +31,8 @@ type Opened = tuple[str, Iterable[tuple[str, Any]]]
 
 _CONSTANTS = frozenset({int, float, complex, bool, type(None), type(...)})
 # Folders of installed packages and of this package.
-_LIBRARIES = (
-    *map(sysconfig.get_path, ("purelib", "platlib")),
-    str(Path(__file__).parents[1]),
-)
+_FOLDERS = sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), Path(__file__).parents[1]
+_LIBRARIES = tuple(os.path.join(folder, "") for folder in _FOLDERS)
 # Packages whose objects are resources: they change by themselves, and hold no numbers.
 _RESOURCES = frozenset({"asyncio", "concurrent", "distributed", "logging", "threading"})
 
@@ -84,15 +82,10 @@ def _opened(value: Any) -> Opened:
         names = value.co_names, value.co_freevars, value.co_argcount, value.co_flags
         return f"{value.co_code!r} {names}", [("", x) for x in value.co_consts]
     if isinstance(value, type):
-        variables = [
-            x
-            for base in value.__mro__
-            if _is_own(base.__module__)
-            for x in list(vars(base).items())
-        ]
-        return f"class {value.__module__}.{value.__qualname__}", [
-            (k, v) for k, v in variables if isinstance(v, FunctionType) or not k.startswith("__")
-        ]
+        user_classes = [base for base in value.__mro__ if _is_own(base.__module__)]
+        variables = [item for base in user_classes for item in list(vars(base).items())]
+        parts = [x for x in variables if isinstance(x[1], FunctionType) or x[0][:2] != "__"]
+        return f"class {value.__module__}.{value.__qualname__}", parts
     if isinstance(value, ModuleType) or name.partition(".")[0] in _RESOURCES:
         return f"{name} {getattr(value, '__name__', '')}", ()
     if isinstance(value, os.PathLike):
@@ -119,9 +112,7 @@ def _elements(value: Any, *, is_plain: bool) -> Opened:
         text = f"{array.dtype.str} {array.shape}"
         if array.dtype.hasobject:
             return text, [("", array.ravel()[:10_000].tolist())]
-        if (
-            array.nbytes > 2**28
-        ):  # a checksum of 256 MiB takes 70 ms; of larger arrays a part counts
+        if array.nbytes > 2**28:  # a checksum takes 70 ms for 256 MiB; of more a part counts
             array = array.ravel(order="K")[:: array.size // 2**16]
         return f"{text} {zlib.crc32(np.ascontiguousarray(array))}", ()
     if isinstance(value, dict):
