@@ -347,6 +347,26 @@ def test_a_file_that_a_text_names(as_path: bool, tmp_path: Path) -> None:
             stored.refuse_change([POINTS], values, stored)
 
 
+def test_a_program_that_a_command_names(tmp_path: Path) -> None:
+    program = tmp_path / "solver.py"
+    program.write_text("print(1.0 * float(open('in.txt').read()))")
+    response = prb.command(
+        [sys.executable, "-S", program],
+        inputs=["x"],
+        write={"in.txt": "{x}"},
+        read=lambda folder: float((folder / "stdout.txt").read_text()),
+    )
+    responses = responses_of(response)
+    points = POINTS[:4]
+    with responses.kept_runs():
+        values = responses([points], [])
+    responses.refuse_change([points], values, responses)
+    assert not responses.may_differ
+    program.write_text("print(2.00 * float(open('in.txt').read()))")
+    with pytest.raises(ResponseError, match="has changed since"):
+        responses.refuse_change([points], values, responses)
+
+
 @pytest.mark.parametrize("metric", [None, prb.KullbackLeibler()])
 def test_uses_of_a_model_after_a_change_are_refused(metric: Any) -> None:
     class Own(Machine):
