@@ -114,9 +114,10 @@ def _elements(value: Any, *, is_plain: bool) -> Opened:
             return text, [("", array.ravel()[:10_000].tolist())]
         if array.nbytes > 2**28:  # a checksum takes 70 ms for 256 MiB; of more a part counts
             array = array.ravel(order="K")[:: array.size // 2**16]
-        return f"{text} {zlib.crc32(np.ascontiguousarray(array))}", ()
+        # As bytes, because an array of dates is no buffer.
+        return f"{text} {zlib.crc32(np.ascontiguousarray(array).ravel().view(np.uint8))}", ()
     if isinstance(value, dict):
-        keys, values = list(value), list(value.values())
+        keys, values = list(dict.keys(value)), list(dict.values(value))
         if len(keys) <= 64 and all(type(key) is str for key in keys):
             return str(keys), zip(keys, values, strict=True)
         return f"{len(keys)}", [("", keys), ("", values)]
@@ -208,7 +209,8 @@ def _attributes(value: object) -> dict[str, Any]:
     """Return the attributes of an object without a call of its own methods."""
     attributes: dict[str, Any] = {}
     with suppress(AttributeError):
-        attributes.update(object.__getattribute__(value, "__dict__"))
+        variables = object.__getattribute__(value, "__dict__")
+        attributes.update((k, v) for k, v in variables.items() if type(k) is str)
     kind: Any = type(value)
     for slot in _slots(kind):
         with suppress(AttributeError):  # the attribute has no value yet

@@ -207,6 +207,12 @@ def of_graph() -> tuple[Any, Callable[[], Any]]:
     return lambda x: compiled(np.atleast_1d(x)), lambda: load.set_value(2.0)
 
 
+def of_dates() -> tuple[Any, Callable[[], Any]]:
+    days = np.array(["2020-01-02", "2020-01-03"], "datetime64[D]")
+    first = np.datetime64("2020-01-01")
+    return lambda x: (days[0] - first).astype(float) * x, lambda: days.__setitem__(0, days[1])
+
+
 def of_library() -> tuple[Any, Callable[[], Any]]:
     module = types.ModuleType("installed")
     vars(module).update(load=1.0, __file__=np.__file__)
@@ -247,6 +253,7 @@ KINDS: dict[str, Callable[[], tuple[Any, Callable[[], Any]]]] = {
     "list of a closure": of_closure,
     "array": lambda: of_array(1000),
     "large array": lambda: of_array(3 * 10**6),
+    "dates": of_dates,
     "integers": lambda: of_array(10, int),
     "default": of_defaults,
     "attribute of a function": of_function_attribute,
@@ -595,6 +602,20 @@ class Evil:
         raise RuntimeError
 
 
+def with_odd_attribute() -> Any:
+    machine = Machine()
+    vars(machine)[Odd()] = 1  # type: ignore[index]
+    return machine
+
+
+class Odd:
+    def __format__(self, text: str) -> str:
+        raise RuntimeError
+
+    def __repr__(self) -> str:
+        raise RuntimeError
+
+
 def recursive() -> Any:
     a: list[Any] = [1]
     a.append({"a": a})
@@ -610,6 +631,7 @@ def deep() -> Any:
 
 OBJECTS: dict[str, Callable[[], Any]] = {
     "evil": Evil,
+    "odd attribute": with_odd_attribute,
     "recursive": recursive,
     "deep": deep,
     "many": lambda: {i: (i, str(i)) for i in range(100_000)},
