@@ -33,6 +33,7 @@ from prbayes.model.random_variable import abc_distance as abc_distance
 from prbayes.model.simulator import Simulator as Simulator
 from prbayes.optimize.minimize import minimize as minimize
 from prbayes.optimize.minimize import refine as refine
+from prbayes.optimize.minimize import repeat_runs as repeat_runs
 from prbayes.optimize.optimum import Optimum as Optimum
 from prbayes.posterior.bootstrap import bootstrap as bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon

@@ -250,6 +250,7 @@ SLOW = (
     "predict",
     "rank",
     "refine",
+    "repeat_runs",
     "sample",
     "sample_smc",
     "simulation_based_calibration",

@@ -141,8 +141,9 @@ def test_own_response_is_predicted_by_the_emulator(
 def test_another_response_costs_a_hundred_odd_runs(problem: Problem, results: Any) -> None:
     later = Growth(0.7)
     predicted = prb.predict(results["posterior"], later, problem.x, model=problem.model)
-    runs = later.runs - 3  # three show whether specimens are independent of each other
-    assert runs == predicted.attrs["responses"] <= 200
+    # Three, and an eighth in another order, show whether specimens are independent of each other.
+    assert 3 <= later.runs - predicted.attrs["responses"] <= 28
+    assert predicted.attrs["responses"] <= 200
     assert "interpolant" in predicted.attrs["source"]
     computed = prb.predict(
         results["posterior"], later, problem.x, model=problem.model, stored=False

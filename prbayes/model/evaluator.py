@@ -39,6 +39,7 @@ from prbayes.model.specimen_likelihood import (
     require_simulator,
     specimen_likelihoods,
 )
+from prbayes.model.specimen_preparation import refuse_changed_runs
 from prbayes.propagation.base import responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
@@ -308,6 +309,16 @@ class Evaluator:
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
         return by_name
+
+
+def with_unchanged_runs(evaluator: Evaluator) -> Evaluator:
+    """Return an evaluator; raise if a response differs from its runs after a change."""
+    for bound in evaluator.reweighted.values():
+        if bound.responses.may_differ:
+            bound.values_of(bound.responses)  # raises after a change
+    for likelihood in evaluator.likelihoods:
+        refuse_changed_runs(likelihood)
+    return evaluator
 
 
 def _unpickled(payload: bytes) -> Evaluator:

@@ -499,6 +499,8 @@ def _metric_log_density(
     node = computed(op.simulator)
     if data is not None:
         node = with_observed(node, data)
+    if node.reweighted is not None and node.responses.may_differ:
+        node.reweighted.values_of(node.responses)  # raises after a change
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "

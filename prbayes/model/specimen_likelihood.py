@@ -42,7 +42,7 @@ from prbayes.model.random_variable import (
     require_data,
     simulators,
 )
-from prbayes.model.specimen_preparation import log_shares, prepared
+from prbayes.model.specimen_preparation import log_shares, prepared, refuse_changed_runs
 from prbayes.model.unknown_error import ReadingDensity
 from prbayes.numerics.threads import one_thread
 from prbayes.response.distributions import log_density
@@ -502,6 +502,7 @@ def _log_density_of_vector(
     data.append(value)
     numbers = {m.name: known_value(v) for m, v in zip(measurements, data, strict=True)}
     likelihood = op.record.observing(numbers)
+    refuse_changed_runs(likelihood)
     result = log_likelihood_graph(likelihood, parents)
     conditions = [
         equal_data(v, m.observed)

@@ -103,6 +103,16 @@ def is_prepared(likelihood: SpecimenLikelihood) -> bool:
     return "preparation" in likelihood.cache
 
 
+def refuse_changed_runs(likelihood: SpecimenLikelihood) -> None:
+    """Raise if a response has changed since the emulator's runs, and differs from them."""
+    for m in likelihood.measurements:
+        if is_prepared(likelihood) and m.responses.may_differ:
+            emulation = prepared(likelihood).emulation
+            points = likelihood.coordinates.inputs(emulation.z)
+            y = emulation.y[:, output_columns(likelihood, m)].reshape(-1, *m.event)
+            m.responses.refuse_change(points, y, m.responses)
+
+
 def first_run_count(likelihood: SpecimenLikelihood) -> int | None:
     """Return the largest number of first runs that a simulator requires, None for the default."""
     numbers = [m.propagation.emulator_runs for m in likelihood.measurements]
@@ -192,7 +202,10 @@ class CheckedRuns:
         likelihood = self.likelihood
         measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
-        parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
+        parts = []
+        for m in measurements:
+            with m.responses.kept_runs():
+                parts.append(m.responses(inputs, []).reshape(len(z), -1))
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and not self.outputs:
             refuse_unreachable(likelihood.name, values, likelihood.readings)

@@ -56,7 +56,14 @@ from prbayes.inference.refits import (
 )
 from prbayes.inference.resampling import SETS
 from prbayes.model.cost import explained, kept
-from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
+from prbayes.model.evaluator import (
+    Evaluator,
+    n_design_runs,
+    only_through_prior,
+    shortcomings,
+    with_data,
+    with_unchanged_runs,
+)
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
@@ -178,6 +185,56 @@ def refine(
 
 
 @locked
+def repeat_runs(model: pm.Model | None = None, *, progressbar: bool = True) -> dict[str, int]:
+    """Repeat three runs of each simulator, and raise if one of them differs.
+
+    A change of the response's code and variables, and of files that a text names, is noticed
+    without a call. Other changes are not: of a program, a server, or what a program reads. For
+    these, three runs are repeated once in a process, when another function uses the runs. Call
+    this function when you have changed something of that kind.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        The one on the context by default.
+    progressbar : bool
+        Whether work of more than two seconds shows a progress bar on stderr.
+
+    Returns
+    -------
+    dict
+        Number of repeated runs by simulator; zero where runs are not kept, are a table, or belong
+        to a store with a version.
+
+    Raises
+    ------
+    TypeError
+        If there is no model, or none with a simulator.
+    ResponseError
+        If a run differs.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+    ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
+    >>> prb.repeat_runs(model)
+    {'y': 3}
+    """
+    model = model_on_context(model, "prb.repeat_runs")
+    with shown(progressbar), explained(model, "prb.repeat_runs"):
+        evaluator = Evaluator.of(model)
+        simulators = with_data(evaluator)
+        before = [simulator.responses.n_repeated for simulator in simulators]
+        for simulator in simulators:
+            simulator.responses.runs.is_repeated = None
+        with_unchanged_runs(evaluator)
+    pairs = zip(simulators, before, strict=True)
+    return {s.name: s.responses.n_repeated - n for s, n in pairs}
+
+
+@locked
 def minimize(
     model: pm.Model | None = None,
     *,
@@ -290,7 +347,7 @@ def minimize(
         random_seed=seed_number(random_seed),
     )
     with shown(progressbar), explained(model, "prb.minimize"), limited(max_seconds, max_runs):
-        return find_optimum(Evaluator.of(model), settings)
+        return find_optimum(with_unchanged_runs(Evaluator.of(model)), settings)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from prbayes._validate import Floats, Seed, executes, flag, positive_integer, se
 from prbayes.inference.refits import summary_obstacle
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator, has_other_terms
+from prbayes.model.evaluator import Evaluator, has_other_terms, with_unchanged_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -116,7 +116,7 @@ def simulation_based_calibration(
     executes(executor)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    evaluator = Evaluator.of(model)
+    evaluator = with_unchanged_runs(Evaluator.of(model))
     obstacle = simulation_obstacle(evaluator)
     if evaluator.nodes:
         obstacle = summary_obstacle(evaluator)

@@ -30,6 +30,7 @@ from prbayes.model.evaluator import (
     missing_mass,
     n_design_runs,
     shortcomings,
+    with_unchanged_runs,
 )
 from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
@@ -283,12 +284,12 @@ def require_adjustment(adjustment: object) -> None:
 def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
     """Return the evaluator of a model; raise if the optimum is none, or of another problem."""
     if optimum is None:
-        return Evaluator.of(model)
+        return with_unchanged_runs(Evaluator.of(model))
     if not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     is_reusable = optimum.model is model and is_current(optimum.evaluator)
-    evaluator = optimum.evaluator if is_reusable else Evaluator.of(model)
+    evaluator = with_unchanged_runs(optimum.evaluator if is_reusable else Evaluator.of(model))
     require_same(optimum.search.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
 

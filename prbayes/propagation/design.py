@@ -160,13 +160,13 @@ class DesignSampler:
         # Responses that this or another design has at these points are reused.
         values = responses.runs.at(points)
         if values is not None:
-            responses.refuse_change(points, values, responses)
+            if responses.runs.is_shared or responses.may_differ:
+                responses.refuse_change(points, values, responses)
             responses.count_reused(len(values))
         else:
             earlier = None if design is None else (design.runs.points, design.runs.values)
             values = deduplicated_responses(responses, points, earlier)
             responses.runs.stored.append((list(points), values))
-            responses.runs.users.add(responses.caller)
         batch_sizes: tuple[int, ...] = (n,)
         if design is None:
             moving = moving_inputs(self.mixtures.name, inputs, components, points)

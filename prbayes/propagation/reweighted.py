@@ -387,6 +387,7 @@ class ReweightedBound(Bound):
             # The design may have changed since the earlier call; its first runs may still be the
             # same.
             previous, earlier = pairs[0]
+            responses.runs = previous.runs
             # Names of the outputs, if the response returns a mapping.
             responses.outputs = responses.outputs or previous.outputs
             n = min(len(earlier), len(runs))
@@ -403,7 +404,6 @@ class ReweightedBound(Bound):
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
-            responses.runs.users.add(responses.caller)
             self._other_responses.append((responses, replace(runs, values=values)))
         return values
 

@@ -7,6 +7,7 @@ before it waits for the next.
 from __future__ import annotations
 
 import io
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,7 +34,10 @@ from prbayes.response.executors import (
 )
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
-from prbayes.response.store import Store, StoreError
+from prbayes.response.store import Store, StoreError, add_digests, stored_digests
+from prbayes.response.variables import changed_names, listed, watched
+
+_log = logging.getLogger(__name__)
 
 type Function = Callable[..., Any]  # the user's response, or a part of it
 
@@ -512,7 +516,10 @@ def respond(
 
 
 def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
-    """Compute a few stored runs again, once: the function or its variables may have changed."""
+    """Compute a few stored runs again, once: the function or its variables may have changed.
+
+    More are computed if the store has no run of the function as it is now.
+    """
     store = settings.store
     if store is None or store.verified:
         return
@@ -529,7 +536,14 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
         reasons.update({int(selected[i]): reason for i, reason in raised.items()})
         return again
 
-    change = changed_run(values[usable], compute)
+    # Runs of other code may differ anywhere, not only at their ends.
+    digests = watched(settings.function).digests()
+    changes = [changed_names(stored, digests) for stored in stored_digests(store)]
+    is_known = [] in changes
+    if usable.size and not is_known:
+        names = listed(min(changes, key=len)) if changes else "its code or variables"
+        _log.info("%s: store: a tenth of the runs repeated: other %s", settings.name, names)
+    change = changed_run(values[usable], compute, most=5 if is_known else None)
     if change is not None:
         selected, again = change
         row = usable[selected]
@@ -546,6 +560,8 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
             f"function, or its variables have changed; nothing was changed: {remedy} another "
             "folder, or version= with a new name, whose runs are stored apart"
         )
+    if not is_known:
+        add_digests(store, digests)
     store.verified = True
 
 
@@ -630,18 +646,32 @@ def changed_run(
     share: float = 0.0,
     *,
     may_fail: bool = False,
+    most: int | None = 5,
+    n_random: int = 0,
 ) -> tuple[int, Floats] | None:
     """Return the row of a run that differs when it is computed again, and its response then.
 
-    A few runs, (n,) or (n, m), are computed; see `revealing_rows`. The ``share`` is that of
-    `tolerance_of`. With ``may_fail`` a run that fails now is no change: it may fail by chance.
+    A few runs, (n,) or (n, m), are computed: ``most`` of `revealing_rows`, and random ones. If
+    ``most`` is None, a tenth of all runs follows, and as many more as take ten seconds. The
+    ``share`` is that of `tolerance_of`. With ``may_fail`` a run that fails now is no change: it
+    may fail by chance.
     """
-    rows = revealing_rows(values)
-    again = compute(rows) if rows.size else values[rows]
-    if may_fail:
-        again = np.where(np.isnan(again), values[rows], again)
-    changed = first_change(values[rows], again, tolerance_of(values, share))
-    return None if changed is None else (int(rows[changed]), again[changed])
+    rows = revealing_rows(values)[:most]
+    inner = np.random.default_rng(0).permutation(np.setdiff1d(np.arange(len(values)), rows))
+    blocks = [np.concatenate([rows, inner[:n_random]])]
+    if most is None:
+        blocks += np.array_split(inner, 10)
+    clock = time.perf_counter()
+    for k, block in enumerate(blocks):
+        if not block.size or (k > 1 and time.perf_counter() - clock > 10):
+            break
+        again = compute(block)
+        if may_fail:
+            again = np.where(np.isnan(again), values[block], again)
+        changed = first_change(values[block], again, tolerance_of(values, share))
+        if changed is not None:
+            return int(block[changed]), again[changed]
+    return None
 
 
 def numbers_text(values: Floats, digits: int = 10) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 import inspect
+import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -48,6 +50,9 @@ from prbayes.response.failures import Abort, Failure, OnFailure, Replace, Respon
 from prbayes.response.inputs import Inputs, aleatory_names, argument_names, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
+from prbayes.response.variables import listed, watched
+
+_log = logging.getLogger(__name__)
 
 
 def refuse_uncallable(name: str, function: object, argument: str = "response") -> None:
@@ -110,11 +115,15 @@ class StoredRuns:
     stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
     last: tuple[list[Floats], Floats] | None = None  # inputs and responses of the last call
     is_shared: bool = False  # whether another simulator uses the runs
-    # Names of the callers for which a few runs were computed again, as a check of the response.
-    users: set[str] = field(default_factory=set)
+    # Version of the function (`Watched`) that gave the runs, or with which a part of them agrees;
+    # None before the first run.
+    version: int | None = None
+    # Whether a few runs were repeated in this process, for another use; None to repeat them again
+    # at any use.
+    is_repeated: bool | None = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "last": None}
+        return {**vars(self), "last": None, "is_repeated": False}
 
     def at(self, points: Sequence[Floats]) -> Floats | None:
         """Return the responses of a stored batch, (n,) or (n, m), None if it is not stored."""
@@ -181,6 +190,8 @@ class Responses:
         # seconds are NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
         self.runs = StoredRuns()
+        self.watched = watched(function)
+        self.n_repeated = 0  # number of runs that were repeated, because the response may change
         self._is_checked = False
         self._written_form = written_form(function)
         self._n_reused = 0
@@ -195,7 +206,9 @@ class Responses:
         """Return a copy with its own counts and the same executor and store."""
         duplicate = copy.copy(self)
         duplicate._tally = self._tally.copied()
-        duplicate.runs = StoredRuns(list(self.runs.stored), users=set(self.runs.users))
+        duplicate.runs = replace(
+            self.runs, stored=list(self.runs.stored), last=None, is_shared=False
+        )
         return duplicate
 
     def share(self, other: Responses) -> None:
@@ -206,7 +219,8 @@ class Responses:
     @property
     def computed(self) -> int:
         """Responses computed here: without those found in a store, with those tried again."""
-        return self.count - self._n_reused if self.is_batched else self._tally.computed
+        n = self.count - self._n_reused if self.is_batched else self._tally.computed
+        return n + self.n_repeated
 
     @property
     def failures(self) -> int:
@@ -292,27 +306,61 @@ class Responses:
         duplicate.caller = caller
         return duplicate
 
+    @property
+    def may_differ(self) -> bool:
+        """Whether runs may be others now: a variable has changed, or the user asks for repeats."""
+        runs = self.runs
+        return runs.version is not None and (
+            runs.is_repeated is None or runs.version != self.watched.compared()
+        )
+
+    @contextmanager
+    def kept_runs(self) -> Iterator[None]:
+        """Compute runs that are used again: what they change in the function is no change."""
+        with self.watched.calls():
+            if self.runs.version is None:
+                self.runs.version = self.watched.version
+            yield
+
     def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
-        """Raise if stored runs differ when a few of them are computed again, once for each caller.
+        """Raise if stored runs differ when a part of them is computed again.
 
         ``points`` are those of this response's aleatory inputs, ``values`` their runs, (n,) or
-        (n, m). Nothing is computed if the store has a version, by which the user vouches for them.
+        (n, m). Where a variable of the function has changed, a tenth of the runs is repeated, and
+        more as time allows. Otherwise three are, once: files and servers are not compared. Nothing
+        is computed if the store has a version, by which the user vouches for the runs.
         """
-        store = stored._settings.store
+        store, runs = stored._settings.store, stored.runs
         self._is_checked |= stored._is_checked
-        if self.caller in stored.runs.users or (store is not None and store.version is not None):
+        if store is not None and store.version is not None:
             return
-        change = changed_run(values, partial(self._again, points), self._one_system)
+        has_changed = runs.version not in (None, stored.watched.compared())
+        if runs.is_repeated and not has_changed:
+            return
+        names = listed(stored.watched.names) if has_changed else "a file or variable that it reads"
+        n_repeated = 0
+
+        def compute(rows: Indices) -> Floats:
+            nonlocal n_repeated
+            n_repeated += rows.size
+            return self._again(points, rows)
+
+        with stored.watched.calls():
+            most = None if has_changed else 3
+            change = changed_run(values, compute, self._one_system, most=most)
+        stored.n_repeated += n_repeated
+        reason = f"{names} has changed" if has_changed else f"{names} may have changed"
+        _log.info("%s: %d runs of %s repeated: %s", self.caller, n_repeated, stored.name, reason)
         if change is not None:
             row, again = change
             raise ResponseError(
                 f"{self.caller}: got {numbers_text(again)} from the response of {stored.name} "
                 f"{self._place(points, row)}, expected "
-                f"{numbers_text(values[row])}, as in its runs: a variable that it reads "
+                f"{numbers_text(values[row])}, as in its runs: {names} "
                 "has changed since; build the model again for the response as it is now, or write "
                 "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
             )
-        stored.runs.users.add(self.caller)
+        runs.version, runs.is_repeated = stored.watched.version, True
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
@@ -375,16 +423,22 @@ class Responses:
         return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
 
     def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
-        """Raise if one of three specimens differs when it is computed again, by itself.
+        """Raise if one of a few specimens differs when it is computed again, by itself.
 
         They are the last one, on which a state that passes from specimen to specimen has the most
-        influence, then one in the middle, and finally the first one.
+        influence, then one in fifty at random, and finally the first one. A function of batches is
+        also called for one in eight of many in random order, as a state may belong to places.
         """
         finite = finite_runs(values)
         if finite.size < 2 or (self.scatter is None and not self.is_batched):
             return
-        rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
-        parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
+        self.watched.called()
+        inner = np.random.default_rng(len(finite)).permutation(finite[1:-1])
+        n_random = 1 if self.is_batched else 1 + len(inner) // 50
+        rows = np.concatenate([finite[-1:], inner[:n_random], finite[:1]])
+        parts = [*rows[:, None]] if self.is_batched else [rows]
+        if self.is_batched and len(inner) > 32:
+            parts.append(inner[1 : min(34, 3 + len(inner) // 8)])
         copies = 3 if len(values) == 2 else 2
 
         def by_itself(rows: Indices) -> Floats:
@@ -425,10 +479,11 @@ class Responses:
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "
-                f"call: got {numbers_text(got, 6)} alone, and {numbers_text(expected, 6)} among "
-                f"{len(values)}, expected the same; look for a mean, a sum, a sort or another "
-                "order over the axis of specimens, and for a state from one specimen to the next, "
-                "or write it for one specimen, in prb.scalar"
+                f"call: got {numbers_text(got, 6)} "
+                f"{'alone' if part.size == 1 or not self.is_batched else f'among {part.size}'}, "
+                f"and {numbers_text(expected, 6)} among {len(values)}, expected the same; look "
+                "for a mean, a sum, a sort or another order over the axis of specimens, and for a "
+                "state from one specimen to the next, or write it for one specimen, in prb.scalar"
             )
 
     def _refuse_one_size(
@@ -486,7 +541,7 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
             return computed_again(settings, points.at(rows), tally.copied())[0]
 
     share = 0.0 if isinstance(settings.function, scalar) else 0.01
-    change = changed_run(values, compute, share, may_fail=True)
+    change = changed_run(values, compute, share, may_fail=True, n_random=len(values) // 32)
     if change is not None:
         row, again = change
         raise ResponseError(
@@ -523,9 +578,11 @@ def deduplicated_responses(
     earliest = first[which]
     is_new = earliest[m:] == np.arange(m, m + n)
     if is_new.all():
-        return responses(points, [])
+        with responses.kept_runs():
+            return responses(points, [])
     new = np.flatnonzero(is_new)
-    computed = responses([x[new] for x in points], []) if new.size else stored_values[:0]
+    with responses.kept_runs():
+        computed = responses([x[new] for x in points], []) if new.size else stored_values[:0]
     values = np.full((m + n, *computed.shape[1:]), np.nan)
     values[:m] = stored_values.reshape(m, *computed.shape[1:])
     values[m + new] = computed

@@ -7,6 +7,7 @@ write at once. A checksum of every run reveals damage.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sqlite3
@@ -381,6 +382,11 @@ _TABLES = (
     "CREATE TABLE run (id INTEGER PRIMARY KEY, response INTEGER NOT NULL, key BLOB NOT NULL, "
     "state TEXT NOT NULL, reason TEXT, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
 )
+# Digests of the functions with which runs agree, as JSON. Older files have no such table.
+_CODE = (
+    "CREATE TABLE code (id INTEGER PRIMARY KEY, response INTEGER NOT NULL, digests TEXT NOT NULL, "
+    "checksum INTEGER NOT NULL)"
+)
 INSERT_RUN = (
     "INSERT INTO run (response, key, state, reason, value, checksum) VALUES (?, ?, ?, ?, ?, ?)"
 )
@@ -533,7 +539,7 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
             "use the version of prbayes that wrote it, or pass another folder",
         )
     tables = connection.execute("SELECT sql FROM sqlite_master ORDER BY name").fetchall()
-    if tables != [(table,) for table in _TABLES]:
+    if [table for table in tables if table != (_CODE,)] != [(table,) for table in _TABLES]:
         raise _damaged("its tables are others")
     (result,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     last = result.splitlines()[-1]  # earlier lines only name the database
@@ -551,6 +557,29 @@ def _responses(connection: sqlite3.Connection) -> dict[tuple[str, str | None], t
         name, columns, version = row
         responses[name, version] = number, columns
     return responses
+
+
+def stored_digests(store: Store) -> list[dict[str, str | None]]:
+    """Return the digests of the functions with which the stored runs agree, by variable."""
+    session = store._read()
+    with store._explained():
+        found = session.connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'code'")
+        select = "SELECT response, digests, checksum FROM code ORDER BY id"
+        rows = session.connection.execute(select).fetchall() if found.fetchall() else []
+        for *row, stored_checksum in rows:
+            if stored_checksum != checksum(*row):
+                raise _damaged("the digests of a function do not match their checksum")
+        return [json.loads(text) for response, text, _ in rows if response == session.response]
+
+
+def add_digests(store: Store, digests: Mapping[str, str | None]) -> None:
+    """Note the digests of a function with which the stored runs agree."""
+    session = store._read()
+    row = session.response, json.dumps(digests)
+    with store._explained(), transaction(session.connection):
+        session.connection.execute(_CODE.replace("TABLE", "TABLE IF NOT EXISTS"))
+        insert = "INSERT INTO code (response, digests, checksum) VALUES (?, ?, ?)"
+        session.connection.execute(insert, (*row, checksum(*row)))
 
 
 # -- errors ----------------------------------------------------------------------------------------

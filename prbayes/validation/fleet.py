@@ -31,7 +31,7 @@ from prbayes._validate import (
 )
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
-from prbayes.model.evaluator import Evaluator, with_data
+from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
@@ -125,7 +125,7 @@ def calibrate_each(
     executes(executor)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    evaluator = Evaluator.of(model)
+    evaluator = with_unchanged_runs(Evaluator.of(model))
     simulator, *more = with_data(evaluator)
     if more:
         raise TypeError(

@@ -512,11 +512,12 @@ def test_responses_under_reweighted_are_those_of_the_design() -> None:
     response = Counting()
     model = normal_model("kl", response=response)
     first_use(model)
-    assert response.count == 256
+    again = 33  # specimens that are computed in another order, to look for a state
+    assert response.count == 256 + again
     optimum = prb.minimize(model)
-    assert optimum.n_responses == response.count == node(model).bound.n_points
+    assert optimum.n_responses == response.count - again == node(model).bound.n_points
     # The design is part of a second optimum as well.
-    assert prb.minimize(model).n_responses == response.count == optimum.n_responses
+    assert prb.minimize(model).n_responses == response.count - again == optimum.n_responses
     trace = optimum.search.trace
     assert optimum.search.n_evaluations == len(trace["discrepancy"]) == len(trace["theta"]) > 3
 
