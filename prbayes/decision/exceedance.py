@@ -1,4 +1,4 @@
-"""Probability that a response exceeds a limit; if rare, by cross-entropy importance sampling."""
+"""Probability that a response exceeds a limit; if rare, by importance sampling near the limit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from scipy.special import logsumexp, ndtr
+from scipy.special import chdtri, gammaln, logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, as_json, report, sentences_of
@@ -45,6 +45,7 @@ from prbayes.decision.quantities import (
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.model.random_variable import response_name
+from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.response import Responses, refuse_uncallable
@@ -487,11 +488,40 @@ class _Normal:
         return log_normal(standard) - float(np.log(np.diag(self.root)).sum())
 
 
+@dataclass(frozen=True)
+class _Shell:
+    """A proposal of z with a uniform direction, and a uniform radius in the tail."""
+
+    d: int
+
+    @property
+    def radius(self) -> float:
+        """The largest radius: a billionth of the population is beyond it."""
+        return float(np.sqrt(chdtri(self.d, 1e-9)))
+
+    def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        """Return n draws, (n, D), whose radius is at least half of the largest one."""
+        z = rng.standard_normal((n, self.d))
+        radius = self.radius * (1 + (np.arange(n) + rng.random(n)) / max(n, 1)) / 2
+        return np.asarray(z * (radius / np.linalg.norm(z, axis=1))[:, None])
+
+    def log_density(self, z: Floats) -> Floats:
+        """Return the log-density, (n, D) -> (n,)."""
+        radius = np.linalg.norm(z, axis=1)
+        log_area = np.log(2) + self.d / 2 * np.log(np.pi) - gammaln(self.d / 2)
+        logs = -np.log(self.radius / 2) - log_area - (self.d - 1) * np.log(radius)
+        is_inside = (radius >= self.radius / 2) & (radius <= self.radius)
+        return np.where(is_inside, logs, -np.inf)
+
+
+type _Proposal = _Normal | _Shell
+
+
 @dataclass(frozen=True, eq=False)
 class _Points:
     """Points from several proposals, with their responses."""
 
-    proposals: list[tuple[_Normal, int]]  # proposals, each with its number of points
+    proposals: list[tuple[_Proposal, int]]  # proposals, each with its number of points
     z: Floats  # (n, D)
     values: Floats  # (n,)
     # (k, n): log ratio of the density of each population to that of the central one
@@ -529,11 +559,16 @@ def rare_event(
     r"""Return the probability that a response is above a limit, in each of k populations.
 
     Points are standard normal numbers z behind the inputs of a central population
-    :math:`\theta_*`. One half is drawn towards the limit step by step, by the cross-entropy method.
-    The other half is drawn from the mixture q of the last proposals, and counts:
+    :math:`\theta_*`. A quarter explores, with up to five numbers in all directions up to the far
+    tail. From points with large responses, proposals in separate parts move towards the limit step
+    by step, each by the cross-entropy method [1]_. The last three eighths are drawn from the
+    mixture q of the last proposals, and count:
 
     .. math:: P_j = \frac{1}{n} \sum_i 1[y_i > c] \frac{p(x_i | \theta_j)}{p(x_i | \theta_*)}
         \frac{\phi(z_i)}{q(z_i)}
+
+    The error has half the difference from the estimate of all points, which sees parts of the
+    region that the last proposals miss.
 
     ``transform`` is that of the central population, ``parents`` are those of the k populations,
     ``respond`` maps normal numbers (n, D) to responses (n,), and ``size`` is the number of these.
@@ -548,25 +583,20 @@ def rare_event(
     d = transform.size
     # The first proposal is wider than the population, so that weights are bounded. It is less wide
     # in each of many dimensions.
-    widest = _Normal(np.zeros(d), (1 + 0.5 / np.sqrt(d)) * np.eye(d))
-    proposals = [widest]
-    # A step has a sixteenth of the points, and more in many dimensions.
-    step = max(size // 16, min(10 * d, size // 8), 1)
+    wide: list[_Proposal] = [_Normal(np.zeros(d), (1 + 0.5 / np.sqrt(d)) * np.eye(d))]
+    if d <= 5:  # points of a shell in more dimensions seldom meet a small region
+        wide.append(_Shell(d))
     draw = partial(_draw_points, transform, parents, respond, rng)
-    search = None
-    for first in range(0, size // 2, step):
-        batch = draw(proposals, min(step, size // 2 - first))
-        search = batch if search is None else search.joined(batch)
-        # Raise the level to what the highest fifth of the responses exceeds, as is usual for the
-        # method.
-        values = batch.values[~np.isnan(batch.values)]
-        elite = float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
-        proposals = _cross_entropy_proposals(search, min(elite, limit), limit) or proposals
-    # The estimate is unbiased, because the proposals do not depend on the final points. One point
-    # in ten comes from the widest proposal, so that weights are bounded.
-    copies = max(1, 9 // len(proposals))
-    mixture = [proposal for proposal in proposals for _ in range(copies)] + [widest]
-    final = draw(mixture, size - size // 2)
+    search = draw(wide, max(size // 4, 2))
+    parts, used, most = _first_parts(search, limit), len(search.z), 5 * size // 8
+    while used < most:
+        parts, between = _separate(parts, respond, limit)
+        batch = draw(_mixture(parts, wide), max(min(size // 25, most - used), 1))
+        used += between + len(batch.z)
+        search = search.joined(batch)
+        parts = _moved(parts, search, limit)
+    # The estimate is unbiased, because the proposals do not depend on the final points.
+    final = draw(_mixture(parts, wide), max(size - used, 2))
     weights = np.exp(final.log_ratio + (log_normal(final.z) - final.log_mixture()))
     mean_weights = weights.mean(axis=0)
     is_beyond = ~np.isnan(final.values) & (final.values > limit)
@@ -578,12 +608,16 @@ def rare_event(
         is_above = final.values >= np.median(values)
         above, above_error = weighted_share(mean_weights[None], is_above)
         error = min(error, float(above[0] + 2 * above_error) / 3)
-    points = final if search is None else search.joined(final)
+    points = search.joined(final)
+    by_draw = weighted_share(weights, is_beyond)[0]
+    estimate = weighted_share(mean_weights[None], is_beyond)[0]
+    all_weights = np.exp(points.log_ratio + (log_normal(points.z) - points.log_mixture()))
+    of_all = weighted_share(all_weights.mean(axis=0)[None], points.values > limit)[0]
     log_weights = points.log_weights()
     shares = np.exp(log_weights - log_weights.max())
     return RareEvent(
-        by_draw=weighted_share(weights, is_beyond)[0],
-        error=error,
+        by_draw=by_draw,
+        error=float(np.hypot(error, (of_all - estimate)[0] / 2)),
         lost=float(shares[np.isnan(points.values)].sum() / shares.sum()),
     )
 
@@ -617,7 +651,7 @@ def _draw_points(
     parents: Sequence[Floats],
     respond: Callable[[Floats], Floats],
     rng: np.random.Generator,
-    proposals: list[_Normal],
+    proposals: list[_Proposal],
     n: int,
 ) -> _Points:
     """Draw n points, in equal parts from each proposal, and compute their responses."""
@@ -635,33 +669,92 @@ def _draw_points(
     return _Points(pairs, z, respond(z), np.concatenate(log_ratio))
 
 
-def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:
-    """Return the normal distribution nearest to the populations above a level, if any point is.
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of the region where responses are above a level, with a proposal in it."""
 
-    Return two of them if the points above scatter wider than the population, as on both sides of
-    it.
+    level: float  # rises to the limit
+    proposal: _Normal
+
+    @property
+    def center(self) -> Floats:
+        """The center of the proposal, (D,)."""
+        return self.proposal.mean
+
+
+def _mixture(parts: list[_Part], wide: list[_Proposal]) -> list[_Proposal]:
+    """Return proposals of equal shares; the wide ones have a tenth, so that weights are bounded."""
+    return [part.proposal for part in parts] * max(1, 18 // len(parts)) + wide
+
+
+def _first_parts(points: _Points, limit: float) -> list[_Part]:
+    """Return parts at points of the highest fifth of the responses that are far from each other.
+
+    The first one is the nearest to the origin. In many dimensions it is the only one, because
+    directions of points are all different there.
     """
-    is_above = points.values >= level
-    if not is_above.any():
-        return []
-    z = points.z[is_above]
-    log_weights = points.log_weights()[is_above]
-    weights = np.exp(log_weights - log_weights.max())
-    total = weights.sum()
-    # Bound the variance towards the limit from below. Narrow proposals would slow the search before
-    # the limit is reached. Beyond four standard deviations a normal tail has a variance of .05.
-    least = 0.1 if level >= limit else 1.0
-    mean = weights @ z / total
-    deviation = z - mean
-    covariance = (deviation.T * weights) @ deviation / total
-    variances, axes = np.linalg.eigh(covariance)
-    error = np.sqrt(2 * (weights**2).sum()) / total  # standard error of a variance of one
-    # The largest of several sample variances exceeds one by chance (Marchenko and Pastur 1967).
-    by_chance = (1 + np.sqrt(mean.size / 2) * error) ** 2
-    if variances[-1] <= max(by_chance, 1 + 3 * error):
-        return [_tail_normal(z, weights, least)]
-    side = deviation @ axes[:, -1] > 0
-    return [_tail_normal(z[part], weights[part], least) for part in (side, ~side)]
+    values = np.where(np.isnan(points.values), -np.inf, points.values)
+    level = min(float(np.quantile(values, 0.8, method="lower")), limit)
+    above = points.z[values >= level]
+    above = above[np.argsort((above**2).sum(axis=1))]
+    d = above.shape[1]
+    rows = farthest_rows(above, min(6 if d <= 5 else 3 if d <= 20 else 1, len(above)))
+    return _moved([_Part(level, _Normal(z, np.eye(d))) for z in above[rows]], points, limit)
+
+
+def _moved(parts: list[_Part], points: _Points, limit: float) -> list[_Part]:
+    """Return parts whose level and proposal follow from the points nearest to their centers."""
+    values = np.where(np.isnan(points.values), -np.inf, points.values)
+    centers = np.array([part.center for part in parts])
+    distance = np.linalg.norm(points.z[:, None] - centers, axis=2)
+    owner, log_weights = distance.argmin(axis=1), points.log_weights()
+    result = []
+    for k, part in enumerate(parts):
+        is_own, level = owner == k, part.level
+        is_near = is_own & (distance[:, k] < 3 + np.sqrt(points.z.shape[1]))
+        if is_near.any():
+            # The highest fifth of the responses is usual for the cross-entropy method.
+            level = max(level, float(np.quantile(values[is_near], 0.8, method="lower")))
+        level = min(level, limit)
+        is_above = is_own & (values >= level)
+        if is_above.any():
+            weights = np.exp(log_weights[is_above] - log_weights[is_above].max())
+            # Bound the variance towards the limit from below. Narrow proposals would slow the
+            # search before the limit is reached. Beyond four standard deviations a normal tail has
+            # a variance of .05.
+            least = 0.1 if level >= limit else 1.0
+            part = _Part(level, _tail_normal(points.z[is_above], weights, least))
+        result.append(part)
+    return result
+
+
+def _separate(
+    parts: list[_Part], respond: Callable[[Floats], Floats], limit: float
+) -> tuple[list[_Part], int]:
+    """Return parts that are separate, and the number of responses that this needed.
+
+    Two parts are the same if the response halfway between them is above the lower level. A part
+    below the limit and one that has reached it stay: points nearer to the origin are more likely.
+    """
+    parts = sorted(parts, key=lambda part: (-part.level, (part.center**2).sum()))
+    pairs = [
+        (i, j)
+        for j in range(len(parts))
+        for i in range(j)
+        if (parts[i].level >= limit) == (parts[j].level >= limit)
+    ]
+    if not pairs:
+        return parts, 0
+    values = respond(np.array([(parts[i].center + parts[j].center) / 2 for i, j in pairs]))
+    is_same = {
+        pair: value >= min(parts[pair[0]].level, parts[pair[1]].level)
+        for pair, value in zip(pairs, values, strict=True)
+    }
+    kept: list[int] = []
+    for j in range(len(parts)):
+        if not any(is_same.get((i, j), False) for i in kept):
+            kept.append(j)
+    return [parts[i] for i in kept], len(pairs)
 
 
 def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:

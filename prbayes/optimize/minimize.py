@@ -226,7 +226,7 @@ def repeat_runs(model: pm.Model | None = None, *, progressbar: bool = True) -> d
     with shown(progressbar), explained(model, "prb.repeat_runs"):
         evaluator = Evaluator.of(model)
         simulators = with_data(evaluator)
-        before = [simulator.responses.n_repeated for simulator in simulators]
+        n_repeated = [simulator.responses.n_repeated for simulator in simulators]
         for simulator in simulators:
             simulator.responses.runs.is_repeated = None
         with_unchanged_runs(evaluator)

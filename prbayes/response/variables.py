@@ -169,8 +169,8 @@ def _opened_function(function: FunctionType) -> Opened:
     spaces: list[tuple[Iterable[str], Mapping[str, Any]]] = [
         ([*closure, *read, *modules], variables)
     ]
-    for wanted, space in spaces:
-        for variable in [x for x in wanted if x in space]:
+    for of_code, space in spaces:
+        for variable in [x for x in of_code if x in space]:
             value = space[variable]
             if not isinstance(value, ModuleType):
                 parts.append((variable, value))

@@ -335,12 +335,26 @@ def rare_events(
     return by_draw, error, lost
 
 
+def unequal_sides(z: Floats) -> Any:
+    return np.maximum(z[:, 0], 3 * (-z[:, 0] - 2.6))
+
+
+def jump(z: Floats) -> Any:
+    return np.where(z[:, 0] < -4, 9.0, z[:, 0])
+
+
+UNEQUAL = float(ndtr(-4.5) + ndtr(-4.1))
 CASES: dict[str, tuple[int, Callable[[Floats], Any], float, float]] = {
     "one": (1, lambda z: z[:, 0], ndtri(1 - 1e-5), 1e-5),
     "ten": (10, lambda z: z.sum(axis=1) / np.sqrt(10), ndtri(1 - 1e-4), 1e-4),
     "two sides": (1, lambda z: np.abs(z[:, 0]), ndtri(1 - 5e-5), 1e-4),
     "common": (2, lambda z: z[:, 0] + z[:, 1], 0.0, 0.5),
     "of another size": (1, lambda z: 1e6 + 3e-3 * z[:, 0], 1e6 + 3e-3 * ndtri(1 - 1e-4), 1e-4),
+    "unequal sides": (1, unequal_sides, 4.5, UNEQUAL),
+    "a jump on one side": (2, jump, 4.5, float(ndtr(-4.5) + ndtr(-4))),
+    "two directions": (2, lambda z: np.maximum(z[:, 0], 3 * (z[:, 1] - 2.6)), 4.5, UNEQUAL),
+    "four sides": (2, lambda z: np.abs(z).max(axis=1), 4.3, 1 - (1 - 2 * ndtr(-4.3)) ** 2),
+    "ring": (2, lambda z: (z**2).sum(axis=1), 20.0, np.exp(-10.0)),
     "failed": (1, lambda z: np.where(z[:, 0] > 3.0, np.inf, z[:, 0]), 3.0, ndtr(-3.0)),
 }
 
@@ -354,6 +368,17 @@ def test_probabilities_and_their_errors(case: str) -> None:
     # In units of the error: a standard deviation of one, known to 1 / sqrt(2 SEEDS).
     assert np.sqrt(np.mean(((values - expected) / errors) ** 2)) < 1 + 4 / np.sqrt(2 * SEEDS)
     assert abs(values.mean() - expected) < 4 * np.sqrt(np.mean(errors**2) / SEEDS)
+
+
+@pytest.mark.parametrize("response", [unequal_sides, jump])
+def test_no_region_is_left_out_beside_inputs_of_no_effect(
+    response: Callable[[Floats], Any],
+) -> None:
+    by_draw, errors, _ = rare_events(5, response, 4.5)
+    expected = ndtr(-4.5) + (ndtr(-4) if response is jump else ndtr(-4.1))
+    is_wrong = by_draw[:, 0] + 4 * errors < expected
+    assert is_wrong.sum() <= 1
+    assert by_draw.mean() == pytest.approx(expected, rel=0.2)
 
 
 def test_populations_share_their_points() -> None:
