@@ -230,7 +230,7 @@ def repeat_runs(model: pm.Model | None = None, *, progressbar: bool = True) -> d
         for simulator in simulators:
             simulator.responses.runs.is_repeated = None
         with_unchanged_runs(evaluator)
-    pairs = zip(simulators, before, strict=True)
+    pairs = zip(simulators, n_repeated, strict=True)
     return {s.name: s.responses.n_repeated - n for s, n in pairs}
 
 
