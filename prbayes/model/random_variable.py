@@ -425,7 +425,7 @@ class SimulatorRV(ObservedRV):
             report(
                 Finding(
                     "independent-draws",
-                    f"{name} and {", ".join(other_names)} have the inputs of the same specimens, but "
+                    f"{name} and {', '.join(other_names)} have the inputs of the same specimens, but "
                     "PyMC's predictive sampling draws each variable independently: use "
                     "prb.predict for responses of the same specimens.",
                 )
