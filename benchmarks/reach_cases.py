@@ -439,7 +439,7 @@ def _eight(number: int) -> Instance:
     start = {f"mu{i}": float(m) for i, m in enumerate(_EIGHT.mean)}
     start |= {f"s{i}": float(s) for i, s in enumerate(_EIGHT.sd)}
 
-    def reference(nodes: int = 1024, sets: int = 2, count: int = 8192) -> dict[str, Any]:
+    def reference(nodes: int = 4096, sets: int = 2, count: int = 8192) -> dict[str, Any]:
         split = _populations(priors)
         points = [fibre_nodes(y, nodes, seed) for seed in range(sets)]
         log_l = [exact.normal_at_nodes(x, log_a) for x, log_a in points]

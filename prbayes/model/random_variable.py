@@ -419,13 +419,13 @@ class SimulatorRV(ObservedRV):
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
-        *other_names, name = self.simulators
-        if other_names and not self._warned:
+        *matched, name = self.simulators
+        if matched and not self._warned:
             self._warned = True
             report(
                 Finding(
                     "independent-draws",
-                    f"{name} and {', '.join(other_names)} have the inputs of the same specimens, but "
+                    f"{name} and {', '.join(matched)} have the inputs of the same specimens, but "
                     "PyMC's predictive sampling draws each variable independently: use "
                     "prb.predict for responses of the same specimens.",
                 )
