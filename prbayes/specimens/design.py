@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
+from prbayes._finding import any_of
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
@@ -560,11 +561,11 @@ def require_accurate(data: SpecimenData, emulation: Emulation, likely: Likely) -
     specimen = int(np.argmax(np.where(is_read, variance, -1.0)))
     name = data.output_names[output] if data.output_names else data.name
     label = specimen if data.labels is None else data.labels[specimen]
+    more_runs, other_metric = data.remedies()
     raise DesignError(
         f"{data.name}: the response is not smooth enough for prb.LogLikelihood(): got an emulator "
         f"of {len(emulation.z)} runs whose error of {name} is {share[output]:.2g} times the "
         f"scatter, the largest at specimen {label}, and would shift an estimate by "
         f"{emulation.bias:.2g} posterior standard deviations, expected at most "
-        f"{data.options.bias}; narrow the priors, ask for more first runs with prb.Reweighted(n), "
-        "or use metric=prb.ProbabilityResidual()"
+        f"{data.options.bias}; {any_of('narrow the priors', more_runs, other_metric)}"
     )

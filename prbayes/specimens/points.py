@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
@@ -130,6 +131,8 @@ class SpecimenData:
     name: str = "response"
     output_names: tuple[str, ...] = ()  # names of the m outputs in messages
     labels: NDArray[Any] | None = None  # labels of the N specimens; None for row numbers
+    # Advice on more runs, and on another metric, that the model accepts; empty texts for none.
+    remedies: Callable[[], tuple[str, str]] = lambda: ("", "")
     seed: int = 0
 
     @property
@@ -450,7 +453,7 @@ def agreeing_points(
         ):
             return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
-            raise _monte_carlo_error(data.name, 2 * count, difference[1], largest)
+            raise _monte_carlo_error(data, 2 * count, difference[1], largest)
         # The error falls like 1 / count at best.
         times = 2 ** int(np.log2(np.clip(difference[1] / largest, 2, most // (2 * count))))
         count *= times
@@ -523,7 +526,7 @@ def reliable_draws(
             if difference <= limit:
                 return draws, points, proposals
             if 2 * count > data.options.most_points:
-                raise _monte_carlo_error(data.name, count, difference, limit)
+                raise _monte_carlo_error(data, count, difference, limit)
         previous = proposals.residuals.population
         covariance = previous.root @ previous.root.T
         smoothing = count ** (-2 / (len(covariance) + 4)) * covariance
@@ -545,9 +548,11 @@ def per_hyperparameter(draws: Draws) -> float:
     return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
 
 
-def _monte_carlo_error(name: str, count: int, difference: float, largest: float) -> DesignError:
+def _monte_carlo_error(
+    data: SpecimenData, count: int, difference: float, largest: float
+) -> DesignError:
+    remedies = "measure more outputs of each specimen", "narrow the priors", data.remedies()[1]
     return DesignError(
-        f"{name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
-        f"{difference:.2g} nats, expected at most {largest:.2g}; measure more outputs of each "
-        "specimen, narrow the priors, or use metric=prb.ProbabilityResidual()"
+        f"{data.name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
+        f"{difference:.2g} nats, expected at most {largest:.2g}; {any_of(*remedies)}"
     )
