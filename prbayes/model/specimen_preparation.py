@@ -39,6 +39,7 @@ from prbayes.model.measurement import (
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.remedies import remedies_of
+from prbayes.model.run_coverage import coverage_findings
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -291,6 +292,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *_data_findings(likelihood, emulation.y, several_roots=several_roots),
         *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error, data.remedies),
+        *coverage_findings(likelihood, data, points, draws.specimens()),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
