@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._display import Shown, View, without_constructor
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._progress import shown
 from prbayes._validate import (
     Floats,
@@ -410,7 +410,18 @@ class Surrogate(Shown):
         _refuse_unfit(name, values, min(needed))
         n_usable = _usable(values).sum()
         models = tuple(m for m, n in zip(models, needed, strict=True) if n <= n_usable)
-        surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
+        try:
+            surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
+        except np.linalg.LinAlgError:
+            names = column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs])
+            levels = [len(np.unique(column)) for column in design.T]
+            pairs = zip(names, levels, strict=True)
+            counts = ", ".join(f"{counted(k, 'value')} of {x}" for x, k in pairs)
+            raise ValueError(
+                f"{name}: inputs: got runs that determine no surface, with {counts}, expected "
+                "at least three values of each, and none that follows from others; make a table "
+                "for each value of an input with two, or leave out what follows from others"
+            ) from None
         spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
         # The 90 % quantile is compared, because the largest residuals are those of the most extreme

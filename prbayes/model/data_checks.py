@@ -149,15 +149,26 @@ def check_constant(
     for label, column in zip(output_labels(name, outputs), finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
-        text = (
-            f"{label}: the response is constant: got {column[0]:.6g} at all {len(finite)} runs "
-            "over the priors, expected one that depends on its inputs; check the response"
-        )
+        text, remedy = _constant(column)
         if is_stored:
-            advice = "take more runs if it changes rarely"
-            raise DesignError(f"{text}, {advice}, or leave the output out")
-        findings.append(Finding("constant-response", f"{text}."))
+            leave = "leave the output out" if values.shape[1] > 1 else ""
+            advice = any_of(remedy, "take more runs if it changes rarely", leave)
+            raise DesignError(f"{label}: {text}; {advice}")
+        findings.append(Finding("constant-response", f"{label}: {text}; {remedy}."))
     return tuple(findings)
+
+
+def _constant(column: Floats) -> tuple[str, str]:
+    """Return a clause about an output that is the same in all runs, and what to do."""
+    value, change, remedy = column[0], np.ptp(column), "check the response"
+    text = f"the response is constant: got {value:.6g} at all {len(column)} runs"
+    if change:
+        text = (
+            f"the response is constant to nine digits: got a range of {change:.2g} at "
+            f"{len(column)} runs near {value:.6g}"
+        )
+        remedy += ", subtract its constant part from it and from the readings"
+    return f"{text} over the priors, expected one that depends on its inputs", remedy
 
 
 def check_failing_region(
@@ -498,18 +509,17 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     for j, width in enumerate(high - low):
         if is_constant[j] and has_error[j]:
             continue
-        output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
+        output, leave = "the output", ""
+        if outputs.shape[1] > 1:
+            output, leave = f"output {j} of {outputs.shape[1]}", "leave the output out"
         if is_constant[j]:
-            raise DesignError(
-                f"{name}: the response is constant: got {high[j]:.6g} for {output} at all "
-                f"{len(finite)} runs, expected one that depends on its inputs; check the response, "
-                "or leave the output out"
-            )
+            text, remedy = _constant(finite[:, j])
+            raise DesignError(f"{name}: {output}: {text}; {any_of(remedy, leave)}")
         values = readings.values[np.isfinite(readings.values[:, j]), j]
         if not values.size and readings.is_censored[:, j].any():
             raise DesignError(
                 f"{name}: got no reading of {output} within the limits of censored=, expected at "
-                "least one; leave the output out, or check the limits"
+                f"least one; {any_of('check the limits', leave)}"
             )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():
