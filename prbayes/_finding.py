@@ -59,8 +59,8 @@ def counted(n: int, noun: str, plural: str = "") -> str:
 
 def any_of(*remedies: str) -> str:
     """Return remedies as a text, "a, b, or c"; empty ones are left out."""
-    *others, last = [remedy for remedy in remedies if remedy] or [""]
-    return f"{', '.join(others)}, or {last}" if others else last
+    *first, last = [remedy for remedy in remedies if remedy] or [""]
+    return f"{', '.join(first)}, or {last}" if first else last
 
 
 def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._display import Shown, View, without_constructor
-from prbayes._finding import Finding, counted, report
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import (
     Floats,
@@ -414,13 +414,11 @@ class Surrogate(Shown):
             surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
         except np.linalg.LinAlgError:
             names = column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs])
-            levels = [len(np.unique(column)) for column in design.T]
-            pairs = zip(names, levels, strict=True)
-            counts = ", ".join(f"{counted(k, 'value')} of {x}" for x, k in pairs)
+            counts = dict(zip(names, [len(set(column)) for column in design.T], strict=True))
             raise ValueError(
-                f"{name}: inputs: got runs that determine no surface, with {counts}, expected "
-                "at least three values of each, and none that follows from others; make a table "
-                "for each value of an input with two, or leave out what follows from others"
+                f"{name}: inputs: got runs that determine no surface, with numbers of different "
+                f"values {counts}, expected at least 3, and no input that follows from others; "
+                "make a table for each value of an input with two, or leave the input out"
             ) from None
         spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)

@@ -149,26 +149,21 @@ def check_constant(
     for label, column in zip(output_labels(name, outputs), finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
-        text, remedy = _constant(column)
+        text = f"{label}: {_constant(column)}"
         if is_stored:
             leave = "leave the output out" if values.shape[1] > 1 else ""
-            advice = any_of(remedy, "take more runs if it changes rarely", leave)
-            raise DesignError(f"{label}: {text}; {advice}")
-        findings.append(Finding("constant-response", f"{label}: {text}; {remedy}."))
+            raise DesignError(any_of(text, "take more runs if it changes rarely", leave))
+        findings.append(Finding("constant-response", f"{text}."))
     return tuple(findings)
 
 
-def _constant(column: Floats) -> tuple[str, str]:
-    """Return a clause about an output that is the same in all runs, and what to do."""
-    value, change, remedy = column[0], np.ptp(column), "check the response"
-    text = f"the response is constant: got {value:.6g} at all {len(column)} runs"
-    if change:
-        text = (
-            f"the response is constant to nine digits: got a range of {change:.2g} at "
-            f"{len(column)} runs near {value:.6g}"
-        )
-        remedy += ", subtract its constant part from it and from the readings"
-    return f"{text} over the priors, expected one that depends on its inputs", remedy
+def _constant(column: Floats) -> str:
+    """Return a text on an output that is the same in all runs, to nine digits."""
+    return (
+        f"the response is constant to nine digits: got {column[0]:.6g} at all {len(column)} runs "
+        f"over the priors, with a range of {np.ptp(column):.2g}, expected one that depends on its "
+        "inputs; check the response (subtract a large constant from it and from the readings)"
+    )
 
 
 def check_failing_region(
@@ -511,15 +506,14 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
             continue
         output, leave = "the output", ""
         if outputs.shape[1] > 1:
-            output, leave = f"output {j} of {outputs.shape[1]}", "leave the output out"
+            output, leave = f"output {j} of {outputs.shape[1]}", ", or leave the output out"
         if is_constant[j]:
-            text, remedy = _constant(finite[:, j])
-            raise DesignError(f"{name}: {output}: {text}; {any_of(remedy, leave)}")
+            raise DesignError(f"{name}: {output}: {_constant(finite[:, j])}{leave}")
         values = readings.values[np.isfinite(readings.values[:, j]), j]
         if not values.size and readings.is_censored[:, j].any():
             raise DesignError(
                 f"{name}: got no reading of {output} within the limits of censored=, expected at "
-                f"least one; {any_of('check the limits', leave)}"
+                f"least one; check the limits{leave}"
             )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():

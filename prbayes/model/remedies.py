@@ -49,21 +49,17 @@ def other_metric(
     """Return advice to use a metric of distributions that a simulator accepts; empty if none."""
     if inputs.conditions or inputs.covariates:
         return ""
-    for candidate in (metric, Joint(metric)):
+    of_one = f"prb.{type(metric).__name__}()"
+    for candidate, label in ((metric, of_one), (Joint(metric), f"prb.Joint({of_one})")):
         try:
             target = candidate.against(observed)
         except (TypeError, ValueError):
             continue
-        for propagation in propagations:
-            if accepts(name, propagation, inputs, target):
-                label = f"prb.{type(metric).__name__}()"
-                label = f"prb.Joint({label})" if isinstance(candidate, Joint) else label
-                # The propagation stays if it is the default or the simulator's.
-                is_other = propagation in PROPAGATIONS[1:] and len(propagations) > 1
-                text = f"use metric={label}"
-                if is_other:
-                    text += f" with propagation=prb.{type(propagation).__name__}()"
-                return text
+        for propagation in filter(lambda p: accepts(name, p, inputs, target), propagations):
+            # The propagation stays if it is the default, or random as the response.
+            is_other = len(propagations) > 1 and propagation is not PROPAGATIONS[0]
+            suffix = f" with propagation=prb.{type(propagation).__name__}()" if is_other else ""
+            return f"use metric={label}{suffix}"
     return ""
 
 

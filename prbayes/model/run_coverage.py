@@ -7,13 +7,12 @@ specimen is about as near to a run as the runs are to each other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from prbayes._finding import Finding, counted
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.emulators.ranges import Ranges
 from prbayes.emulators.runs import Runs
@@ -26,34 +25,24 @@ from prbayes.specimens.points import SpecimenData, SpecimenPoints, likely_weight
 _PAGE = "runs.md#where-the-runs-are"
 
 
-@dataclass(frozen=True, eq=False)
-class CoverageOptions:
-    """Limits of the findings about the places of runs."""
-
-    # Distance of a specimen from the nearest run, in units of the distance that 90 % of the runs
-    # have at most from each other. Of 60 data sets of 20 normal specimens in the middle of 30 or
-    # 100 runs it was exceeded in none with grids, Sobol points and Latin hypercubes, in 0 to .12
-    # with uniform random runs, and in all with a hole of .3 of the range of one input.
-    distance: float = 2.0
-    specimens: float = MAX_LOST  # share of the specimens that is reported
-    # Share of the populations that is beyond the runs and may have the readings of specimens.
-    beyond: float = 0.005
-
-
 def coverage_findings(
     likelihood: SpecimenLikelihood,
     data: SpecimenData,
     points: SpecimenPoints,
     specimens: Floats,
-    options: CoverageOptions | None = None,
+    farthest: float = 2.0,
+    beyond: float = 0.005,
 ) -> list[Finding]:
     """Report runs of tables and surrogates that are not where the specimens or populations are.
 
-    ``specimens``, (n, d), are coordinates of specimens of the posterior's populations.
+    ``specimens``, (n, d), are coordinates of specimens of the posterior's populations. ``farthest``
+    is in units of the distance that 90 % of the runs have at most from each other. Of 60 data sets
+    of 20 normal specimens in the middle of 30 or 100 runs it was exceeded in none with grids, Sobol
+    points and Latin hypercubes, in 0 to .12 with uniform random runs, and in all with a hole of .3
+    of the range of one input. ``beyond`` is the largest share of the populations that is beyond the
+    runs, and may have the readings of specimens.
     """
-    options = CoverageOptions() if options is None else options
     findings = []
-    weights = likely_weights(data, points, normal_of(specimens[:, data.free]))
     for m in likelihood.measurements:
         function = m.responses.function
         surrogate = function.surrogate if isinstance(function, Runs) else function
@@ -62,26 +51,27 @@ def coverage_findings(
         remedy = "fit the surrogate to more runs there"
         if function is not surrogate:
             remedy = "add the runs that prb.propose_runs(model) returns"
+        weights = likely_weights(data, points, normal_of(specimens[:, data.free]))
         z = points.z.reshape(-1, points.z.shape[-1])
         distance = _relative_distance(surrogate, m, _columns(likelihood, m, surrogate.domain, z))
         by_specimen = (weights * distance.reshape(weights.shape)).sum(axis=1)
-        is_far = by_specimen > options.distance
-        if is_far.mean() >= options.specimens:
+        is_far = by_specimen > farthest
+        if is_far.mean() >= MAX_LOST:
             text = (
-                f"{m.name}: got {counted(int(is_far.sum()), 'specimen')} of {len(is_far)} up to "
+                f"{m.name}: got {is_far.sum()} of {len(is_far)} specimens up to "
                 f"{by_specimen.max():.2g} times as far from the nearest run as runs are from each "
-                f"other, expected at most {options.distance:g}: the error of the surface is not "
+                f"other, expected at most {farthest:g}: the error of the surface is not "
                 f"known there; {remedy}."
             )
             findings.append(Finding("sparse-runs", text, _PAGE))
         columns = _columns(likelihood, m, surrogate.domain, specimens)
         is_beyond = surrogate.domain.outside(columns)
         share = float(np.mean(is_beyond.any(axis=1) & _may_be_measured(surrogate, m, columns)))
-        if share > options.beyond:
+        if share > beyond:
             place = surrogate.domain.complaint(columns, is_beyond).partition("design: ")[2]
             text = (
                 f"{m.name}: {share:.1%} of the populations are beyond the runs, where the response "
-                f"may be that of specimens, expected at most {options.beyond:.1%}: got {place}; "
+                f"may be that of specimens, expected at most {beyond:.1%}: got {place}; "
                 f"{remedy}, or restrict the distribution of the inputs."
             )
             findings.append(Finding("beyond-runs", text, _PAGE))
@@ -100,15 +90,14 @@ def _relative_distance(surrogate: Surrogate, m: Measurement, columns: Floats) ->
     The unit is the 90 % quantile at the runs whose response is near the readings. An input with few
     different values, as in a grid, has their typical step as its unit.
     """
-    domain = surrogate.domain
-    values = surrogate.responses.reshape(len(surrogate.points), -1)
-    is_finite = np.isfinite(values).all(axis=1)
-    runs = domain.scaled(surrogate.points[is_finite])
+    usable = surrogate._surface.usable
+    runs = surrogate._surface.unit[usable]
+    values = surrogate.responses.reshape(len(usable), -1)[usable]
     steps = np.array([np.median(np.diff(np.unique(column))) for column in runs.T])
     tree = cKDTree(runs / steps)
-    is_near = near_readings(values[is_finite], m.readings)
+    is_near = near_readings(values, m.readings)
     between = tree.query(runs[is_near] / steps, k=2)[0][:, 1]
-    unit = np.clip(domain.scaled(columns), -9, 9)
+    unit = np.clip(surrogate.domain.scaled(columns), -9, 9)
     return np.asarray(tree.query(unit / steps)[0] / np.quantile(between, 0.9))
 
 

@@ -306,7 +306,7 @@ def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture
 @pytest.mark.parametrize("m", [1, 2])
 def test_a_change_beyond_the_ninth_digit_is_no_exact_constant(m: int) -> None:
     values = 1e12 + SIMULATED[:40, :m]
-    message = r"constant to nine digits: got a range of [\d.]+ at 40 runs near 1e\+12 .*subtract"
+    message = r"constant to nine digits: got 1e\+12 at all 40 runs .* range of [1-9].*subtract"
     with pytest.raises(DesignError, match=message) as by_metric:
         check_constant("y", values, ["a", "b"][: m if m > 1 else 0], True)
     with pytest.raises(DesignError, match=message) as by_specimen:
@@ -317,11 +317,11 @@ def test_a_change_beyond_the_ninth_digit_is_no_exact_constant(m: int) -> None:
 
 def test_constant_responses_that_are_stored_are_refused() -> None:
     message = (
-        r"y: the response is constant: got 1 at all 3 runs .*; check the .*, or take more runs"
+        r"y: the response is constant .* got 1 at all 3 runs .*; check the .*, or take more runs"
     )
     with pytest.raises(DesignError, match=message):
         check_constant("y", np.ones(3), [], True)
-    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant: got 0 at all 40 runs"):
+    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant .* got 0 at all 40 runs"):
         check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], 1), ["a", "b"], True)
     with pytest.raises(DesignError, match="at all 24 runs"):
         check_constant("y", np.where(np.arange(64) < 24, 5.0, np.nan), [], True)
