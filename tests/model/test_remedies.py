@@ -193,6 +193,9 @@ def test_a_metric_is_named_only_where_it_compares_the_same_readings(case: str) -
     runs, metric = remedies_of(likelihood)
     assert metric == (f"use metric={expected}" if expected else "")
     assert "prb.Reweighted(n)" in runs
+    assert "prb.Resimulated()" in runs
+    for propagation in (prb.Reweighted(512), prb.Resimulated()):
+        build(make, propagation=propagation)
     if expected:
         build(make, metric=eval(expected, {"prb": prb}))
 
