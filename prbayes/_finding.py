@@ -57,6 +57,12 @@ def counted(n: int, noun: str, plural: str = "") -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {plural or f'{noun}s'}"
 
 
+def any_of(*remedies: str) -> str:
+    """Return remedies as a text, "a, b, or c"; empty ones are left out."""
+    *first, last = [remedy for remedy in remedies if remedy] or [""]
+    return f"{', '.join(first)}, or {last}" if first else last
+
+
 def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
     """Log findings with the logger ``prbayes``, each record with its ``code``; return them."""
     for finding in findings:

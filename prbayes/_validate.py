@@ -295,7 +295,9 @@ def seed_number(random_seed: object, name: str = "random_seed") -> int:
             return int(random_seed.randint(2**32, dtype=np.uint32))
         case list() | tuple() | np.ndarray() if np.size(random_seed) > 0:
             whole = [positive_integer(x, name, minimum=0) for x in np.ravel(random_seed)]
-            return int(np.random.SeedSequence(whole).generate_state(1)[0])
+            # As in NumPy, a sequence of one number is the seed of this number.
+            several = np.random.SeedSequence(whole).generate_state(1)[0]
+            return int(several) if len(whole) > 1 else whole[0]
         case bool() | np.bool():
             pass
         case int() | np.integer():

@@ -125,7 +125,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 type Case = tuple[Callable[[], Any], type[Exception], str]
 UNSET = r"y: epsilon is not set; .*prb.calibrate_epsilon\(prb.minimize\(model\)\)"
-OTHER_ROUTE = r"; use propagation=prb.Reweighted\(\) or prb.Fresh\(\)"
+OTHER_ROUTE = r"; use propagation=prb\.Reweighted\(\)"
 BAD: dict[str, Case] = {
     # The measured responses.
     "observed huge": (

@@ -296,7 +296,10 @@ def two_calls() -> None:
         (lambda: as_in_pymc(HARDNESS, True), r"write hardness = prb.response.condition"),
         (named_expression, "expected an expression without a name"),
         (two_calls, "got two calls"),
-        (lambda: build(metric=prb.AreaMetric()), "use metric=prb.LogLikelihood"),
+        (
+            lambda: build(metric=prb.AreaMetric()),
+            "leave metric= out, for the log-likelihood by specimen",
+        ),
     ],
 )
 def test_other_forms_are_refused_with_the_remedy(make: Any, message: str) -> None:

@@ -374,6 +374,9 @@ def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:
     heavy["log_likelihood"]["y"][..., 3] = -np.random.default_rng(1).exponential(1.5, (2, 200))
     (finding,) = influence(heavy)
     assert finding.code == "influential-specimens"
+    diagnosis = prb.diagnose(heavy)
+    assert finding.code in {remark.code for remark in diagnosis.remarks}
+    assert finding.code not in {x.code for x in diagnosis.findings}
     assert "indices 3" in finding.text
 
 

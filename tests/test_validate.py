@@ -187,6 +187,7 @@ def test_every_seed_that_pymc_takes_becomes_an_integer() -> None:
     assert seed_number(3) == seed_number(np.int64(3)) == 3
     assert seed_number([1, 2]) == seed_number((1, 2)) == seed_number(np.array([1, 2]))
     assert seed_number([1, 2]) != seed_number([2, 1])
+    assert seed_number([3]) == seed_number(np.array([3])) == 3  # as in NumPy
     a, b = np.random.default_rng(5), np.random.default_rng(5)
     first = seed_number(a)
     assert first == seed_number(b) != seed_number(a)

@@ -410,7 +410,16 @@ class Surrogate(Shown):
         _refuse_unfit(name, values, min(needed))
         n_usable = _usable(values).sum()
         models = tuple(m for m, n in zip(models, needed, strict=True) if n <= n_usable)
-        surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
+        try:
+            surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
+        except np.linalg.LinAlgError:
+            names = column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs])
+            counts = dict(zip(names, [len(set(column)) for column in design.T], strict=True))
+            raise ValueError(
+                f"{name}: inputs: got runs that determine no surface, with numbers of different "
+                f"values {counts}, expected at least 3, and no input that follows from others; "
+                "make a table for each value of an input with two, or leave the input out"
+            ) from None
         spread = _spread(values[surfaces[0].usable])
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
         # The 90 % quantile is compared, because the largest residuals are those of the most extreme

@@ -22,6 +22,10 @@ MOST_OUTPUTS = 8
 LEFT_OUT = 0.01
 
 
+class FewSpecimensError(ValueError):
+    """Too few specimens for the covariance of their outputs."""
+
+
 @dataclass(frozen=True, eq=False)
 class Components:
     """Scores ``(y - center) @ axes`` of outputs y, and the variance that they leave out."""
@@ -182,11 +186,10 @@ def whitening(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats
     weights = weights / weights.sum()
     n, m = sample.shape
     if n < m + 2:
-        transposed = "" if n > max(m, 3) else "; rows are specimens: is it transposed?"
-        raise ValueError(
+        transposed = "" if n > max(m, 3) else " (rows are specimens: is it transposed?)"
+        raise FewSpecimensError(
             f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
-            f"expected at least {m + 2} for {m} outputs; leave outputs out, or leave metric= out, "
-            f"for the log-likelihood by specimen{transposed}"
+            f"expected at least {m + 2} for {m} outputs{transposed}; leave outputs out"
         )
     center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit

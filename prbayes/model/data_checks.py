@@ -8,7 +8,7 @@ nothing is wrong) and power is likelihood_guards, sections 2.6 to 2.9.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, any_of, report
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
 from prbayes.emulators.emulator import fit_emulator
@@ -149,15 +149,21 @@ def check_constant(
     for label, column in zip(output_labels(name, outputs), finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
-        text = (
-            f"{label}: the response is constant: got {column[0]:.6g} at all {len(finite)} runs "
-            "over the priors, expected one that depends on its inputs; check the response"
-        )
+        text = f"{label}: {_constant(column)}"
         if is_stored:
-            advice = "take more runs if it changes rarely"
-            raise DesignError(f"{text}, {advice}, or leave the output out")
+            leave = "leave the output out" if values.shape[1] > 1 else ""
+            raise DesignError(any_of(text, "take more runs if it changes rarely", leave))
         findings.append(Finding("constant-response", f"{text}."))
     return tuple(findings)
+
+
+def _constant(column: Floats) -> str:
+    """Return a text on an output that is the same in all runs, to nine digits."""
+    return (
+        f"the response is constant to nine digits: got {column[0]:.6g} at all {len(column)} runs "
+        f"over the priors, with a range of {np.ptp(column):.2g}, expected one that depends on its "
+        "inputs; check the response (subtract a large constant from it and from the readings)"
+    )
 
 
 def check_failing_region(
@@ -498,18 +504,16 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     for j, width in enumerate(high - low):
         if is_constant[j] and has_error[j]:
             continue
-        output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
+        output, leave = "the output", ""
+        if outputs.shape[1] > 1:
+            output, leave = f"output {j} of {outputs.shape[1]}", ", or leave the output out"
         if is_constant[j]:
-            raise DesignError(
-                f"{name}: the response is constant: got {high[j]:.6g} for {output} at all "
-                f"{len(finite)} runs, expected one that depends on its inputs; check the response, "
-                "or leave the output out"
-            )
+            raise DesignError(f"{name}: {output}: {_constant(finite[:, j])}{leave}")
         values = readings.values[np.isfinite(readings.values[:, j]), j]
         if not values.size and readings.is_censored[:, j].any():
             raise DesignError(
                 f"{name}: got no reading of {output} within the limits of censored=, expected at "
-                "least one; leave the output out, or check the limits"
+                f"least one; check the limits{leave}"
             )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():
@@ -521,30 +525,30 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
             )
 
 
-def unreached(outputs: Floats, readings: Readings) -> str:
-    """Return a sentence about readings outside the range of the runs; empty if most are inside."""
+def refuse_unreached(name: str, outputs: Floats, readings: Readings) -> None:
+    """Raise if the readings of most specimens are outside the range of the runs."""
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if not len(finite):
-        return ""
+        return
     with np.errstate(invalid="ignore"):
         outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
     count = int(outside.any(axis=1).sum())
     order = "the order of the outputs, " if finite.shape[1] > 1 else ""
     if 2 * count > len(readings):
-        return (
-            f"the readings of {count} of {len(readings)} specimens are outside the range of all "
-            f"runs over the priors: check {order}the response, the priors and the units, or pass "
-            "prb.LogLikelihood(error=...)"
-        )
+        error = "a larger error=" if (readings.error > 0).any() else "prb.LogLikelihood(error=...)"
+        raise DesignError(
+            f"{name}: the readings of {count} of {len(readings)} specimens are outside the range "
+            f"of all runs over the priors; check {order}the response, the priors and the units, or "
+            f"pass {error}"
+        ) from None
     for pair in combinations(range(finite.shape[1]), 2):
         count = _n_beyond(finite[:, pair], readings.values[:, pair])
         if 2 * count > len(readings):
-            return (
-                f"outputs {pair[0]} and {pair[1]} of {count} of {len(readings)} specimens are "
-                "outside the range of all runs over the priors together, although each is within "
-                "its own range: check the order of the outputs, the response and the priors"
-            )
-    return ""
+            raise DesignError(
+                f"{name}: outputs {pair[0]} and {pair[1]} of {count} of {len(readings)} specimens "
+                "are outside the range of all runs over the priors together, although each is "
+                "within its own range; check the order of the outputs, the response and the priors"
+            ) from None
 
 
 def _n_beyond(runs: Floats, readings: Floats) -> int:
@@ -676,7 +680,11 @@ def repeat_findings(name: str, repeats: Repeats, largest: float = 50.0) -> list[
 
 
 def emulator_findings(
-    name: str, readings: Readings, error: Floats, largest: float = 0.03
+    name: str,
+    readings: Readings,
+    error: Floats,
+    remedies: Callable[[], tuple[str, str]],
+    largest: float = 0.03,
 ) -> list[Finding]:
     """Report an emulator whose error, (m,), is not small beside the scatter of the readings.
 
@@ -692,8 +700,7 @@ def emulator_findings(
             f"{name}: the emulator's error is up to {share.max():.2g} standard deviations of the "
             f"readings, expected at most {largest}: the response has a pole, a jump or a kink "
             "in the range of the priors, or more detail than the runs; posterior means may be off "
-            "by more than .1 standard deviations. Narrow the priors, give more first runs with "
-            "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual().",
+            f"by more than .1 standard deviations: {any_of('narrow the priors', *remedies())}.",
             "likelihood.md#emulator-error",
         )
     ]

@@ -49,6 +49,7 @@ class Measurement:
     # Conditions on which the population of a specimen depends, as values (N,) by name.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
+    at_conditions: bool = False  # whether outputs are readings at values of a vector condition
     # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 

@@ -30,10 +30,12 @@ from prbayes._validate import (
     texts,
 )
 from prbayes.emulators.runs import Runs
+from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import SummaryLikelihood
+from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
@@ -50,6 +52,13 @@ from prbayes.model.random_variable import (
     shared_epsilon,
     simulators,
 )
+from prbayes.model.remedies import (
+    PROPAGATIONS,
+    advised,
+    check_propagation,
+    other_metric,
+    scatter_advice,
+)
 from prbayes.model.specimen_likelihood import (
     SpecimenRV,
     measurements_of,
@@ -57,7 +66,7 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.response.condition import refuse_vectors_of_specimens
+from prbayes.response.condition import ReadingsCondition, refuse_vectors_of_specimens
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -209,7 +218,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
-    arguments = _Arguments(name, model, response, variables, data, settings, epsilon, progressbar)
+    of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)
+    arguments = _Arguments(
+        name, model, response, variables, data, settings, epsilon, progressbar, of_readings
+    )
     metric = LogLikelihood() if metric is None else metric
     if isinstance(metric, Metric) and metric.by_specimen:
         return _add_measurement(arguments, cast(LogLikelihood, metric))
@@ -228,6 +240,15 @@ class _Arguments:
     propagation: Propagation
     epsilon: float | None
     progressbar: bool
+    at_conditions: bool  # whether outputs are readings at values of a vector condition
+
+    def other_metric(self) -> str:
+        """Return advice to use a metric of distributions that the simulator accepts, or none."""
+        if self.at_conditions:
+            return ""
+        is_random = self.propagation.is_random
+        propagations = [self.propagation] if is_random else PROPAGATIONS
+        return other_metric(self.name, self.inputs, self.data.values, AreaMetric(), propagations)
 
     def responses(self, name: str, inputs: Inputs, scatter: float | None) -> Responses:
         """Return the response of inputs, and how the propagation calls it."""
@@ -323,10 +344,10 @@ def _with_units(
 def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVariable:
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
     name, model, data = arguments.name, arguments.model, arguments.data
-    _refuse_by_specimen(name, arguments.inputs, arguments.epsilon, arguments.propagation)
+    _refuse_by_specimen(arguments)
     if data.rows is not None:
         metric = metric.of_frequencies(data.rows, data.n_rows)
-    values = _checked_specimens(name, data.values, data.outputs)
+    values = _checked_specimens(arguments)
     arguments.propagation.check_likelihood(name)
     partners = _with_common_specimens(name, data.labels, model)
     inputs = _inputs_of_partners(name, arguments.inputs, partners)
@@ -349,6 +370,7 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
         data.groups,
         data.known_values(inputs.covariates),
         stacked_values(conditions),
+        arguments.at_conditions,
         _measurement_variables(name, model, metric, partners),
     )
     likelihood = _joint_likelihood(measurement, partners, model)
@@ -491,42 +513,62 @@ def _measurement_variables(
     return extras
 
 
-def _refuse_by_specimen(
-    name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation
-) -> None:
-    """Raise if the log-likelihood by specimen does not apply, and name a metric that does."""
-    remedy = "use metric=prb.AreaMetric()"
-    if epsilon is not None:
+def _refuse_by_specimen(arguments: _Arguments) -> None:
+    """Raise if the log-likelihood by specimen does not apply, and name what the model accepts."""
+    name, propagation = arguments.name, arguments.propagation
+    if arguments.epsilon is not None:
         raise ValueError(
-            f"{name}: epsilon: got {epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
-            "and has no scale to choose; leave epsilon= out"
+            f"{name}: epsilon: got {arguments.epsilon!r}, expected none: prb.LogLikelihood() is a "
+            "likelihood and has no scale to choose; leave epsilon= out"
         )
+    try:
+        _refuse_inputs(name, arguments.inputs, len(arguments.data))
+    except TypeError as error:
+        text, leave = str(error), ""
+    else:
+        text, leave = "", "leave propagation= out, with random scatter of the response as an input"
     if propagation.is_random:
-        raise TypeError(
+        text = (
             f"{name}: propagation: got {called(propagation)}, expected stored responses of a "
-            f"deterministic response for prb.LogLikelihood(); {remedy}, or leave propagation= out"
+            "deterministic response for prb.LogLikelihood()"
         )
-    if inputs.epistemic:
-        names = ", ".join(str(e.name or e) for e in inputs.epistemic)
-        raise TypeError(
-            f"{name}: got {names}, which goes into the response as a model variable, expected "
-            "aleatory inputs and constants for prb.LogLikelihood(); let it scatter a little, as in "
-            "pm.Normal.dist(c, 0.01) with a known scatter, or use metric=prb.ProbabilityResidual() "
-            "with propagation=prb.Resimulated()"
-        )
+        raise TypeError(advised(text, arguments.other_metric(), leave))
+    if text:
+        raise TypeError(advised(text, arguments.other_metric()))
+
+
+def _likelihood_advice(arguments: _Arguments) -> str:
+    """Return advice to use the log-likelihood by specimen if the simulator accepts it."""
+    try:
+        _refuse_by_specimen(arguments)
+    except (TypeError, ValueError):
+        return ""
+    return "leave metric= out, for the log-likelihood by specimen"
+
+
+def _refuse_inputs(name: str, inputs: Inputs, specimens: int) -> None:
+    """Raise TypeError for inputs without a density that varies between specimens."""
     discrete = [x for x in inputs.aleatory if not x.dtype.startswith("float")]
     if discrete:
         raise TypeError(
             f"{name}: got {discrete[0].owner.op}, which is discrete, expected continuous inputs "
-            f"for prb.LogLikelihood(); {remedy}"
+            "for prb.LogLikelihood()"
         )
     refuse_nested(name, inputs)
     refuse_without_density(name, inputs)
+    if inputs.epistemic:
+        names = ", ".join(str(e.name or e) for e in inputs.epistemic)
+        raise TypeError(
+            f"{name}: got {names}, which goes into the response as a model variable, expected "
+            "aleatory inputs and constants for prb.LogLikelihood(); "
+            f"{scatter_advice(inputs, specimens)}"
+        )
 
 
-def _checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
+def _checked_specimens(arguments: _Arguments) -> Floats:
     """Return measured outputs, (N,) or (N, m), of at least two specimens."""
-    values = np.asarray(observed, dtype=np.float64)
+    name, outputs = arguments.name, arguments.data.outputs
+    values = np.asarray(arguments.data.values, dtype=np.float64)
     if values.ndim not in (1, 2) or len(values) < 2:
         raise ValueError(
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
@@ -547,10 +589,10 @@ def _checked_specimens(name: str, observed: Floats, outputs: Outputs) -> Floats:
             "one; leave the output out, here and in the response or its condition"
         )
     if np.isinf(rows).any():
-        raise ValueError(
-            f"{name}: observed: got infinite values, expected finite ones for prb.LogLikelihood(); "
-            "use metric=prb.AreaMetric(), which counts specimens that failed"
+        text = (
+            f"{name}: observed: got infinite values, expected finite ones for prb.LogLikelihood()"
         )
+        raise ValueError(advised(text, "leave these specimens out", arguments.other_metric()))
     refuse_huge(rows, f"{name}: observed")
     return values
 
@@ -564,12 +606,16 @@ def _add_by_metric(
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
     if inputs.covariates:
-        raise TypeError(
+        text = (
             f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "
-            "expected one population, as a metric compares distributions; use "
-            "metric=prb.LogLikelihood(), or prb.response.group for few different values"
+            "expected one population, as a metric compares distributions; use prb.response.group "
+            "for few different values"
         )
-    target = _prepared_metric(name, metric, data.values, data.weights)
+        raise TypeError(advised(text, _likelihood_advice(arguments)))
+    try:
+        target = _prepared_metric(name, metric, data.values, data.weights)
+    except FewSpecimensError as error:
+        raise ValueError(advised(str(error), _likelihood_advice(arguments))) from None
     if data.labels is not None:
         _refuse_ambiguous_labels(name, data.labels, list(simulators(model).values()))
     if arguments.epsilon is not None:
@@ -610,7 +656,7 @@ def _add_specification(
     name, target, labels = specification.name, specification.target, specification.specimens
     responses, inputs = specification.responses, specification.responses.inputs
     earlier = list(simulators(model).values())
-    specification.propagation.check_simulator(name, inputs, target)
+    check_propagation(name, specification.propagation, inputs, target)
     for simulator in earlier:
         has_same_propagation = simulator.propagation == specification.propagation
         if has_same_propagation and responses.same_as(simulator.responses):

@@ -27,9 +27,9 @@ from prbayes.model.data_checks import (
     outlier_findings,
     output_labels,
     refuse_unreachable,
+    refuse_unreached,
     refuse_unused_inputs,
     repeat_findings,
-    unreached,
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
@@ -38,6 +38,8 @@ from prbayes.model.measurement import (
 )
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
 from prbayes.model.random_variable import log_first_runs
+from prbayes.model.remedies import remedies_of
+from prbayes.model.run_coverage import coverage_findings
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -176,13 +178,11 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if likelihood.has_table:
             raise
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
-        cause = unreached(outputs, likelihood.readings)
-        if not cause and runs.outputs:
-            # The first runs are checked alone, because later runs may be far from the priors.
-            cause = unreached(runs.outputs[0], likelihood.readings)
-        if not cause:
-            checked = _data_findings(likelihood, outputs, several_roots=False)
-            cause = "".join(finding.text.removesuffix(".") for finding in checked[:1])
+        # The first runs are checked alone as well, because later runs may be far from the priors.
+        for of_runs in (outputs, *runs.outputs[:1]):
+            refuse_unreached(likelihood.name, of_runs, likelihood.readings)
+        checked = _data_findings(likelihood, outputs, several_roots=False)
+        cause = "".join(finding.text.removesuffix(".") for finding in checked[:1])
         raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
         for response in responses:
@@ -280,6 +280,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
             for label in output_labels(m.name, m.outputs.names)
         ),
         labels=specimen_labels(likelihood),
+        remedies=partial(remedies_of, likelihood),
     )
 
 
@@ -303,7 +304,8 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
     findings = (
         *_data_findings(likelihood, emulation.y, several_roots=several_roots),
         *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
-        *emulator_findings(name, readings, error),
+        *emulator_findings(name, readings, error, data.remedies),
+        *coverage_findings(likelihood, data, points, draws.specimens()),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 

@@ -24,6 +24,7 @@ from prbayes.model.evaluator import (
     shortcomings,
 )
 from prbayes.model.parameters import THETAS
+from prbayes.model.remedies import accepts
 from prbayes.optimize.convergence import (
     OVERLAP,
     OVERLAP_ENOUGH,
@@ -37,6 +38,7 @@ from prbayes.optimize.convergence import (
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError, refuse_lost_share, valid_parents
 from prbayes.propagation.importance import SIZES
+from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
@@ -432,6 +434,8 @@ def refuse(
     name, reason = next(iter(short.items()))
     suffix = f" (and {len(short) - 1} more)" if len(short) > 1 else ""
     bound = evaluator.reweighted[name]
+    is_accepted = accepts(name, Resimulated(), bound.inputs, bound.target)
+    resimulated = ", or use prb.Resimulated(n)" if is_accepted else ""
     cause, advice = "the design does not support the answer", "narrow the priors"
     if unidentified:
         cause += (
@@ -440,7 +444,7 @@ def refuse(
         advice = "narrow these priors, measure more outputs or conditions"
     raise DesignError(
         f"{name}{suffix}: {cause}: {advice}, pass a larger prb.Reweighted(n) (now {bound.n_runs} "
-        f"runs, of at most {bound.config.most}), or use prb.Resimulated(n); got {reason}"
+        f"runs, of at most {bound.config.most}){resimulated}; got {reason}"
     )
 
 

@@ -326,8 +326,7 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
     if inputs.nested:
         raise TypeError(
             f"{name}: an input is a `.dist()` that depends on another `.dist()`; its density "
-            "is not that of independent inputs; use one multivariate distribution, "
-            "or propagation=prb.Fresh()"
+            "is not that of independent inputs; use one multivariate distribution"
         )
 
 

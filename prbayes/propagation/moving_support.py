@@ -69,8 +69,7 @@ def _refuse_unaverageable(name: str, dist: TensorVariable) -> None:
     except (NotImplementedError, TypeError, ValueError):
         raise TypeError(
             f"{refused}one whose distribution function PyMC knows, since the weights of stored "
-            "responses jump where an edge passes them; use propagation=prb.Resimulated() or "
-            "prb.Fresh()"
+            "responses jump where an edge passes them; use propagation=prb.Fresh()"
         ) from None
     if isinstance(dist.owner.op, CensoredRV):
         raise TypeError(_moving_atoms(name, dist, "bounds"))
@@ -80,7 +79,7 @@ def _moving_atoms(name: str, dist: TensorVariable, what: str) -> str:
     return (
         f"{name}: got {dist.owner.op} with {what} that move with its hyperparameters and have "
         f"probability themselves, which no stored point has at other hyperparameters, expected "
-        f"{what} that stay; use propagation=prb.Resimulated() or prb.Fresh()"
+        f"{what} that stay; use propagation=prb.Fresh()"
     )
 
 

@@ -77,10 +77,11 @@ class ResponseOp(OwnOp):
         if responses.outputs is not None:
             self.event_shape = responses.outputs.event
         self.event_ndims = responses.inputs.event_ndims
+        # Stored responses have no inputs that are common to all specimens.
+        stored = "" if responses.inputs.epistemic else "propagation=prb.Reweighted(), or "
         self.no_gradient = (
             f"{responses.name}: the response does not accept PyTensor variables, so it has no "
-            "gradient under prb.Resimulated; use propagation=prb.Reweighted(), or prb.sample_smc, "
-            "which needs none"
+            f"gradient under prb.Resimulated; use {stored}prb.sample_smc, which needs none"
         )
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:

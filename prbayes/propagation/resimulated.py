@@ -91,11 +91,13 @@ class Resimulated(Propagation):
         per_observation = target.metric.tail_responses
         enough = per_observation * target.n_effective
         if self.n < enough:
+            # Stored responses have no inputs that are common to all specimens.
+            stored = "" if inputs.epistemic else "prb.Reweighted(n), "
             text = (
                 f"{name}: got {self.n} resimulated responses for a log-likelihood, expected at "
                 f"least {enough:.0f}, {per_observation} for each observation: the tails are "
                 "undersampled, and the standard errors and the posterior are too narrow; use "
-                "prb.Reweighted(n), prb.KullbackLeibler() or a larger n."
+                f"{stored}prb.KullbackLeibler() or a larger n."
             )
             report(Finding("few-responses", text, "choose.md#how-many-responses"))
         for dist, u in zip(inputs.aleatory, self.base_points(inputs), strict=True):

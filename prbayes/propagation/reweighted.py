@@ -170,12 +170,11 @@ class Reweighted(Propagation):
             if not any(above in inputs.parents for above in ancestors(inputs.epistemic)):
                 raise TypeError(
                     f"{name}: {names} goes into the response as data whose value may change, while "
-                    "responses are stored; pass the value itself, such as "
-                    f"{labels[0]}.get_value(), or use propagation=prb.Resimulated()"
+                    f"responses are stored; pass the value itself, such as {labels[0]}.get_value()"
                 )
             raise TypeError(
                 f"{name}: {names} goes into the response as a model variable (epistemic), so "
-                "stored responses cannot be reweighted; use propagation=prb.Resimulated()"
+                "stored responses cannot be reweighted"
             )
         refuse_nested(name, inputs)
         refuse_without_density(name, inputs)
@@ -183,7 +182,7 @@ class Reweighted(Propagation):
             raise TypeError(
                 f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; "
                 "in a FunctionMetric write function(simulated, observed, weights) with "
-                "weighted=True, or use propagation=prb.Resimulated()"
+                "weighted=True"
             )
         is_custom = self.emulator is not None and not isinstance(self.emulator, str)
         if is_custom and not self.emulates(inputs):
@@ -201,8 +200,8 @@ class Reweighted(Propagation):
             if value != default:
                 raise TypeError(
                     f"{name}: propagation: got Reweighted({option}={value!r}), which "
-                    "prb.LogLikelihood() does not use, as it has its own emulator; use "
-                    f"metric=prb.ProbabilityResidual(), or leave {option}= out"
+                    "prb.LogLikelihood() does not use, as it has its own emulator; leave "
+                    f"{option}= out"
                 )
 
     def emulates(self, inputs: Inputs) -> bool:

@@ -297,6 +297,11 @@ def checked(
                 len(event) == 1 and not expected
             ):  # a curve of one specimen was observed as specimens
                 remedy += f"; {NO_POPULATION}"
+            if event and expected:
+                remedy = (
+                    "return as many outputs as observed= has columns; its rows are specimens, so "
+                    f"transpose it if it has {event[0]} rows"
+                )
             if not event and expected:
                 remedy = "return outputs along a last axis, or as a mapping"
                 if expected == (1,):
@@ -333,9 +338,8 @@ def refuse_negative_infinity(values: Floats) -> None:
 
 # Advice for a response that contains an array with a value for each measured specimen.
 PER_SPECIMEN = (
-    "a value that is known for each specimen, such as its load, is no constant: make it an input "
-    "with a distribution, such as pm.Uniform.dist(1, 2), return it as an output beside the "
-    "response, and observe both"
+    "a value that is known for each specimen, such as its load, is no constant: pass it as "
+    "prb.response.condition('load', values), with the default metric"
 )
 
 

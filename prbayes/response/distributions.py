@@ -143,9 +143,8 @@ def _scalar_if_infinite(end: TensorVariable) -> Any:
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     """Return the inverse distribution function of ``dist`` at u, (n, *event), or raise."""
     op = dist.owner.op
-    advice = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {advice}")
+        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one")
     if isinstance(op, MVNORMAL):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
@@ -158,7 +157,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     except NotImplementedError:
         raise TypeError(
             f"{name}: got {op}, which has no inverse distribution function in PyMC, expected one "
-            f"that has; {advice}"
+            "that has"
         ) from None
 
 
@@ -183,8 +182,7 @@ def refuse_without_density(name: str, inputs: Inputs) -> None:
         if not isinstance(dist.owner.op, ELLIPTICAL) and _density(dist) is None:
             raise TypeError(
                 f"{name}: got {dist.owner.op}, for which PyMC has no density, expected one, since "
-                "stored responses are weighted by it; give a pm.CustomDist its logp=, or use "
-                "propagation=prb.Fresh()"
+                "stored responses are weighted by it; give a pm.CustomDist its logp="
             )
 
 

@@ -512,7 +512,7 @@ def _read_answer(name: str, path: str, status: int, text: str) -> list[Any]:
         except (ValueError, RecursionError):
             pass
     error = answer.get("error") if isinstance(answer, dict) else None
-    if error is not None:
+    if error:  # servers may send an empty text, or false, beside a result
         if isinstance(error, dict):
             error = f"{error.get('type')}: {error.get('message')}"
         # JSON may contain lone surrogates, which no file or terminal accepts.

@@ -307,7 +307,8 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
 
     Without a model, evaluator and thetas are None.
     """
-    checked = Checked(findings=influence(result))
+    # Pareto k is about az.loo, not about the draws.
+    checked = Checked(remarks=influence(result))
     if evaluator is None or thetas is None:
         both = f"{_FAMILY} and the conflict of prior and data were not tested"
         return checked + Checked(untested=(f"{both}: that needs the model; pass model=.",))

@@ -18,18 +18,20 @@ class Coordinates:
     """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1]."""
 
     shapes: tuple[tuple[int, ...], ...]  # event shape of each aleatory input
-    # (d,): logarithms are positive inputs whose prior spans more than a factor of ten.
+    # (d,): whether z is linear in the logarithm of the input: for positive inputs whose prior spans
+    # more than a factor of ten.
     is_log: NDArray[np.bool_]
-    # Of the prior range, which has 99 % of the specimens of the prior predictive population.
-    center: Floats  # (d,)
-    half_width: Floats  # (d,)
+    # (d,): middle of the prior range, which has 99 % of the specimens of the prior predictive
+    # population
+    center: Floats
+    half_width: Floats  # (d,): half the width of that range
     # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
     # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
     # (2, d): ends of the range of inputs between zero and one whose density may be infinite there;
     # infinite numbers for other inputs.
     ends: Floats
-    is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
+    is_condition: NDArray[np.bool_]  # (d,): whether the value is known for each specimen
 
     @classmethod
     def of_prior(
@@ -113,7 +115,7 @@ class Coordinates:
         return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
 
     def log_jacobian(self, z: Floats) -> Floats:
-        """Return log|dx/dz|, (..., d) -> (...), of all inputs but conditions."""
+        """Return log|dx/dz|, (..., d) -> (...), of all inputs that are no conditions."""
         is_log = self.is_log & ~self.is_condition
         logs = np.where(is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
         return np.asarray(logs + np.log(self.half_width[~self.is_condition]).sum())
@@ -121,5 +123,5 @@ class Coordinates:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _logs(flat: Floats, is_log: NDArray[np.bool_]) -> Floats:
-    """Return inputs (..., d), the logarithms of some; NaN of negative values."""
+    """Return inputs (..., d), with the logarithm of those selected; NaN for negative values."""
     return np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
+from prbayes._finding import any_of
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
@@ -36,7 +37,7 @@ from prbayes.specimens.weighted_points import fit_normal
 
 
 def first_runs(dimensions: int) -> int:
-    """Return the number of runs that an emulator of so many inputs starts from."""
+    """Return the default number of first runs for an emulator of so many inputs."""
     return 6 * dimensions + 4
 
 
@@ -50,7 +51,7 @@ type Run = Callable[[Floats], Floats]
 
 
 def first_emulation(run: Run, data: SpecimenData) -> Emulation:
-    """Return the emulation through first runs, half as wide again as the prior's population."""
+    """Return the emulation through first runs, 1.5 times as wide as the prior's population."""
     d = data.known.shape[1]
     n = data.options.n_first or first_runs(d)
     u = sobol(n, d, data.seed)
@@ -60,7 +61,8 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
     low, high = data.prior.min(axis=0), data.prior.max(axis=0)
     z = np.clip(z, low, high)
     conditions = np.flatnonzero(~np.isnan(data.known[0]))
-    for place, column in enumerate(conditions):  # conditions: those of the specimens
+    # Runs have the conditions of the specimens.
+    for place, column in enumerate(conditions):
         values = np.quantile(data.known[:, column], u[:, len(data.free) + place])
         z[:, column] = values
     y = run(z)
@@ -82,12 +84,13 @@ class Likely:
     proposals: Proposals
     points: SpecimenPoints
     population: Normal
-    weights: Floats  # (N, K)
+    weights: Floats  # (N, K): weights of the points of each specimen, of sum one
 
     @classmethod
     def of(cls, data: SpecimenData, emulation: Emulation, population: Normal, seed: int) -> Likely:
         """Return likely inputs under the population that fits them."""
-        # Twice as wide: the population of the last round may have been too narrow.
+        # The reference is twice as wide, because the population of the last round may have been
+        # too narrow.
         wide = Normal(population.mean, 2.0 * population.root)
         proposals = fit_proposals(data, emulation, wide)
         count = max(8 * proposals.modes.table.shape[1], 64 if proposals.is_open() else 0)
@@ -99,12 +102,14 @@ class Likely:
             has_point &= typical_specimens(proposals.modes, len(has_point))
         has_several = np.bincount(proposals.modes.specimen) > 1
         if has_several.mean() > 0.1 and not proposals.is_open(scale):
-            # The prior decides which of several roots are those of one population.
+            # If specimens have several roots, the prior decides which of them form a population,
+            # so that the population follows from posterior draws.
             draws = data.posterior(points.z, points.log_a, None)
             population = normal_of(draws.specimens()[:, data.free])
             return cls(proposals, points, population, likely_weights(data, points, population))
         z = points.z[has_point][..., data.free]
-        # A few steps of EM: along inputs that the readings leave open a fit would collapse.
+        # Along inputs that the readings leave open, a fit that converges would collapse to a point:
+        # a few steps of EM from the last population do not.
         start = None if not proposals.is_open(scale) else population
         population = Normal(*fit_normal(z, points.log_a[has_point], start))
         return cls(proposals, points, population, likely_weights(data, points, population))
@@ -119,7 +124,7 @@ class Likely:
     def sample(
         self, count: int, rng: np.random.Generator, weights: Floats | None = None
     ) -> tuple[Floats, NDArray[np.intp]]:
-        """Return likely inputs, (count, d), and their specimens; different specimens first."""
+        """Return likely inputs, (count, d), and their specimens, which repeat only beyond N."""
         weights = self.weights if weights is None else weights
         n = len(weights)
         specimens = np.concatenate([rng.permutation(n) for _ in range(-(-count // n))])[:count]
@@ -128,11 +133,11 @@ class Likely:
         return self.points.z[specimens, places], specimens
 
     def scale(self, data: SpecimenData) -> Floats:
-        """Return the unit of distances between inputs, (d,): the population's deviation."""
+        """Return the unit of distances, (d,): the population's standard deviation of each input."""
         return data.scale(np.sqrt((self.population.root**2).sum(axis=1)))
 
     def is_known(self, largest: float = 0.3) -> bool:
-        """Return whether the inputs of each specimen are in one place, beside the population."""
+        """Return whether likely inputs of each specimen scatter less than the population."""
         residuals = self.proposals.residuals
         a = residuals.whitened(self.points.z)
         weights = self.weights[:, :, None]
@@ -168,9 +173,9 @@ def emulate(
     rng = np.random.default_rng([data.seed, 1])
     has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
     enough_further = 1 if has_fewer_readings else 2
-    # An emulator of other data needs one batch, which measures its error at these.
+    # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
-    further = 0  # batches after the bias was small
+    further = 0  # number of batches since the bias was small
     plausible = None
     if previous is not None:
         emulation = replace(emulation, bias=np.inf, offsets=None)
@@ -188,12 +193,12 @@ def emulate(
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
             plausible = Plausible.of(data, emulation, wider(population), plausible)
             before = emulation.surface
-            # Where the audit fails, the next batch is at the same inputs.
+            # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
             is_good = emulation.bias <= 1.5 * data.options.bias
             if is_good and emulation.surface is not before:
-                # Another population may be the likely one by the new surface.
+                # The audit's runs changed the surface, so that another population may be likely.
                 earlier = plausible
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
@@ -211,7 +216,8 @@ def emulate(
                 require_accurate(data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population))
             return emulation, *plausible.agreeing(data), plausible.draws
-        # Batches of half the runs there are, a quarter near the end; at most three times the first.
+        # A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and
+        # at most three times the first runs.
         share = 2 if emulation.bias > 3 * data.options.bias else 4
         growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
         count = max(data.options.sampled + 2, growth if previous is None else 0)
@@ -239,7 +245,8 @@ def extended(
     sampled, specimens = likely.sample(n_sampled, rng)
     possible = likely.possible(data, n_possible, rng)
     scale = likely.scale(data)
-    # Specimens near the likely ones, and others of the population: the emulator predicts them.
+    # Candidates for runs far from all others are inputs beside the likely ones, and specimens of
+    # the whole population, because the emulator predicts both.
     near, _ = likely.sample(8 * count, rng)
     of_population = near.repeat(4, axis=0)
     noise = rng.standard_normal((len(near), len(data.free)))
@@ -252,7 +259,7 @@ def extended(
     prior[:, is_condition] = of_specimens[:, is_condition]
     of_prior = data.scale(data.inner[:, data.free].std(axis=0))
     runs = np.concatenate([emulation.z, sampled, possible])
-    # Where specimens have few inputs, there are runs at them already.
+    # Likely inputs may have a run already, so that only the new ones count.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
     far = _farthest(runs, near, max(0, count - n_explored - n_new - 3), scale)
     uncertain = _explored(data, emulation, runs, of_population, 3, scale)
@@ -307,7 +314,7 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
 
 
 def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
-    """Return which points (k, d) are at the place of no run and of no point before them, (k,)."""
+    """Return which points (k, d) coincide with no run and with no earlier point, (k,)."""
     cells = np.round(np.concatenate([runs, z]) / (1e-4 * scale))
     _, first = np.unique(cells, axis=0, return_index=True)
     is_first = np.zeros(len(cells), dtype=bool)
@@ -318,7 +325,7 @@ def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
 def _compared(
     run: Run, emulation: Emulation, z: Floats, is_new: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
-    """Return outputs at new points, and misfits, (k, m), of the emulator: none at old ones."""
+    """Return outputs at new points, and the emulator's misfits, (k, m): zero at old points."""
     misfit = np.zeros((len(z), emulation.y.shape[1]))
     outputs = run(z[is_new]) if is_new.any() else misfit[:0]
     misfit[is_new] = outputs - emulation.surface.values(z[is_new])
@@ -368,11 +375,12 @@ def error_and_bias(
     gain = np.linalg.solve(hessian, slopes.swapaxes(1, 2))
     shift = -np.einsum("kdm,km->kd", gain, relative[0])
     bias = np.abs(predicted_bias(shift, a, len(data.readings))).max()
-    # m readings identify m of d directions; the posterior is wider than the formula assumes.
+    # With fewer readings than inputs the posterior is wider than the formula for the bias assumes,
+    # because m readings identify only m of d directions.
     of_each = data.readings.is_measured.sum(axis=1).mean()
     bias *= np.sqrt(min(1.0, of_each / a.shape[1]))
-    # The comparison allows the error at each specimen; what the runs have overestimated of it is
-    # missing in the population's variance.
+    # The error is part of the comparison at each specimen. If it is overestimated, it takes a part
+    # of the scatter, so that the population is too narrow.
     by_error = gain * relative[1][:, None]
     narrowing = np.sqrt(len(data.readings) / 2) * (by_error**2).sum(axis=2).mean(axis=0).max()
     return error, float(max(bias, narrowing))
@@ -400,9 +408,10 @@ def _with_bias_at_ends(
 
     by_emulator = input_sd(np.where(data.readings.is_measured, emulation.error, np.inf))
     by_all = input_sd(data.readings.comparison_sd(emulation.error))
-    # Errors of readings smooth the density, so that the error of the emulator is small beside them.
+    # Errors of readings smooth the density near the end, so that the emulator's error is compared
+    # with them as well as with the distance.
     by_readings = np.sqrt(np.maximum(by_all**2 - by_emulator**2, 0.0))
-    # The input may be nearer to the end by three standard deviations.
+    # The distance is reduced by three standard deviations, because the input is not known exactly.
     distance = np.minimum(z - data.ends[0], data.ends[1] - z)[:, data.free] - 3 * by_emulator
     share = by_emulator / np.maximum(np.maximum(distance, by_readings), 1e-300)
     share = np.clip(share, 0.0, 3.0)
@@ -425,7 +434,7 @@ def _near_population(
 
 
 def _farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Floats:
-    """Return candidates, (count, d), each far from all runs and from those before."""
+    """Return candidates, (count, d), each the farthest from the runs and from earlier ones."""
     squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
     return candidates[farthest_rows(candidates / scale, count, squares)]
 
@@ -438,7 +447,8 @@ def _explored(
     They are far from all runs.
     """
     readings, spread = data.readings, data.readings.spread()
-    # What the emulator says of a place without runs may be wrong: its own deviation counts.
+    # Far from runs the emulator's outputs may be wrong, so that outputs within three of its
+    # predictive standard deviations count as possible.
     error = np.sqrt(emulation.surface.variance(z))
     deviation = spread + 3 * error
     values = emulation.surface.values(z)
@@ -467,7 +477,8 @@ def audited(
     """
     sampled, specimens = likely.sample(data.options.sampled // 2, rng)
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
-    # Half of the runs are among the quarter of them at which the emulator is the least certain.
+    # Half of the runs are drawn from the quarter of the candidates with the largest predictive
+    # variance.
     deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
     order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
     rows = rng.permutation(order)[: len(sampled)]
@@ -486,7 +497,8 @@ def audited(
     bias = max(bias, emulation.bias)
     pooled = data.readings.relative_error
     if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
-        # Eight runs may miss where the emulator is wrong: halfway between both, in logarithms.
+        # Eight runs may miss the places where the emulator is wrong, so that the new error is the
+        # geometric mean of the stated and the measured one.
         measured = np.sqrt(((error / emulation.error) ** 2).mean())
         error = np.sqrt(min(measured, 1.0)) * emulation.error
         emulation = replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
@@ -498,7 +510,7 @@ def audited(
     if bias <= 1.5 * data.options.bias:
         at_audited = left_out[len(emulation.z) :][: is_new[: len(specimens)].sum()]
         error = _improved(data, error, at_audited)
-    else:  # specimens may be elsewhere
+    else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)
     return _with_bias_at_ends(data, Emulation(all_z, all_y, surface, error, bias), likely)
 
@@ -509,7 +521,7 @@ def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) ->
 
 
 def most_corrections(specimens: int, dimensions: int) -> int:
-    """Return the largest number of runs of corrections: three of each of not too many specimens."""
+    """Return the largest number of runs of corrections: three a specimen, none for many."""
     return 3 * specimens if 2 * specimens <= most_runs(dimensions) else 0
 
 
@@ -560,11 +572,11 @@ def require_accurate(data: SpecimenData, emulation: Emulation, likely: Likely) -
     specimen = int(np.argmax(np.where(is_read, variance, -1.0)))
     name = data.output_names[output] if data.output_names else data.name
     label = specimen if data.labels is None else data.labels[specimen]
+    more_runs, other_metric = data.remedies()
     raise DesignError(
         f"{data.name}: the response is not smooth enough for prb.LogLikelihood(): got an emulator "
         f"of {len(emulation.z)} runs whose error of {name} is {share[output]:.2g} times the "
         f"scatter, the largest at specimen {label}, and would shift an estimate by "
         f"{emulation.bias:.2g} posterior standard deviations, expected at most "
-        f"{data.options.bias}; narrow the priors, ask for more first runs with prb.Reweighted(n), "
-        "or use metric=prb.ProbabilityResidual()"
+        f"{data.options.bias}; {any_of('narrow the priors', more_runs, other_metric)}"
     )

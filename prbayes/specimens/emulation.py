@@ -37,18 +37,18 @@ class Surface(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class CompressedSurface:
-    """A surface of outputs whose logarithms grow far from the data.
+    """A surface through outputs that are compressed like logarithms far from the data.
 
     A response that is steep outside the data would take the digits that outputs near them need. The
     surface is that of arcsinh((y - center) / unit).
     """
 
     surface: Emulator
-    center: Floats  # (m,)
-    unit: Floats  # (m,)
+    center: Floats  # (m,): mean of the readings of each output
+    unit: Floats  # (m,): scale of each output, within which the surface is nearly linear in it
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
-        """Return outputs, (n, m), of values of the surface."""
+        """Return outputs, (n, m), from values of the compressed surface."""
         inside = np.clip(u, -100, 100)
         scaled = self.unit[columns] * np.sinh(inside)
         return np.asarray(self.center[columns] + scaled)
@@ -75,7 +75,7 @@ class DifferencedResponse:
     """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
 
     values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
-    step: float = 1e-5  # in units of the coordinates
+    step: float = 1e-5  # step of the differences, in units of the coordinates
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
@@ -110,9 +110,10 @@ class Emulation:
     error: Floats
     # Predicted bias of a mean or standard deviation of an input, in posterior standard deviations.
     bias: float
-    # (2, d): ends beyond which a specimen has the response at the end; by default of the runs.
+    # (2, d): ends of the emulator's range, by default those of the runs. Beyond an end a specimen
+    # has the response at the end.
     ends: Floats | None = None
-    # (N, m): output less that of the surface at the likely inputs of each specimen
+    # (N, m): output of the response less that of the surface, at the likely inputs of each specimen
     offsets: Floats | None = None
 
     @cached_property
@@ -190,7 +191,8 @@ def fit_surface(
     center = np.nanmean(readings.values, axis=0)
     inside = near_readings(yg, readings)
     largest = np.abs(yg - center).max(axis=0)
-    # Within 100 standard deviations of the data the outputs themselves.
+    # If all outputs are within 100 standard deviations of the data, the unit is so large that they
+    # are not compressed.
     unit = np.where(largest <= 100 * spread, 1e6 * np.maximum(largest, spread), 10 * spread)
     compressed = np.arcsinh((yg - center) / unit)
     start = previous.surface if isinstance(previous, CompressedSurface) else None
@@ -227,7 +229,7 @@ def predicted_bias(shift: Floats, x: Floats, size: int) -> Floats:
     """
     sd = x.std(axis=0)
     if (sd == 0).any():
-        # Inputs at one place, such as the maximum of a response, show no spread.
+        # If all inputs are equal, as at the maximum of a response, the spread is not known.
         return np.full((2, len(sd)), np.inf)
     mean_bias = -shift.mean(axis=0) / sd * np.sqrt(size)
     covariance = ((x - x.mean(axis=0)) * shift).mean(axis=0)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
@@ -32,12 +33,12 @@ from prbayes.specimens.weighted_points import fit_normal, normal_log_density
 class SpecimenOptions:
     """Settings of runs and points, from the study of guards (docs/likelihood.md)."""
 
-    starts: int = 12  # of the search for modes, by specimen
+    starts: int = 12  # number of starts of the search for modes, for each specimen
     gap: float = 20.0  # largest misfit of a mode above the specimen's best, in nats
     points: int = 8  # fewest points of a mode in each half; doubled until the halves agree
-    most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
+    most_points: int = 4096  # largest number of points of a specimen, or `most_in_all` / N
     most_in_all: int = 2**17
-    cheap_in_all: int = 2**16  # up to which points are doubled for the sake of few populations
+    cheap_in_all: int = 2**16  # number of points in all up to which doubling them costs little
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
     half_difference: float = 0.05
@@ -54,7 +55,7 @@ class SpecimenOptions:
 class SpecimenPoints:
     """Points of N specimens."""
 
-    z: Floats  # (N, K, d)
+    z: Floats  # (N, K, d): coordinates of the points
     outputs: Floats  # (N, K, m): the emulator's outputs at the points
     # (N, K): the log-likelihood of a specimen under a density p of z is ``logsumexp(log p(z) +
     # log_a, axis=1)``; -inf for points that fill up the array
@@ -102,7 +103,7 @@ type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
 
 
 def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
-    """Return the normal population with the moments of a sample, (n, d); inflation of the sd."""
+    """Return the normal population with the moments of a sample, (n, d), its sd times inflation."""
     mean = sample.mean(axis=0)
     covariance = np.atleast_2d(np.cov(sample.T)) * inflation**2
     sd = np.sqrt(np.diagonal(covariance))
@@ -113,23 +114,25 @@ def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
 
 @dataclass(frozen=True, eq=False)
 class SpecimenData:
-    """Measured specimens, and what is known of them before the response is."""
+    """Measured specimens, and what is known of them before any run."""
 
     readings: Readings
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
     prior: Floats  # (n, d): specimens of the prior predictive population
-    posterior: Posterior  # points, their numbers and a smoothing to draws
+    posterior: Posterior  # function of points, log_a and a smoothing that returns posterior draws
     bounds: Floats | None = None  # (2, d): ends of data sets of the prior
     # (2, d): ends of the range of inputs, at which a density may be infinite
     ends: Floats | None = None
-    # (free,): the columns that are not known, those whose population may be narrow first
+    # (free,): columns of unknown coordinates, the narrowest possible populations first
     order: NDArray[np.intp] | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
-    gross_errors: bool = False  # whether readings of single specimens may be anything
+    gross_errors: bool = False  # whether readings of single specimens may have gross errors
     options: SpecimenOptions = SpecimenOptions()
     name: str = "response"
     output_names: tuple[str, ...] = ()  # names of the m outputs in messages
     labels: NDArray[Any] | None = None  # labels of the N specimens; None for row numbers
+    # Advice on more runs, and on another metric, that the model accepts; empty texts for none.
+    remedies: Callable[[], tuple[str, str]] = lambda: ("", "")
     seed: int = 0
 
     @property
@@ -146,7 +149,7 @@ class SpecimenData:
         return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
 
     def scale(self, sd: Floats) -> Floats:
-        """Return units of all coordinates, (d,), from those that are not known."""
+        """Return units of all coordinates, (d,), from those of the unknown coordinates, (free,)."""
         scale = np.maximum(np.ptp(self.known, axis=0), 1e-9)
         scale[self.free] = sd
         return np.asarray(scale)
@@ -305,7 +308,8 @@ class Plausible:
         if earlier is not None and earlier.proposals.is_open(earlier.scale):
             population = earlier.proposals.residuals.population
         proposals = fit_proposals(data, emulation, population)
-        # Few points of a specimen suffice among many specimens; the halves have to agree.
+        # With many specimens few points of each suffice, because their errors average out. The
+        # halves have to agree all the same.
         n = len(data.readings)
         of_mode = options.points if n <= 512 else max(2, 512 * options.points // n)
         count = of_mode * proposals.modes.table.shape[1]
@@ -354,7 +358,7 @@ class Plausible:
         """Return points whose halves agree at the draws."""
         proposals, points, modes = self.proposals, self.points, self.proposals.modes
         population = normal_of(self.draws.specimens()[:, data.free])
-        # A branch that only a wide population reaches has its points, too.
+        # Proposals of a wider population have points on branches that only such populations reach.
         wide = Normal(population.mean, 2.5 * population.root)
         masses = [
             np.bincount(
@@ -364,7 +368,8 @@ class Plausible:
             )
             for reference in (population, wide)
         ]
-        # A scale that is not likely needs its points all the same.
+        # Scales of an unknown error that are not likely have points as well, because the prior
+        # allows them.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
             proposals = proposals.with_shares(masses[0] + masses[1])
         result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
@@ -430,7 +435,8 @@ def agreeing_points(
     """
     options = data.options
     over_scales = 0.03 * np.sqrt(max(len(data.readings), 10) / 10)
-    # Along open inputs the error falls more slowly with the number of points.
+    # Along inputs that readings leave open the error decreases more slowly with the number of
+    # points, so that a larger one is accepted.
     largest = options.half_difference * per_hyperparameter(draws)
     largest *= 2 if proposals.is_open(scale) else 1
     most = max(options.most_points, options.most_in_all // len(data.readings))
@@ -438,7 +444,8 @@ def agreeing_points(
     while True:
         halves = [draw_points(data, proposals, count, 100 + 2 * data.seed + h) for h in (0, 1)]
         difference = _half_difference(data, proposals, halves, draws, (scale,))
-        # Where points become denser than populations are narrow the error falls all at once.
+        # The error drops at once when the distance of points becomes less than the width of the
+        # narrowest populations.
         falls = difference[0] < last / 3
         is_cheap = 4 * count * len(data.readings) <= options.cheap_in_all * (4 if falls else 1)
         last = difference[0]
@@ -450,7 +457,7 @@ def agreeing_points(
         ):
             return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
-            raise _monte_carlo_error(data.name, 2 * count, difference[1], largest)
+            raise _monte_carlo_error(data, 2 * count, difference[1], largest)
         # The error falls like 1 / count at best.
         times = 2 ** int(np.log2(np.clip(difference[1] / largest, 2, most // (2 * count))))
         count *= times
@@ -523,7 +530,7 @@ def reliable_draws(
             if difference <= limit:
                 return draws, points, proposals
             if 2 * count > data.options.most_points:
-                raise _monte_carlo_error(data.name, count, difference, limit)
+                raise _monte_carlo_error(data, count, difference, limit)
         previous = proposals.residuals.population
         covariance = previous.root @ previous.root.T
         smoothing = count ** (-2 / (len(covariance) + 4)) * covariance
@@ -545,9 +552,11 @@ def per_hyperparameter(draws: Draws) -> float:
     return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
 
 
-def _monte_carlo_error(name: str, count: int, difference: float, largest: float) -> DesignError:
+def _monte_carlo_error(
+    data: SpecimenData, count: int, difference: float, largest: float
+) -> DesignError:
+    remedies = "measure more outputs of each specimen", "narrow the priors", data.remedies()[1]
     return DesignError(
-        f"{name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
-        f"{difference:.2g} nats, expected at most {largest:.2g}; measure more outputs of each "
-        "specimen, narrow the priors, or use metric=prb.ProbabilityResidual()"
+        f"{data.name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
+        f"{difference:.2g} nats, expected at most {largest:.2g}; {any_of(*remedies)}"
     )

@@ -53,7 +53,7 @@ Indices = NDArray[np.intp]
 class Normal:
     """Normal population, in which inputs are whitened: z = mean + root a."""
 
-    mean: Floats  # (d,)
+    mean: Floats  # (d,): mean of the coordinates
     root: Floats  # (d, d): lower Cholesky factor of the covariance
 
 
@@ -67,13 +67,13 @@ class Residuals:
     emulator_error: Floats  # (N, m): standard deviation of the emulator's error
     error: Floats  # (N, m): standard deviation of the reading; infinite where there is none
     relative: Floats  # (N, m): further error of the reading as a share of the output
-    population: Normal  # of the reference, in coordinates z
+    population: Normal  # reference population of the coordinates z
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
     # (2, d): range in which inputs are possible; an emulator is arbitrary far beyond its runs.
     box: Floats | None = None
-    # (free,): the columns that are not known, those whose population may be narrow first.
+    # (free,): columns of unknown coordinates, the narrowest possible populations first
     order: Indices | None = None
-    # (N, m): the outputs of the response that a specimen has; None for all.
+    # (N, m): columns of the outputs that were measured of a specimen; None if all were.
     columns: Indices | None = None
 
     @property
@@ -115,7 +115,7 @@ class Residuals:
         z = self.coordinates(specimen, a)
         columns = None if self.columns is None else self.columns[specimen]
         values, jacobian = self.response(z) if columns is None else self.response(z, columns)
-        # Differences beside inputs without a response have no slopes.
+        # A difference between inputs with and without a response is no slope.
         values[~np.isfinite(jacobian).all(axis=(1, 2))] = np.nan
         if self.box is not None:
             values[((z < self.box[0]) | (z > self.box[1])).any(axis=1)] = np.nan
@@ -131,7 +131,7 @@ class Residuals:
         error = self.error[specimen]
         variance = self.emulator_error[specimen] ** 2 + factor * error**2 + relative * values**2
         residual, sd = self.target[specimen] - values, np.sqrt(variance)
-        # The error of a relative reading changes with the output.
+        # The standard deviation of a relative error depends on the output, and so does its slope.
         by_output = (1 + residual * relative * values / variance) / sd
         is_read = np.isfinite(error)
         e = np.where(is_read, residual / sd, 0.0)
@@ -152,8 +152,8 @@ class Modes:
     specimen: Indices  # (R,): row of the specimen; sorted
     a: Floats  # (R, free): whitened inputs
     misfit: Floats  # (R,): half the squared standardised errors, in nats
-    errors: Floats  # (R, m)
-    slopes: Floats  # (R, m, free): G
+    errors: Floats  # (R, m): standardised errors e of the readings
+    slopes: Floats  # (R, m, free): G = -de/da
     scale: Floats  # (R,): factor of the readings' errors
 
     @classmethod
@@ -202,15 +202,15 @@ def find_modes(
     """
     n, count, d = starts.shape
     specimen = np.repeat(np.arange(n), count)
-    # An accurate reading makes a narrow curved valley, in which the method creeps: first it finds
-    # the valley's lowest point with a larger error, then the readings themselves.
+    # Accurate readings make a narrow curved valley, in which the method takes tiny steps. The first
+    # search therefore has a larger reading error, and the second one starts at its result.
     change = 0.03 * _typical_change(residuals, starts)
     change = change if residuals.columns is None else change[residuals.columns]
     soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
     a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
     a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
     misfit = (e**2).sum(axis=1) / 2
-    # A mode far from the reference counts: another population may be the likely one.
+    # Modes far from the reference population are kept, because another population may be likely.
     least = np.full(n, np.inf)
     np.minimum.at(least, specimen, np.where(np.isfinite(value), misfit, np.inf))
     value = np.where(misfit <= least[specimen] + gap, value, np.inf)
@@ -259,7 +259,7 @@ def _minimised(
         damped = hessian + (damping[active, None] * diagonal)[:, :, None] * np.eye(d)
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         length = np.sqrt((step**2).sum(axis=1))
-        # Far from the population, where an outlier may lie, steps are longer.
+        # Steps are longer far from the population, because an outlier may be there.
         longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
         step /= np.maximum(length / longest, 1.0)[:, None]
         trial = a[active] + step
@@ -271,7 +271,7 @@ def _minimised(
         a[rows], e[rows], slopes[rows] = trial[better], new_e[better], new_slopes[better]
         value[rows] = new_value[better]
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
-        # A gain of 1e-6 nats is none; a rejected step that is this short is rounding.
+        # The search ends at a gain below 1e-6 nats, or at a rejected step as short as rounding.
         unfinished = (gain > 1e-6) & (length > 1e-11) & (damping[active] < 1e11)
         active = active[unfinished]
     return a, value, e, slopes
@@ -289,7 +289,7 @@ def _distinct(
     table = np.where(slots >= 0, candidates[slots], -1)
     is_mode = table >= 0
     for k in range(1, table.shape[1]):
-        # Each specimen's k-th candidate, beside the better ones.
+        # The k-th candidate of each specimen is compared with its better candidates.
         better = table[:, :k]
         difference = a[table[:, k], None] - a[better]
         along = np.einsum("nkmd,nkd->nkm", slopes[better], difference)
@@ -313,7 +313,8 @@ def rows_by_specimen(specimen: Indices) -> Indices:
 class Proposals:
     """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
 
-    # Readings leave a direction open whose precision is less than this many times the population's.
+    # A direction is open if the readings' precision along it is less than this many times that of
+    # the population.
     least_precision: ClassVar[float] = 4.0
     degrees: ClassVar[float] = 5.0  # of Student's t distribution along open directions
 
@@ -322,7 +323,7 @@ class Proposals:
     inputs: Floats  # (R, free, free): D V'
     readings: Floats  # (R, free, m): D S U'
     orientation: Floats  # (R,): sign of the map's determinant at the mode
-    log_det: Floats  # (R,): log of its size
+    log_det: Floats  # (R,): log of the determinant's absolute value
     # (R, free): directions that the readings leave open, along which populations differ
     open_axes: NDArray[np.bool_]
     share: Floats  # (R,): mixing weight among the modes of the specimen
@@ -345,8 +346,9 @@ class Proposals:
         log_det = -np.log(inverse).sum(axis=1)
         inputs = inverse[:, :, None] * vt
         is_open = scale**2 < cls.least_precision
-        # Open directions are rotated: the first input of the order changes along the first one
-        # alone, the next along two. Equidistant points of narrow populations follow from that.
+        # Open directions are rotated so that the first input of the order changes along the first
+        # direction alone, the second input along two, and so on. Points of narrow populations are
+        # then equidistant.
         order = np.arange(d) if residuals.order is None else residuals.order
         rotation, _ = np.linalg.qr((is_open[:, :, None] * inputs)[:, :, order])
         orientation = orientation * np.sign(np.linalg.det(rotation))

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp, stdtrit
 
+from prbayes._finding import any_of
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
@@ -90,6 +91,7 @@ def response_share(
     if np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
         return emulation, None
     draws = posterior(share)
+    _, other_metric = data.remedies()
     batch = max(2 * first_runs(emulation.z.shape[1]), 32)
     for _ in range(batches):
         fresh = boundary_points(emulation, draws.specimens(), batch, seed)
@@ -106,8 +108,7 @@ def response_share(
         raise DesignError(
             f"{name}: got a failing region (NaN) whose boundary still changes the log-likelihood "
             f"by {change:.2g} nats after {batches} batches of {batch} runs there, expected at most "
-            f"{largest / 4}; repair the response, narrow the priors, or use "
-            "metric=prb.ProbabilityResidual()"
+            f"{largest / 4}; {any_of('repair the response', 'narrow the priors', other_metric)}"
         )
     draws = posterior(share)
     while True:
@@ -121,7 +122,7 @@ def response_share(
             raise DesignError(
                 f"{name}: got two halves of {count // 2} points whose shares without response "
                 f"change the log-likelihood by {difference:.2g} nats, expected at most {largest}; "
-                "narrow the priors, or use metric=prb.ProbabilityResidual()"
+                f"{any_of('narrow the priors', other_metric)}"
             )
     z = np.concatenate([half.z for half in halves])
     return emulation, _sorted(z, np.concatenate([half.log_b for half in halves]), emulation)

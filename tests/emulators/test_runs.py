@@ -155,3 +155,15 @@ def test_a_surrogate_of_runs_takes_a_surface_of_ones_own() -> None:
     assert fitted.n_runs == 0
     with pytest.raises(TypeError, match=r"expected prb\.surrogate"):
         prb.Surrogate.from_runs(TABLE, X[:, 0], model=3)
+
+
+@pytest.mark.parametrize("make", [prb.Runs, prb.Surrogate.from_runs])
+@pytest.mark.parametrize("kind", ["codes", "multiples"])
+def test_inputs_that_determine_no_surface_are_named(make: Any, kind: str) -> None:
+    a = np.arange(40.0)
+    c, n = (np.repeat([0.0, 1.0], 20), 2) if kind == "codes" else (3 * a, 40)
+    message = (
+        rf"runs that determine no surface, with .* \{{'a': 40, 'c': {n}\}}, expected at least 3"
+    )
+    with pytest.raises(ValueError, match=message):
+        make({"a": a, "c": c}, a)

@@ -12,7 +12,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.metrics.readings import Repeats
+from prbayes.metrics.readings import Readings, Repeats
 from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
@@ -22,6 +22,7 @@ from prbayes.model.data_checks import (
     duplicate_findings,
     identical_specimens,
     outlier_findings,
+    refuse_unreachable,
     repeat_findings,
     resolution,
     warn_out_of_range,
@@ -302,11 +303,25 @@ def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture
     assert "all below the first 64 responses" in logged.text
 
 
+@pytest.mark.parametrize("m", [1, 2])
+def test_a_change_beyond_the_ninth_digit_is_no_exact_constant(m: int) -> None:
+    values = 1e12 + SIMULATED[:40, :m]
+    message = r"constant to nine digits: got 1e\+12 at all 40 runs .* range of [1-9].*subtract"
+    with pytest.raises(DesignError, match=message) as by_metric:
+        check_constant("y", values, ["a", "b"][: m if m > 1 else 0], True)
+    with pytest.raises(DesignError, match=message) as by_specimen:
+        refuse_unreachable("y", values, Readings.exact(values[:20]))
+    for caught in (by_metric, by_specimen):
+        assert ("leave the output out" in str(caught.value)) == (m > 1)
+
+
 def test_constant_responses_that_are_stored_are_refused() -> None:
-    message = r"y: the response is constant: got 1 at all 3 runs .*; check the .*, take more runs"
+    message = (
+        r"y: the response is constant .* got 1 at all 3 runs .*; check the .*, or take more runs"
+    )
     with pytest.raises(DesignError, match=message):
         check_constant("y", np.ones(3), [], True)
-    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant: got 0 at all 40 runs"):
+    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant .* got 0 at all 40 runs"):
         check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], 1), ["a", "b"], True)
     with pytest.raises(DesignError, match="at all 24 runs"):
         check_constant("y", np.where(np.arange(64) < 24, 5.0, np.nan), [], True)

@@ -414,8 +414,9 @@ def test_a_description_of_another_type_is_refused(path: str, answer: Any, said: 
         prb.umbridge(server.url)
 
 
-def test_an_error_that_is_null_is_none() -> None:
-    text = '{"output": [[1, 2]], "error": null}'
+@pytest.mark.parametrize("error", ["null", "false", '""'])
+def test_an_error_that_is_empty_is_none(error: str) -> None:
+    text = f'{{"output": [[1, 2]], "error": {error}}}'
     with telling(lambda handler, *_: handler.say(text)) as server:
         np.testing.assert_array_equal(prb.umbridge(server.url)(1.0, 2.0), [1.0, 2.0])
 

@@ -202,7 +202,7 @@ def test_points_are_doubled_until_both_halves_agree() -> None:
     error = errors(points, exact_log_likelihoods(a, readings, draws), draws).sum(axis=1)
     assert error.std() < 0.2
     few = SpecimenOptions(most_points=128, most_in_all=128)
-    with pytest.raises(DesignError, match=r"got two halves of .* points .*ProbabilityResidual"):
+    with pytest.raises(DesignError, match=r"got two halves of .* points .*narrow the priors"):
         points_of(lambda z: z @ a.T, readings, draws, options=few)
 
 
