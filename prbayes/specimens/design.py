@@ -43,7 +43,7 @@ def first_runs(dimensions: int) -> int:
 
 def most_runs(dimensions: int) -> int:
     """Return the largest number of runs before a response is refused."""
-    return 256 if dimensions <= 2 else 512 if dimensions <= 4 else 1920
+    return 256 if dimensions < 2 else 384 if dimensions == 2 else 512 if dimensions <= 4 else 1920
 
 
 # Coordinates (n, d) -> outputs (n, m), NaN where there is no response.

@@ -224,7 +224,7 @@ def test_first_runs_of_the_user() -> None:
 
 def test_limits_grow_with_the_inputs() -> None:
     assert [first_runs(d) for d in (1, 2, 8)] == [10, 16, 52]
-    assert [most_runs(d) for d in (1, 2, 4, 8)] == [256, 256, 512, 1920]
+    assert [most_runs(d) for d in (1, 2, 4, 8)] == [256, 384, 512, 1920]
 
 
 def test_runs_are_those_of_the_seed() -> None:
