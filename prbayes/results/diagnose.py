@@ -35,6 +35,8 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators
 from prbayes.optimize.design_refinement import rough_emulators
 from prbayes.optimize.maximum_likelihood import specimen_refit_obstacle
 from prbayes.optimize.minimize import find_optimum
@@ -258,6 +260,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         checked += Checked(untested=(f"{text}Optimum itself.",))
     if evaluator is not None:
         checked += check_tables(evaluator)
+        checked += Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
