@@ -130,8 +130,9 @@ def unlabelled_specimens(simulators: Mapping[Any, Any]) -> list[Finding]:
     ]
     for k, (simulator, labels) in enumerate(parts):
         n = len(simulator.observed)
-        if simulator.specimens is None and labels is not None and len(set(labels)) < len(labels):
-            label, count = Counter(labels).most_common(1)[0]
+        label, count = Counter(labels or [""]).most_common(1)[0]
+        # Whole numbers are what joining tables leaves in an index.
+        if simulator.specimens is None and count > 1 and not label.isdigit():
             texts.append(
                 f"{simulator.name}: got the label {label!r} {count} times in the index of "
                 "observed, expected different ones, since each row counts as a specimen; pass "

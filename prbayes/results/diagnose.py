@@ -279,8 +279,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     )
 
 
-def _refuse_few_draws(tree: xr.DataTree, fewest: int = 4) -> None:
-    """Raise for draws too few for R-hat."""
+def _refuse_few_draws(tree: xr.DataTree, fewest: int = 2) -> None:
+    """Raise for chains of one draw, which have no autocorrelation."""
     n = tree["posterior"].sizes["draw"]
     if n < fewest:
         raise ValueError(

@@ -27,6 +27,13 @@ def one_posterior(result: Any, caller: str) -> Any:
             "fleet['products']['product'].values"
         )
     result = with_chains(result)
+    if isinstance(result, xr.DataTree) and "posterior" in result.children:
+        lacking = {"chain", "draw"} - set(result["posterior"].dims)
+        if lacking:
+            raise ValueError(
+                f"{caller}: got a posterior without the dimensions {sorted(lacking)}, expected "
+                "draws, as of prb.sample; pass the result itself, not means of its draws"
+            )
     if product_names(result) and "observed_data" in result.children:
         data = result["observed_data"].to_dataset()
         for dim in data.dims:
@@ -40,7 +47,12 @@ def with_chains(result: Any) -> Any:
     """Restore the dimensions chain and draw, which a selection of one of them has lost."""
     if not isinstance(result, xr.DataTree) or "posterior" not in result.children:
         return result
-    lost = [dim for dim in ("chain", "draw") if dim not in result["posterior"].dims]
+    posterior = result["posterior"]
+    lost = [
+        dim for dim in ("chain", "draw") if dim in posterior.coords and dim not in posterior.dims
+    ]
+    if "draw" in posterior.dims and not {"chain"} & {*posterior.coords, *posterior.dims}:
+        lost.append("chain")
     if not lost:
         return result
     groups = {name: node.to_dataset() for name, node in result.children.items()}

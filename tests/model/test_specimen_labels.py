@@ -126,6 +126,8 @@ def test_other_specimens_are_not_reported(make: Any) -> None:
 def test_a_label_twice_in_one_index_is_reported() -> None:
     (text,) = findings(two(series(COLD, ["s0", *NAMES[:-1]]), series(HOT, OTHERS)))
     assert text.startswith("cold: got the label 's0' 2 times in the index of observed")
+    table = pd.concat([series(COLD[:10], range(10)), series(COLD[10:], range(15))])
+    assert not findings(two(table, series(HOT, OTHERS)))
 
 
 def test_specimens_of_other_inputs_may_have_the_same_labels() -> None:

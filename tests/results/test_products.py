@@ -160,8 +160,15 @@ def test_numbers_of_a_selected_chain_are_those_of_a_result_with_one() -> None:
 def test_a_single_draw_has_populations_and_no_diagnosis() -> None:
     draw = posterior().isel(draw=0)
     assert CALLS["population"](draw)["estimate"].notnull().any()
-    with pytest.raises(ValueError, match="got 1 draw of each chain, expected at least 4"):
+    with pytest.raises(ValueError, match="got 1 draw of each chain, expected at least 2"):
         CALLS["diagnose"](draw)
+
+
+def test_means_of_draws_are_no_draws() -> None:
+    means = {"posterior": posterior()["posterior"].to_dataset().mean(("chain", "draw"))}
+    for name in ("population", "compare", "diagnose", "Report"):
+        with pytest.raises(ValueError, match=r"without the dimensions \['chain', 'draw'\]"):
+            CALLS[name](xr.DataTree.from_dict(means))
 
 
 def test_responses_of_a_product_are_tested_against_others() -> None:
