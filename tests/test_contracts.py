@@ -25,6 +25,7 @@ from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.backends.base import MultiTrace
 from pymc.backends.ndarray import NDArray
 from pymc.distributions.censored import CensoredRV
+from pymc.distributions.custom import CustomSymbolicDistRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
@@ -234,6 +235,19 @@ def test_operations_define_their_batches_and_may_have_no_gradient() -> None:
     np.testing.assert_array_equal(total.eval({batch: rows}, mode=PLAIN), [3, 12])
     with pytest.raises(NullTypeGradError):
         pt.grad(Batched()(x).sum(), x)
+
+
+def test_distributions_of_others_are_resized_from_their_inputs_and_operation() -> None:
+    assert isinstance(pm.LogitNormal.dist(0.0, 1.0).owner.op, CustomSymbolicDistRV)
+    node = pm.Weibull.dist(2.0, pt.dscalar()).owner
+    assert isinstance(node.op, SymbolicRandomVariable)
+    scales = pt.constant([1.0, 1e9])
+    inputs = [*node.inputs[:-1], scales]
+    unsized = Apply(node.op, inputs, [v.type() for v in node.outputs])
+    resized = change_dist_size(unsized.default_output(), (5, 2))
+    draws = pm.draw(resized, random_seed=1, mode=PLAIN)
+    assert (draws[:, 0] < draws[:, 1]).all()
+    assert len(np.unique(draws)) == 10
 
 
 def test_disconnected_and_missing_inputs() -> None:

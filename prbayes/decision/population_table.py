@@ -213,6 +213,15 @@ class PopulationTable(Table):
     _parts = (*_VARIABLES, "name", "quantity", "prob")
     _columns = _VARIABLES
 
+    def to_dataframe(self, dim_order: Sequence[Any] | None = None) -> Any:
+        """Return the table as a data frame with the unit of each quantity."""
+        table = super().to_dataframe(dim_order)
+        flat = table.reset_index()
+        if {"unit", "quantity"} <= set(flat):
+            is_pure = flat["quantity"].astype(str).str.match("cv$|correlation with ").to_numpy()
+            table.loc[is_pure, "unit"] = ""
+        return table
+
     def rows(self) -> Iterator[tuple[str, str, dict[str, tuple[str, str]]]]:
         """Yield name, unit, and texts of estimate and interval by quantity, of each population."""
         group_dims = [dim for dim in self["estimate"].dims if dim not in ("name", "quantity")]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
@@ -21,7 +22,14 @@ from prbayes.model.random_variable import known_value
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
 from prbayes.response.inputs import Groups, group_indices
-from prbayes.response.outputs import Outputs, in_order_of, read_observed, refuse_other_order
+from prbayes.response.outputs import (
+    Outputs,
+    in_order_of,
+    label_texts,
+    read_observed,
+    refuse_other_order,
+    specimen_index,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +47,8 @@ class ObservedData:
     rows: NDArray[np.intp] | None
     n_rows: int  # number of observed rows
     dims: tuple[str, ...] | None  # names of the observed dimensions
+    # (N,): labels in the index or the coordinate of the specimens; None if these only count them
+    index: list[str] | None = None
 
     def __len__(self) -> int:
         return _length(self.values)
@@ -89,8 +99,14 @@ def read_data(
         labels = sample_labels(in_order_of(specimens, observed, label), _length(values), label)
     if dims is not None:
         dims = _checked_dims(name, dims, np.shape(values), model)
+    index = None
+    if rows is None:
+        of_data = model.named_vars_to_dims.get(getattr(observed, "name", None), (None,))
+        coordinate = model.coords.get((dims or of_data)[0])
+        index = specimen_index(observed) if coordinate is None else pd.Index(list(coordinate))
+        index = label_texts(index, "" if groups is None else groups.dim)
     return ObservedData(
-        name, observed, values, outputs, places, weights, labels, rows, n_rows, dims
+        name, observed, values, outputs, places, weights, labels, rows, n_rows, dims, index
     )
 
 

@@ -172,6 +172,11 @@ class Specification:
         """The metric of the target."""
         return self.target.metric
 
+    @property
+    def observed(self) -> Floats:
+        """Measured responses, (N,) or (N, m)."""
+        return self.target.observed
+
 
 type AnySimulator = Specification | Node
 

@@ -59,8 +59,10 @@ from prbayes.model.remedies import (
     other_metric,
     scatter_advice,
 )
+from prbayes.model.simulator_with_data import refuse_labels_of_index, unlabelled_specimens
 from prbayes.model.specimen_likelihood import (
     SpecimenRV,
+    all_simulators,
     measurements_of,
     specimen_likelihoods,
 )
@@ -76,7 +78,7 @@ from prbayes.response.inputs import (
     read_inputs,
     set_units,
 )
-from prbayes.response.outputs import Outputs
+from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.pymc_dims import values_of
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
@@ -223,9 +225,17 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         name, model, response, variables, data, settings, epsilon, progressbar, of_readings
     )
     metric = LogLikelihood() if metric is None else metric
+    earlier = all_simulators(model)
+    refuse_labels_of_index(name, variables, data.labels, data.index, earlier)
     if isinstance(metric, Metric) and metric.by_specimen:
-        return _add_measurement(arguments, cast(LogLikelihood, metric))
-    return _add_by_metric(arguments, metric)
+        added = _add_measurement(arguments, cast(LogLikelihood, metric))
+    else:
+        added = _add_by_metric(arguments, metric)
+    for variable in added if isinstance(added, tuple) else (added,):
+        variable.tag.specimen_index = data.index
+    findings = unlabelled_specimens(all_simulators(model))
+    report(*findings[len(unlabelled_specimens(earlier)) :])
+    return added
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,7 +419,7 @@ def _with_common_specimens(
     def common(simulator: AnySimulator | Measurement) -> list[str]:
         if simulator.specimens is None:
             return []
-        return sorted(map(_label_text, set(labels.tolist()) & set(simulator.specimens.tolist())))
+        return sorted(map(label_text, set(labels.tolist()) & set(simulator.specimens.tolist())))
 
     for simulator in by_metric:
         if common(simulator):
@@ -781,19 +791,10 @@ def _refuse_ambiguous_labels(
     labels_of = [(simulator.name, simulator.specimens) for simulator in earlier]
     for simulator, specimens in [*labels_of, (name, labels)]:
         for label in [] if specimens is None else specimens.tolist():
-            first, first_label = first_use.setdefault(_label_text(label), (simulator, label))
+            first, first_label = first_use.setdefault(label_text(label), (simulator, label))
             if first_label != label:
                 raise TypeError(
                     f"{name}: specimens: got the label {label!r} and, in {first}, "
                     f"{first_label!r}, expected labels of one type, since these would count as "
                     "two specimens; pass numbers, or strings, in all simulators"
                 )
-
-
-def _label_text(label: object) -> str:
-    """Return a label as readers see it."""
-    if isinstance(label, bytes):
-        return label.decode(errors="replace").strip()
-    if isinstance(label, float) and label.is_integer():
-        return str(int(label))
-    return str(label).strip()

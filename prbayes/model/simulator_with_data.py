@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
+from prbayes.response.condition import is_condition
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import Outputs
+from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.response import Responses
+
+_PAGE = "conditions.md#what-the-labels-change"
 
 
 class SimulatorWithData(Protocol):
@@ -84,3 +89,83 @@ def new_observed(
             f"as many as there are {aligned}; build the model again with those of the new ones"
         )
     return values
+
+
+def refuse_labels_of_index(
+    name: str,
+    inputs: Inputs,
+    labels: NDArray[Any] | None,
+    index: Sequence[str] | None,
+    earlier: Mapping[Any, Any],
+) -> None:
+    """Raise if specimens have labels of an earlier simulator by their index, not by specimens=.
+
+    The earlier simulators are by their observed variables. Specimens with the same labels and the
+    same inputs would count twice.
+    """
+    present = _labels(labels, index) or []
+    for variable, simulator in earlier.items():
+        taken = set(_labels(simulator.specimens, _index_of(variable)) or [])
+        common = [label for label in present if label in taken]
+        is_joined = labels is not None and simulator.specimens is not None
+        if common and not is_joined and _have_common_inputs(inputs, simulator):
+            raise ValueError(
+                f"{name}: observed: got the specimen {common[0]!r}, which {simulator.name} has too "
+                "by index, coordinate or dims, expected specimens= in both simulators, with which "
+                "it counts once; pass specimens=[str(label) for label in index] to both and leave "
+                "dims= out, or, if they are other specimens, give them other labels"
+            )
+
+
+def unlabelled_specimens(simulators: Mapping[Any, Any]) -> list[Finding]:
+    """Report specimens that may be the same, and count as several, since they have no labels.
+
+    The simulators are by their observed variables.
+    """
+    texts = []
+    parts = [
+        (s, _labels(s.specimens, _index_of(variable)))
+        for variable, s in simulators.items()
+        if not s.metric.exact_likelihood
+    ]
+    for k, (simulator, labels) in enumerate(parts):
+        n = len(simulator.observed)
+        label, count = Counter(labels or [""]).most_common(1)[0]
+        # Whole numbers are what joining tables leaves in an index.
+        if simulator.specimens is None and count > 1 and not label.isdigit():
+            texts.append(
+                f"{simulator.name}: got the label {label!r} {count} times in the index of "
+                "observed, expected different ones, since each row counts as a specimen; pass "
+                "specimens= if rows with the same label are readings of one specimen."
+            )
+        for other, labels_of_other in parts[:k]:
+            is_known = labels is not None and labels_of_other is not None
+            is_other_group = getattr(simulator, "group", "") != getattr(other, "group", "")
+            if is_known or is_other_group or len(other.observed) != n:
+                continue
+            if _have_common_inputs(simulator.responses.inputs, other):
+                texts.append(
+                    f"{other.name} and {simulator.name}: got {n} specimens of the same inputs in "
+                    f"each, expected labels, without which they count as {2 * n} specimens; pass "
+                    "specimens= to both, with the same labels if the specimens are the same."
+                )
+    return [Finding("unlabelled-specimens", text, _PAGE) for text in texts]
+
+
+def _labels(specimens: NDArray[Any] | None, index: Sequence[str] | None) -> list[str] | None:
+    """Return the labels of specimens as texts: those of specimens=, else those of the index."""
+    if specimens is not None:
+        return list(map(label_text, specimens.tolist()))
+    return None if index is None else list(index)
+
+
+def _index_of(variable: Any) -> Sequence[str] | None:
+    """Return the labels in the index of the observed values of a variable."""
+    labels: Sequence[str] | None = getattr(variable.tag, "specimen_index", None)
+    return labels
+
+
+def _have_common_inputs(inputs: Inputs, simulator: Any) -> bool:
+    """Return whether a simulator has an aleatory input in common, apart from known conditions."""
+    aleatory = {x for x in inputs.aleatory if not is_condition(x)}
+    return not aleatory.isdisjoint(simulator.responses.inputs.aleatory)

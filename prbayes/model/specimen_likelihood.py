@@ -547,9 +547,14 @@ def measurements_of(model: pm.Model) -> dict[Any, Measurement]:
     return {rv: rv.owner.op.simulator for rv in specimen_likelihoods(model)}
 
 
+def all_simulators(model: pm.Model) -> dict[Any, Any]:
+    """Return the simulators of both kinds by their observed variables."""
+    return {**simulators(model), **measurements_of(model)}
+
+
 def require_simulator(model: pm.Model) -> None:
     """Raise if a model has no simulator of any kind; nothing is run."""
-    if not simulators(model) and not specimen_likelihoods(model):
+    if not all_simulators(model):
         raise ValueError(
             "model: got one without a prb.Simulator, expected at least one; add "
             "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "

@@ -22,6 +22,7 @@ from prbayes.plots.curves import pointwise_band
 from prbayes.propagation.base import DesignError
 from prbayes.response.inputs import model_on_context
 from prbayes.results.predict import thetas_of
+from prbayes.results.products import model_of_product, one_posterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,7 +68,8 @@ def read_result(
     else:
         model = model_on_context(model, caller)
         require_of_model(result, model, caller, Level.POPULATIONS)
-        evaluator = Evaluator.of(model)
+        result = one_posterior(result, caller)
+        evaluator = Evaluator.of(model_of_product(result, model))
     cost = 0 if free else evaluator.responses_per_theta
     if n_draws is not None:
         positive_integer(n_draws, "n_draws")

@@ -35,6 +35,7 @@ from prbayes.plots.canvas import (
 )
 from prbayes.plots.curves import bounded_density, central_levels
 from prbayes.plots.selection import Coords, FilterVars, VarNames, elements_of, select
+from prbayes.results.products import with_chains
 
 if TYPE_CHECKING:
     from arviz_plots.plot_collection import PlotCollection
@@ -120,6 +121,7 @@ def plot_posterior(
     ['mu']
     """
     check_options(labels, pc_kwargs, by_arviz=True)
+    posterior = with_chains(posterior)
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
         raise wrong_type(posterior, "plot_posterior", "a DataTree with a posterior group")
     if optimum is not None and not isinstance(optimum, Optimum):

@@ -33,6 +33,7 @@ from prbayes.plots.canvas import refuse_labels
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
+from prbayes.results.products import model_of_product, one_posterior
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.pit import Comparable, comparables, u_values
 
@@ -193,7 +194,10 @@ def gather(
 ) -> Material:
     """Check results, and derive the missing ones."""
     optima = _by_label(optimum, "optimum")
-    posteriors = _by_label(posterior, "posterior")
+    posteriors = {
+        label: one_posterior(result, f"Report: {label}")
+        for label, result in _by_label(posterior, "posterior").items()
+    }
     tests = _by_label(validity, "validity")
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
@@ -382,6 +386,8 @@ def _observed(
     """Return the measured responses, and the statistics of data sheets, by simulator."""
     observed, sheets = {}, {}
     if model is not None:
+        for result in results.values():
+            model = model_of_product(result, model)
         for simulator in population_simulators(model):
             observed[simulator.name] = Observed(simulator.observed, simulator.outputs)
             sheets[simulator.name] = data_sheet(simulator.metric)

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import singledispatch
 from threading import Lock, RLock
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytensor
 import pytensor.tensor as pt
+from pymc.distributions.custom import CustomSymbolicDistRV
+from pymc.distributions.distribution import SymbolicRandomVariable
+from pymc.distributions.shape_utils import change_dist_size
 from pytensor.compile.mode import Mode
-from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
-from pytensor.graph.replace import clone_replace, graph_replace, vectorize_graph
+from pytensor.graph.replace import (
+    _vectorize_node,
+    clone_replace,
+    graph_replace,
+    vectorize_graph,
+)
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorConstant, TensorVariable
@@ -242,3 +253,75 @@ def compile_batched(
         batched = with_leading_axis(core_inputs)
         vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
         return compiled([*batched, *extra], vectorized, allow_input_downcast=True)
+
+
+# PyTensor's rules by type of operation, and those below.
+_vectorized = singledispatch(lambda op, node, *batched: _vectorize_node(op, node, *batched))
+
+
+def vectorize_distributions(
+    outputs: Sequence[TensorVariable], replace: Mapping[Any, Variable]
+) -> list[Any]:
+    """Vectorize a graph as PyTensor does, also distributions that PyMC makes of others."""
+    vectors: dict[Variable, Any] = dict(replace)
+    for node in toposort(outputs, blockers=list(replace)):
+        batched = [vectors.get(v, v) for v in node.inputs]
+        if all(old is new for old, new in zip(node.inputs, batched, strict=True)):
+            continue
+        try:
+            result = _vectorized(node.op, node, *batched)
+        except NotImplementedError:
+            raise TypeError(
+                f"inputs: got {str(node.op).partition('{')[0]} with parameters that differ between "
+                "specimens, which PyMC cannot make for several specimens at once, expected another "
+                "distribution; pass the one from which it is computed, and compute the rest in the "
+                "response, or write a pm.CustomDist with logp= and random="
+            ) from None
+        results = result.outputs if isinstance(result, Apply) else result
+        for old, new in zip(node.outputs, results, strict=True):
+            vectors.setdefault(old, new)
+    return [vectors.get(v, v) for v in outputs]
+
+
+@_vectorized.register(RandomVariable)
+@_vectorized.register(SymbolicRandomVariable)
+def _vectorized_distribution(op: Any, node: Any, *batched: Any) -> Any:
+    """Return the outputs of a distribution, which PyMC makes with a new size.
+
+    PyTensor cannot add axes to the generators of a distribution that is made of others, and of one
+    with a size it reads the first parameter alone.
+    """
+    if isinstance(op, RandomVariable) and not isinstance(batched[1], TensorVariable):
+        return _vectorize_node(op, node, *batched)  # it has no size
+    dist = node.default_output()
+    n_axes = dist.type.ndim - op.ndim_supp  # axes of an array of independent elements
+    core = dict(zip(op.dist_params(node), op.ndims_params, strict=True))
+    inputs, batch = [], []
+    for old, new in zip(node.inputs, batched, strict=True):
+        extra = new.type.ndim - old.type.ndim if old in core else 0
+        batch.append(tuple(new.shape[i] for i in range(extra)))
+        missing = n_axes - (old.type.ndim - core[old]) if extra else 0
+        inputs.append(pt.expand_dims(new, range(extra, extra + missing)) if missing else new)
+    shape = (*pt.broadcast_shape(*batch, arrays_are_shapes=True), *dist.type.shape[:n_axes])
+    unsized = Apply(op, inputs, [v.type() for v in node.outputs])
+    vectorized = change_dist_size(unsized.default_output(), shape)
+    return [vectorized if v is dist else v for v in node.outputs]
+
+
+@_vectorized.register(pm.Truncated.rv_type)
+def _vectorized_truncated(op: Any, node: Any, *batched: Any) -> Any:
+    *parameters, lower, upper = batched
+    base = op.base_rv_op.make_node(*node.inputs[:-2])
+    results = _vectorized(base.op, base, *parameters)
+    outputs = results.outputs if isinstance(results, Apply) else results
+    untruncated = outputs[base.outputs.index(base.default_output())]
+    truncated = pm.Truncated.dist(untruncated, lower, upper, max_n_steps=op.max_n_steps)
+    return [truncated, *node.outputs[1:]]
+
+
+# PyMC makes the former with its first parameters, and puts the steps of the latter in front.
+@_vectorized.register(CustomSymbolicDistRV)
+@_vectorized.register(pm.RandomWalk.rv_type)
+@_vectorized.register(pm.LKJCorr.rv_type)
+def _refuse(op: Any, *_: Any) -> Any:
+    raise NotImplementedError(op)

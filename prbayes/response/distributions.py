@@ -19,7 +19,13 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
-from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
+from prbayes.response.compile import (
+    PLAIN,
+    compile_batched,
+    interpreted,
+    vectorize_distributions,
+    with_leading_axis,
+)
 from prbayes.response.condition import is_condition
 from prbayes.response.inputs import Inputs, event_shape, quiet_logp
 from prbayes.response.pymc_dims import is_random, without_dims
@@ -165,7 +171,7 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
     """Return the log-density at zero as a graph; None if PyMC has none, or only a random one."""
     try:
         density = quiet_logp(dist, pt.zeros_like(dist))
-    except NotImplementedError:
+    except (NotImplementedError, ValueError):  # a ValueError: PyMC has it for one value only
         return None
     if isinstance(dist.owner.op, RANDOM_WALK):
         return density  # only the shapes of the random parts are used
@@ -327,7 +333,8 @@ class PopulationSampler:
                 per_specimen[v] = resized(v, size)
         self._is_batched = True
         try:
-            specimens = vectorize_graph(aleatory, per_specimen)
+            vectorize = vectorize_distributions if covariates else vectorize_graph
+            specimens = vectorize(aleatory, per_specimen)
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
         except (NotImplementedError, ValueError, MissingInputError) as error:

@@ -13,13 +13,13 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
-from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import NO_POPULATION, Indices, Shape, plain_text, real_array
-from prbayes.response.compile import PLAIN, interpreted
+from prbayes.response.compile import PLAIN, interpreted, vectorize_distributions
 from prbayes.response.condition import is_condition
 from prbayes.response.pymc_dims import (
     foreign_variable,
@@ -105,7 +105,7 @@ class Inputs:
         new: Any = [*self.aleatory, *self.epistemic]
         new = graph_replace(new, dict(zip(self.parents, symbols, strict=True)), strict=False)
         if vectors:
-            new = vectorize_graph(new, vectors)
+            new = vectorize_distributions(new, vectors)
         new = graph_replace(
             new, {s: v for s, v in values.items() if s not in vectors}, strict=False
         )

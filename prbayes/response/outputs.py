@@ -330,6 +330,30 @@ def specimen_index(values: Any) -> Any:
     return values.index if hasattr(values, "iloc") else None
 
 
+def label_texts(index: Any, groups: str = "") -> list[str] | None:
+    """Return the labels of specimens in an index of pandas as texts; None where it only counts.
+
+    A level with the names of groups is left out.
+    """
+    if index is not None and groups in index.names:
+        index = index.droplevel(groups) if index.nlevels > 1 else None
+    if index is None or set(index) == set(range(len(index))):
+        return None
+    return [
+        ", ".join(map(label_text, label)) if isinstance(label, tuple) else label_text(label)
+        for label in index
+    ]
+
+
+def label_text(label: object) -> str:
+    """Return a label as readers see it."""
+    if isinstance(label, bytes):
+        return label.decode(errors="replace").strip()
+    if isinstance(label, float) and label.is_integer():
+        return str(int(label))
+    return str(label).strip()
+
+
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
     columns, keys, units = [], [], []
     first = next(iter(observed.values()), None)

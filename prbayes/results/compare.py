@@ -41,6 +41,7 @@ from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in, refuse_model
 from prbayes.results.predict import width_of_epsilon
+from prbayes.results.products import model_of_product, one_posterior, product_names
 
 # variables by result that are no scores
 COSTS = ("n_responses", "seconds")
@@ -106,11 +107,20 @@ def compare(
     ['mu']
     """
     _refuse_wrong_arguments(results, metrics)
+    results = {label: one_posterior(r, f"compare: {label}") for label, r in results.items()}
     identities = {label: identity_in(result) for label, result in results.items()}
     try:
         identity = require_together(identities, "compare", model=model)
     except ValueError as error:
         raise ValueError(f"{error}; use prb.rank to compare models of the same data") from None
+    products = {tuple(product_names(result)) for result in results.values()}
+    if model is not None and len(products) > 1:
+        raise ValueError(
+            "compare: got results of several products, which have other data, with model=, "
+            "expected one product; leave model= out: then no data score the results"
+        )
+    if model is not None:
+        model = model_of_product(next(iter(results.values())), model)
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates take those of the model, so that elements have the same names.
     naming = optima[0].model if model is None and optima else model

@@ -35,6 +35,8 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators
 from prbayes.optimize.design_refinement import rough_emulators
 from prbayes.optimize.maximum_likelihood import specimen_refit_obstacle
 from prbayes.optimize.minimize import find_optimum
@@ -58,6 +60,7 @@ from prbayes.results.likelihood_checks import (
     separate_modes,
 )
 from prbayes.results.predict import RESULT, thetas_of, width_of_epsilon
+from prbayes.results.products import model_of_product, one_posterior
 
 # noise of R-hat: with independent draws it exceeds 1 + _NOISE / (chains x draws) about once in a
 # thousand cases; the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, from 1500 to 4000
@@ -199,17 +202,21 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     No problem was found.
     """
     refuse_model(result, "diagnose: result")
+    result = one_posterior(result, "diagnose")
     optimum = result if isinstance(result, Optimum) else None
     tree = result.to_datatree() if isinstance(result, Optimum) else result
     groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
     if not groups & {"posterior", "optimum"}:
         raise wrong_type(result, "diagnose: result", RESULT)
     has_draws = "posterior" in groups
+    if has_draws:
+        _refuse_few_draws(tree)
     calibration = tree["calibration"].to_dataset() if "calibration" in groups else xr.Dataset()
     if has_draws and not calibration:
         model = model_on_context(model, "prb.diagnose")
     if model is not None:
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
+        model = model_of_product(result, model)
     by_specimen = "is_likelihood" in calibration and bool(calibration["is_likelihood"].all())
     evaluator = None if optimum is None else optimum.evaluator
     thetas = None if optimum is None else optimum.theta[None]
@@ -253,6 +260,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         checked += Checked(untested=(f"{text}Optimum itself.",))
     if evaluator is not None:
         checked += check_tables(evaluator)
+        checked += Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
@@ -269,6 +277,16 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
         checked.untested,
     )
+
+
+def _refuse_few_draws(tree: xr.DataTree, fewest: int = 2) -> None:
+    """Raise for chains of one draw, which have no autocorrelation."""
+    n = tree["posterior"].sizes["draw"]
+    if n < fewest:
+        raise ValueError(
+            f"diagnose: result: got {counted(n, 'draw')} of each chain, expected at least "
+            f"{fewest}; pass the result with all draws"
+        )
 
 
 def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> tuple[Finding, ...]:

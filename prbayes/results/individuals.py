@@ -20,6 +20,7 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
+from prbayes.results.products import model_of_product, one_posterior
 
 # distribution of inputs whose shrinkage is that of their logarithms
 _LOG_NORMAL = type(pm.LogNormal.rv_op)
@@ -87,7 +88,8 @@ def individuals(
     array([0.  , 0.5 , 1.25, 2.  , 1.5 , 0.75])
     """
     positive_integer(n_draws, "n_draws")
-    model = model_of(result, model, "prb.individuals")
+    result = one_posterior(result, "prb.individuals")
+    model = model_of_product(result, model_of(result, model, "prb.individuals"))
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
     if not likelihoods:
         raise TypeError(

@@ -60,6 +60,7 @@ from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, is_group, model_on_context
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
+from prbayes.results.products import one_posterior
 
 # Types that a function of results takes, for its errors.
 RESULT = (
@@ -407,6 +408,7 @@ def populations_of(
     These are the free variables, and those that `pymc.do` or `pymc.observe` fixed.
     """
     names = [str(rv.name) for rv in model.free_RVs]
+    result = one_posterior(result, caller)
     values: Any
     if isinstance(result, Optimum):
         values = result.point

@@ -32,6 +32,7 @@ from prbayes._validate import (
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
+from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
@@ -42,6 +43,7 @@ from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
+from prbayes.response.outputs import Outputs
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import Emulation
 from prbayes.validation.area_test import area_test
@@ -90,8 +92,10 @@ def calibrate_each(
     -------
     xarray.DataTree
         Group ``posterior``: the hyperparameters with dims (chain, draw, product), for
-        ArviZ's summary or forest plot; NaN for products that failed. Group ``products``, by
-        product: ``pareto_k`` of importance sampling (NaN for another
+        ArviZ's summary or forest plot; NaN for products that failed. Group ``observed_data``: the
+        data, with rows of NaN after the last specimen of a product. ``each.sel(product="A")`` has
+        both of one product, for all functions that take a result. Group ``products``, by product:
+        ``pareto_k`` of importance sampling (NaN for another
         sampler), ``finding`` (why it failed, or which specimens no inputs reproduce; else an empty
         text), and with ``validation`` the ``statistic``, ``critical_value``, ``p_value`` and
         ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
@@ -174,7 +178,24 @@ def calibrate_each(
         raise RuntimeError(
             f"{caller}: {len(failures)} of {len(names)} products failed; {failures[0]}"
         )
-    return _tree(evaluator, names, rows, draws, {"random_seed": str(seed), "alpha": alpha})
+    attrs = {"random_seed": str(seed), "alpha": alpha, **as_attributes(identity_of(model))}
+    tree = _tree(evaluator, names, rows, draws, attrs)
+    tree["observed_data"] = _padded(simulator.name, observed, simulator.outputs)
+    return tree
+
+
+def _padded(name: str, observed: Mapping[str, Floats], outputs: Outputs) -> xr.Dataset:
+    """Return the data of all products, with rows of NaN after the last specimen of each."""
+    size = max(map(len, observed.values()))
+    arrays = [
+        np.pad(y, [(0, size - len(y)), *[(0, 0)] * (y.ndim - 1)], constant_values=np.nan)
+        for y in observed.values()
+    ]
+    dims = ("product", f"{name}_specimen", outputs.dim)[: 1 + arrays[0].ndim]
+    coords: dict[str, Any] = {"product": list(observed)}
+    if outputs.labels:
+        coords[outputs.dim] = list(outputs.labels)
+    return xr.Dataset({name: (dims, np.stack(arrays))}, coords)
 
 
 def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:

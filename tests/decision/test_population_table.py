@@ -286,3 +286,19 @@ def test_elements_of_a_vector_have_units_of_their_own() -> None:
         TypeError, match=r"element among \['x\[0\]', 'x\[1\]'\]; an expression is a"
     ):
         prb.population(posterior, x[0], model=model)
+
+
+def test_a_coefficient_of_variation_and_correlations_have_no_unit() -> None:
+    rows = np.random.default_rng(0).normal([2.0, 3.0], [0.2, 0.3], (20, 2))
+    with pm.Model() as model:
+        mu = pm.Normal("mu", [2.0, 3.0], 1.0, shape=2)
+        x = pm.MvNormal.dist(mu, np.array([[0.04, 0.01], [0.01, 0.09]]), name="x")
+        prb.Simulator("y", np.positive, x, observed=rows, units={"x": "ksi"})
+    table = prb.population(prb.minimize(model, starts=0, progressbar=False), "x", model=model)
+    frame = table.to_dataframe().reset_index()
+    units = frame.groupby("quantity")["unit"].agg(set).to_dict()
+    pure = {quantity for quantity, unit in units.items() if unit == {""}}
+    assert pure == {q for q in units if q == "cv" or q.startswith("correlation with")}
+    assert len(pure) == 2
+    assert all(unit == {"ksi"} for quantity, unit in units.items() if quantity not in pure)
+    assert set(table.sel(quantity="cv").to_dataframe()["unit"]) == {""}

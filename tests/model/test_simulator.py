@@ -453,14 +453,15 @@ def test_weights_and_specimens_are_matched_by_their_index() -> None:
     observed = pd.Series(Y, index=[f"s{i}" for i in range(20)])
     weights = pd.Series(np.arange(1.0, 21), index=observed.index)
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        mu = pm.Normal("mu")
+        x, x_b, x_c = (pm.Normal.dist(mu, 1.0) for _ in range(3))
         data = {"metric": prb.KullbackLeibler(), "observed": observed}
         prb.Simulator("a", np.positive, x, weights=weights[::-1], **data)
         labels = pd.Series(list(observed.index), index=observed.index)
-        prb.Simulator("b", np.positive, x, specimens=labels[::-1], **data)
+        prb.Simulator("b", np.positive, x_b, specimens=labels[::-1], **data)
         other = weights.rename(index={"s0": "t0"})
         with pytest.raises(ValueError, match=r"c: weights: got .*expected that of observed"):
-            prb.Simulator("c", np.positive, x, weights=other, **data)
+            prb.Simulator("c", np.positive, x_c, weights=other, **data)
     a, b = simulators(model).values()
     np.testing.assert_allclose(a.target.weights, weights / weights.sum())
     assert b.specimens.tolist() == list(observed.index)

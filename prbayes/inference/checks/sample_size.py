@@ -13,6 +13,8 @@ from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
 from prbayes._validate import Bools, Floats, Indices
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
 
@@ -76,7 +78,7 @@ def interval_ratios(n: float) -> tuple[float, float]:
 
 
 def few_specimens(evaluator: Evaluator) -> list[Finding]:
-    """Report too few specimens for standard errors.
+    """Report too few specimens for standard errors, and those that may be counted twice.
 
     Specimens of simulators with a common element of theta are added.
     """
@@ -93,9 +95,10 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
             count = float(np.unique(np.concatenate(labels)).size)
         # because a sum of weights may be slightly below a whole number
         counts.append(round(count, 6))
+    findings = unlabelled_specimens(all_simulators(evaluator.model))
     n = min(counts, default=enough)
     if not n < enough:
-        return _spread_in_common(evaluator, enters, groups, counts)
+        return findings + _spread_in_common(evaluator, enters, groups, counts)
     fewest = np.flatnonzero(groups == np.argmin(counts))
     names = ", ".join(evaluator.simulators[k].name for k in fewest)
     text = f"{names}: got {n:.3g} specimen{'s' * (n != 1)}, expected at least {enough}: "
@@ -109,7 +112,7 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
             f"as wide as by standard errors, and those of its spread {spread:.1f} times; "
         )
     text += "report intervals of prb.sample, not the optimum's."
-    return [Finding("few-specimens", text, _PAGE)]
+    return [*findings, Finding("few-specimens", text, _PAGE)]
 
 
 def _spread_in_common(
