@@ -419,7 +419,7 @@ def test_data_of_another_shape_are_refused() -> None:
         ),
         (
             {"inputs": lambda: [*normal(), pm.Normal("c")]},
-            "got c, which goes into the response as a model variable.*scatter.*ProbabilityResidual",
+            "got c, which goes into the response as a model variable.*scatter.*AreaMetric",
         ),
     ],
 )

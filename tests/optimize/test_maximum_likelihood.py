@@ -215,7 +215,8 @@ def test_standard_errors_that_are_too_small_on_a_curved_ridge(codes: list[str]) 
         prb.Simulator("force", lambda x, f: 100 * x * f, *inputs, observed=force)
     optimum = fit(model)
     assert codes == ["flat-likelihood"]
-    assert "mean" in optimum.findings[0].text
+    # The force determines the product of both alone.
+    assert any(name in optimum.findings[0].text for name in ("mean", "friction"))
 
 
 @pytest.mark.parametrize(
@@ -351,7 +352,7 @@ def test_a_population_between_the_points_is_no_optimum_with_an_unknown_error() -
     assert narrow > 1
     assert wide < 0.2
     # Maxima at spreads of b near zero are several nats high.
-    optimum = fit(model, start={"m1": 1, "s1": 0.5, "m2": 0.7, "s2": 0.01, "e": 0.3})
+    optimum = fit(model, start={"m1": 1, "s1": 0.5, "m2": 0.7, "s2": 0.001, "e": 0.3})
     assert not optimum.converged
     assert "narrow-population" in {finding.code for finding in optimum.findings}
 

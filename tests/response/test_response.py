@@ -513,7 +513,7 @@ def test_an_array_of_values_of_specimens_is_no_population(
 ) -> None:
     given = inputs(X, *constants)
     x = np.linspace(1, 2, 40)
-    advice = "known for each specimen, such as its load, is no constant: make it an input"
+    advice = "known for each specimen, such as its load, is no constant: "
     with pytest.raises(ResponseError, match=f"takes 40 specimens, but not one or 2, .*{advice}"):
         Responses("y", function, given)([x], [])
     for batch in (np.stack([x, x]), np.ones(64)):
