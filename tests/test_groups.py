@@ -168,7 +168,8 @@ def test_predictions_have_a_dimension_of_groups(
     difference = np.abs(means.values - optimum.point["mu"])
     assert (difference < 0.5 * np.asarray(optimum.stderr["mu"])).all()
     new = prb.predict(optimum, counting, specimen(model), stored=False, n_samples=100)
-    assert calls == before + 200 + 3 + 14  # runs that are computed again
+    # Three runs are computed again at most, and others show that the function has no state.
+    assert 200 + 14 <= calls - before <= 200 + 3 + 14
     assert float(new.sel(supplier="Busch").mean() / new.sel(supplier="Adler").mean()) != 1
     # New specimens of one supplier
     mu, sigma = optimum.point["mu"][1], optimum.point["sigma"]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+PAUSE = "0.012"  # seconds of a response
 SCRIPT = """
 import sys, time
 import numpy as np, pymc as pm, prbayes as prb
@@ -56,7 +57,7 @@ def killed(folder: Path, kind: str, at: int) -> str:
     """
     folder.mkdir()
     process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(folder), kind, "0.012"],
+        [sys.executable, "-c", SCRIPT, str(folder), kind, PAUSE],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -90,9 +91,13 @@ def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     def finished(folder: Path) -> str:
         """Run the script to its end, in this process, which knows nothing of the killed one."""
         folder.mkdir(exist_ok=True)
-        monkeypatch.setattr(sys, "argv", ["script", str(folder), kind, "0"])
+        # Another pause would be a change of the response.
+        monkeypatch.setattr(sys, "argv", ["script", str(folder), kind, PAUSE])
         capsys.readouterr()
-        exec(compile(SCRIPT, "script", "exec"), {})
+        code = compile(
+            SCRIPT, "script", "exec", dont_inherit=True
+        )  # the same code as in the process
+        exec(code, {"__name__": "__main__"})
         return capsys.readouterr().out
 
     once = finished(tmp_path / "a")
