@@ -40,8 +40,8 @@ _RESOURCES = frozenset({"asyncio", "concurrent", "distributed", "logging", "thre
 def digests_of(function: object, most: int = 10_000) -> dict[str, str]:
     """Return a digest of each variable that a function reads, by its name.
 
-    The function's own code has the name "". No object is called, copied or kept. Of more than
-    ``most`` objects those that are nearest to the function count.
+    The function's own code has the name "". The function is not called, and no object is kept. Of
+    more than ``most`` objects those that are nearest to the function count.
     """
     hashes: dict[str, Any] = {}
     opened: dict[int, tuple[str, Any]] = {}  # objects with their variables; kept, so that ids stay

@@ -172,7 +172,6 @@ def emulate(
     most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
     rng = np.random.default_rng([data.seed, 1])
     has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
-    enough_further = 1 if has_fewer_readings else 2
     # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # number of batches since the bias was small
@@ -187,7 +186,7 @@ def emulate(
         can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it matters less, because the inputs are not known well.
-        is_last = further >= enough_further or len(emulation.z) >= most
+        is_last = further >= (1 if has_fewer_readings else 2) or len(emulation.z) >= most
         may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:

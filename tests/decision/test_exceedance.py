@@ -2,6 +2,7 @@
 
 import logging
 import re
+import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -379,6 +380,19 @@ def test_no_region_is_left_out_beside_inputs_of_no_effect(
     is_wrong = by_draw[:, 0] + 4 * errors < expected
     assert is_wrong.sum() <= 1
     assert by_draw.mean() == pytest.approx(expected, rel=0.2)
+
+
+def test_the_error_sees_a_region_that_the_last_proposals_miss(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def on_one_side(parts: Any, wide: Any) -> Any:
+        return [max(parts, key=lambda part: part.center[0]).proposal]
+
+    monkeypatch.setattr(sys.modules[rare_event.__module__], "_mixture", on_one_side)
+    by_draw, errors, _ = rare_events(1, unequal_sides, 4.5)
+    assert (by_draw < 0.3 * UNEQUAL).all()
+    # The first points see it roughly; the last ones alone would have an error below .02.
+    assert (errors > 0.1 * UNEQUAL).all()
 
 
 def test_populations_share_their_points() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,16 @@ from scipy.stats import norm
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
-from prbayes.specimens.design import corrected, emulate, first_emulation, first_runs, most_runs
+from prbayes.specimens import design
+from prbayes.specimens.design import (
+    audited,
+    corrected,
+    emulate,
+    extended,
+    first_emulation,
+    first_runs,
+    most_runs,
+)
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import (
     Plausible,
@@ -215,6 +224,29 @@ def test_a_response_that_no_emulator_follows_is_refused_at_the_limit() -> None:
     assert len(message) < 5 * 90
     # A batch is half of the runs so far, and the limit is checked before each.
     assert 64 <= len(rough.z) - len(x) <= 64 * 3 // 2 + 8
+
+
+def test_the_batch_after_a_failed_audit_is_where_the_audit_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    audits: list[Any] = []
+    batches: list[Any] = []
+
+    def failing(run: Any, data: Any, emulation: Any, likely: Any, rng: Any) -> Any:
+        result = audited(run, data, emulation, likely, rng)
+        audits.append(likely)
+        return replace(result, bias=np.inf) if len(audits) == 1 else result
+
+    def recorded(run: Any, data: Any, emulation: Any, likely: Any, *rest: Any) -> Any:
+        if audits:
+            batches.append(likely)
+        return extended(run, data, emulation, likely, *rest)
+
+    monkeypatch.setattr(design, "audited", failing)
+    monkeypatch.setattr(design, "extended", recorded)
+    emulated(np.exp, population(0.1, 0.15))
+    assert batches[0] is audits[0]
+    assert len(audits) > 1
 
 
 def test_first_runs_of_the_user() -> None:
