@@ -37,6 +37,7 @@ from prbayes.model.evaluator import (
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, variables_at
+from prbayes.model.specimen_audit import audited
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
@@ -47,6 +48,7 @@ from prbayes.model.specimen_preparation import (
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.modes import far_apart
 from prbayes.optimize.convergence import Result
+from prbayes.optimize.design_refinement import MAX_ROUNDS
 from prbayes.optimize.optimum import (
     Optimum,
     SearchRecord,
@@ -81,30 +83,36 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     """
     clock = time.perf_counter()
     n_previous = evaluator.n_responses
-    hyperparameters = evaluator.hyperparameters
-    objective = _Objective(evaluator, settings.prior)
-    starts, n_screened = _starts(evaluator, settings)
-    optima = []
-    for start in starts:
-        optima.append(_descend(objective, start, settings))
-        if objective.count > settings.max_evaluations:
+    for round_ in range(MAX_ROUNDS + 1):
+        objective = _Objective(evaluator, settings.prior)
+        starts, n_screened = _starts(evaluator, settings)
+        optima = []
+        for start in starts:
+            optima.append(_descend(objective, start, settings))
+            if objective.count > settings.max_evaluations:
+                break
+        preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
+        # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
+        errors = [
+            max(preparation.points.difference, likelihood.options.half_difference)
+            for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
+        ]
+        is_supported = _supported(evaluator, optima)
+        if is_supported.any():
+            optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
+        modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+        thetas = np.stack([mode.theta for mode in modes])
+        latest = audited(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+        if latest is evaluator:
             break
-    preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
-    # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
-    errors = [
-        max(preparation.points.difference, likelihood.options.half_difference)
-        for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
-    ]
-    is_supported = _supported(evaluator, optima)
-    if is_supported.any():
-        optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
-    modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+        evaluator = latest
+    hyperparameters = evaluator.hyperparameters
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
     if settings.prior or len(modes) == 1:
         weights = mode_weights(modes)
     else:
-        log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
+        log_prior = hyperparameters.log_prior(thetas)
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
     n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious

@@ -18,6 +18,7 @@ from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
+from prbayes.model.specimen_audit import audited
 from prbayes.numerics.modes import Laplace, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum
@@ -147,7 +148,7 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
         chains = None
-        for _ in range(MAX_ROUNDS + 1):
+        for round_ in range(MAX_ROUNDS + 1):
             target = posterior_target(evaluator, optimum)
             modes = modes_of(target)
             if modes is None:
@@ -160,10 +161,13 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
                 is_exact = settings.kind(evaluator) is Likelihood.SPECIMENS
                 if has_one_mode and is_exact and evaluator.has_graph:
                     chains = _nuts_chains(evaluator, modes[0], settings)
+            if chains is None:
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
-            if not refine_at(evaluator, thetas[:THETAS]):
+            latest = audited(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+            if not refine_at(latest, thetas[:THETAS]) and latest is evaluator:
                 break
+            evaluator = latest
         if chains is None:
             return smc.sample(evaluator, settings)
         return result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)

@@ -260,7 +260,7 @@ def extended(
     runs = np.concatenate([emulation.z, sampled, possible])
     # Likely inputs may have a run already, so that only the new ones count.
     n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
-    far = _farthest(runs, near, max(0, count - n_explored - n_new - 3), scale)
+    far = farthest(runs, near, max(0, count - n_explored - n_new - 3), scale)
     uncertain = _explored(data, emulation, runs, of_population, 3, scale)
     runs = np.concatenate([runs, far, uncertain])
     explored = _explored(data, emulation, runs, prior, n_explored, of_prior)
@@ -432,7 +432,7 @@ def _near_population(
     return np.asarray(distance <= limit)
 
 
-def _farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Floats:
+def farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Floats:
     """Return candidates, (count, d), each the farthest from the runs and from earlier ones."""
     squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
     return candidates[farthest_rows(candidates / scale, count, squares)]
@@ -458,7 +458,7 @@ def _explored(
         z, error = z[is_possible], error[is_possible]
     order = np.argsort(-(error / spread).max(axis=1), kind="stable")
     z = z[order[: max(count, len(z) // 4)]]
-    return _farthest(runs, z, count, scale)
+    return farthest(runs, z, count, scale)
 
 
 def audited(

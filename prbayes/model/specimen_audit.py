@@ -1,0 +1,107 @@
+"""Audit of an emulator at likely inputs of the specimens under posterior draws.
+
+The emulator is fitted around populations of a coarse posterior, which may lack a narrow mode. Where
+the emulator is uncertain at inputs that the draws themselves make likely, the response is computed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from prbayes._finding import any_of
+from prbayes._validate import Floats
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.parameters import variables_at
+from prbayes.model.remedies import remedies_of
+from prbayes.model.specimen_likelihood import draw_inputs, specimen_likelihoods
+from prbayes.model.specimen_preparation import CheckedRuns, first_run_count, prepared
+from prbayes.propagation.base import DesignError
+from prbayes.specimens.design import farthest, most_runs
+from prbayes.specimens.emulation import Emulation, fit_surface
+
+
+def audited(evaluator: Evaluator, thetas: Floats, *, is_last: bool = False) -> Evaluator:
+    """Return the evaluator with emulators that are right at likely inputs of draws, (S, p).
+
+    It is the same object if no emulator has changed. Raise DesignError if one would change in the
+    last round, or has its largest number of runs.
+    """
+    records = {old: _audited(old, thetas, is_last) for old in evaluator.likelihoods}
+    if all(new is old for old, new in records.items()):
+        return evaluator
+    for rv, old in specimen_likelihoods(evaluator.model).items():
+        rv.owner.op.assign(rv.owner, records[old])
+    return Evaluator.of(evaluator.model)
+
+
+def _audited(
+    likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool, least_share: float = 0.005
+) -> SpecimenLikelihood:
+    """Return a likelihood with runs where its emulator is wrong, the same if it is right.
+
+    A smaller share of the inputs than ``least_share`` may have an uncertain emulator.
+    """
+    emulation, readings = prepared(likelihood).emulation, likelihood.readings
+    if likelihood.calls_response or emulation.offsets is not None:
+        return likelihood
+
+    def uncertainty(z: Floats) -> Floats:
+        """Return predictive standard deviations relative to the stated error, (n,)."""
+        return (np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1)
+
+    runs = likelihood.options.sampled
+    points = prepared(likelihood).points.z[:, ::4]  # a mode has at least eight points
+    if (uncertainty(points.reshape(-1, points.shape[2])) <= 1.0).all():
+        return likelihood
+    z = _likely_inputs(likelihood, thetas)
+    ratio = uncertainty(z)
+    possible, ratio = z[ratio > 1.0], ratio[ratio > 1.0]
+    share = len(possible) / len(z)
+    if share < least_share:
+        return likelihood
+    # Half of the runs are in the least certain part, and half are the farthest from all others.
+    scale = np.maximum(np.ptp(possible, axis=0), 1e-12)
+    worst = possible[np.argsort(-ratio)[: max(runs, len(ratio) // 20)]]
+    worst = np.random.default_rng(0).permutation(worst)[: runs // 2]
+    distant = farthest(np.concatenate([emulation.z, worst]), possible, runs // 2, scale)
+    fresh = np.unique(np.concatenate([worst, distant]), axis=0)
+    outputs = CheckedRuns(likelihood, [emulation.y])(fresh)
+    # Each run represents the inputs that are nearest to it.
+    nearest = cdist(possible / scale, fresh / scale).argmin(axis=1)
+    weights = share * np.bincount(nearest, minlength=len(fresh)) / len(possible)
+    misfit = np.abs(outputs - emulation.values(fresh))
+    relative = np.array([readings.relative_error(error).max() for error in misfit])
+    # A wrong input shifts a mean by its distance from the other inputs at most.
+    is_free = ~likelihood.coordinates.is_condition
+    middle = np.median(z, axis=0)
+    width = np.maximum(np.median(np.abs(z - middle), axis=0), 1e-12)
+    distance = (np.abs(fresh - middle) / width)[:, is_free].max(axis=1)
+    shift = np.fmin(relative, np.maximum(distance, 1.0))
+    bias = float(np.sqrt(len(readings)) * (weights @ shift))
+    if bias <= likelihood.options.bias:
+        return likelihood
+    if is_last or len(emulation.z) >= most_runs(z.shape[1]) + (first_run_count(likelihood) or 0):
+        advice = any_of("narrow the priors", *remedies_of(likelihood))
+        raise DesignError(
+            f"{likelihood.name}: the response is not smooth enough for prb.LogLikelihood(): got an "
+            f"emulator of {len(emulation.z)} runs that would shift an estimate by {bias:.2g} "
+            "posterior standard deviations at inputs that posterior draws make likely, expected "
+            f"at most {likelihood.options.bias}; {advice}"
+        )
+    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
+    surface, *_ = fit_surface(z, y, readings, likelihood.name, emulation.surface)
+    return replace(likelihood, shared_emulation=Emulation(z, y, surface, emulation.error, np.inf))
+
+
+def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:
+    """Return coordinates of inputs of the specimens under posterior draws, (n, d)."""
+    count = int(np.clip(2**15 // len(likelihood.readings), 16, 256))
+    rows = np.unique(np.linspace(0, len(thetas) - 1, count).round().astype(int))
+    values = variables_at(likelihood.hyperparameters, thetas[rows])
+    inputs, _ = draw_inputs(likelihood, np.random.default_rng(0), values)
+    z = likelihood.coordinates.of([x.reshape(-1, *x.shape[2:]) for x in inputs], 1)
+    return z[np.isfinite(z).all(axis=1)]

@@ -1,0 +1,86 @@
+"""Audit of emulators at likely inputs of posterior draws: poles, periods, and smooth responses."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.specimen_audit import audited
+from prbayes.propagation.base import DesignError
+
+# Beside a pole, or a period away, the emulator without runs has inputs that do not exist.
+ONE_AT_TWICE_THE_OTHERS = np.array([60.0, *np.random.default_rng(3).normal(28, 3, 14)[1:]])
+PROBLEMS: dict[str, Any] = {
+    "pole": (lambda x: 100 / x, (20.0, 8.0), 4.0, ONE_AT_TWICE_THE_OTHERS),
+    "period": (
+        lambda x: np.tan(x / 4),
+        (3.0, 2.0),
+        1.0,
+        np.random.default_rng(0).normal(3.5, 0.5, 14),
+    ),
+}
+
+
+def build(
+    response: Callable[[Any], Any], of_mu: tuple[float, float], of_sigma: float, x: Any
+) -> pm.Model:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", *of_mu), pm.HalfNormal("sigma", of_sigma)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), observed=response(x))
+    return model
+
+
+def exact(of_mu: tuple[float, float], of_sigma: float, x: Any) -> tuple[Any, Any]:
+    """Return posterior means and standard deviations of mu and sigma, from the inputs, (2,)."""
+    mu = np.linspace(of_mu[0] - 6 * of_mu[1], of_mu[0] + 6 * of_mu[1], 1601)
+    sigma = np.linspace(0.01, 8 * of_sigma, 1200)[:, None]
+    squares = ((x - x.mean()) ** 2).sum() + len(x) * (x.mean() - mu) ** 2
+    logs = -len(x) * np.log(sigma) - squares / (2 * sigma**2)
+    logs -= ((mu - of_mu[0]) / of_mu[1]) ** 2 / 2 + (sigma / of_sigma) ** 2 / 2
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    mean = np.array([(weights * mu).sum(), (weights * sigma).sum()])
+    square = np.array([(weights * mu**2).sum(), (weights * sigma**2).sum()])
+    return mean, np.sqrt(square - mean**2)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
+    response, *priors, x = PROBLEMS[name]
+    posterior = prb.sample(model=build(response, *priors, x), random_seed=1).posterior
+    mean, sd = exact(*priors, x)
+    draws = np.stack([posterior[name].values.ravel() for name in ("mu", "sigma")])
+    np.testing.assert_allclose((draws.mean(axis=1) - mean) / sd, 0, atol=0.1)
+    np.testing.assert_allclose(draws.std(axis=1) / sd, 1, atol=0.1)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_maximum_is_at_inputs_that_exist(name: str) -> None:
+    response, *priors, x = PROBLEMS[name]
+    optimum = prb.minimize(build(response, *priors, x))
+    np.testing.assert_allclose(optimum.theta[0], x.mean(), rtol=1e-3)
+    assert optimum.local_optima == ()
+
+
+def test_a_smooth_response_needs_no_further_run() -> None:
+    x = np.random.default_rng(1).normal(1, 0.5, 20)
+    model = build(lambda x: 2 * x + 1, (1.0, 1.0), 1.0, x)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(100, 0)
+    evaluator.log_other(thetas)
+    n_runs = evaluator.n_responses
+    assert audited(evaluator, thetas, is_last=True) is evaluator
+    assert evaluator.n_responses == n_runs
+
+
+def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
+    evaluator = Evaluator.of(build(*PROBLEMS["period"]))
+    # Populations around x = -.7 make inputs likely at which the emulator is wrong.
+    thetas = np.stack([np.full(32, -0.7), np.full(32, np.log(0.2))], axis=1)
+    evaluator.log_other(thetas)
+    with pytest.raises(DesignError, match=r"not smooth enough.*an emulator of \d+ runs that would"):
+        audited(evaluator, thetas, is_last=True)
