@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -12,7 +12,6 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, texts, wrong_type
 from prbayes.metrics.summary_likelihood import data_sheet
@@ -412,7 +411,7 @@ def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
     return None if problem_differences(identity, identity_of(model), Level.OPTIMUM) else model
 
 
-# -- schema of results in files --------------------------------------------------------------
+# -- decisions -------------------------------------------------------------------------------
 
 
 # variables that identify a table of a decision, and functions that return the tables
@@ -422,17 +421,6 @@ _TABLES = {
     "plan": {"sd", "now"},
 }
 CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
-# variables and attributes that a report reads
-_OF_DECISION = {
-    "risk": ("lower", "upper", "limit", "below", "prob"),
-    "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
-    "plan": ("name", "candidate", "k"),
-}
-_OF_CALIBRATION = (
-    *("epsilon", "metric", "propagation", "n_points", "required_ess", "max_lost"),
-    *("discrepancy", "discrepancy_error", "weight_ess", "mean_weight", "lost_mass"),
-)
-_OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
 
 
 def kind_of_decision(table: Any) -> str | None:
@@ -442,86 +430,3 @@ def kind_of_decision(table: Any) -> str | None:
             if variables <= set(table.data_vars):
                 return kind
     return None
-
-
-def complaints(tree: xr.DataTree) -> Iterator[str]:
-    """Yield what is wrong with the contents of a file: posterior, optimum, test or decision."""
-    groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
-    if "posterior" in groups or "optimum" in groups:
-        yield from _of_estimates(groups)
-    elif "u" in tree.data_vars:
-        yield from _of_test(tree.to_dataset())
-    else:
-        table = tree.to_dataset()
-        kind = kind_of_decision(table) or ""
-        present = {*table.variables, *table.attrs}
-        lacking = [name for name in _OF_DECISION[kind] if name not in present]
-        if lacking:
-            yield f"got no {lacking}, expected a table of prb.{CALLED[kind]}"
-        yield from _not_numbers("a decision", table.data_vars)
-    for group in {"posterior", "optimum"} & set(groups):
-        attrs = groups[group].attrs
-        for name in ("n_responses", "seconds"):
-            value = np.asarray(attrs.get(name, 0.0))
-            if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
-                yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
-        try:
-            from_json(str(attrs.get("findings", "[]")))
-        except ValueError as error:
-            yield f"{group}: {error}"
-    if "observed_data" in groups:
-        yield from _not_numbers("observed_data", groups["observed_data"].data_vars)
-
-
-def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    """Yield what is wrong with a posterior or an optimum."""
-    kind = "posterior" if "posterior" in groups else "optimum"
-    variables = groups[kind].data_vars
-    yield from _not_numbers(kind, variables)
-    for name, values in variables.items():
-        if not values.size:
-            yield f"{kind}: {name}: got no values (shape {values.shape}), expected some"
-        elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
-            yield f"{kind}: {name}: got NaN or infinite values only, expected finite ones"
-    needed: dict[str, tuple[str, ...]] = {"calibration": ("discrepancy", "metric")}
-    if kind == "posterior":
-        needed = {"calibration": _OF_CALIBRATION}
-        if "sample_stats" in groups and "stage" in groups["sample_stats"].dims:
-            needed["sample_stats"] = ("beta", "accept_rate", "n_steps")
-    elif "stderr" in groups:
-        errors = groups["stderr"]
-        for name, value in variables.items():
-            if name not in errors or errors[name].shape != value.shape:
-                yield f"stderr: got no standard error of {name}, expected one of the same shape"
-    for group, names in needed.items():
-        lacking = [name for name in names if group in groups and name not in groups[group]]
-        if lacking:
-            yield f"{group}: got no {lacking}, expected them beside {list(groups[group])}"
-    if "sample_stats" in needed:
-        yield from _not_numbers("sample_stats", groups["sample_stats"].data_vars)
-
-
-def _of_test(test: xr.Dataset) -> Iterator[str]:
-    lacking = [name for name in (*_OF_TEST, "lower", "upper") if name not in test.variables]
-    if lacking:
-        yield f"got no {lacking}, expected a validity test saved by to_dataset()"
-        return
-    for name in _OF_TEST:
-        if test[name].size != 1 or test[name].dtype.kind not in "fiub":
-            yield f"{name}: got shape {test[name].shape}, expected one number"
-    u = test["u"]
-    yield from _not_numbers("a validity test", {"u": u})
-    if u.ndim != 1 or not u.size or not bool(((u >= 0) & (u <= 1)).all()):
-        yield f"u: got shape {u.shape}, expected one or more numbers between 0 and 1"
-    for name in ("condition", "specimen", "lower", "upper"):
-        if name in test.variables and test[name].shape != u.shape:
-            yield f"{name}: got shape {test[name].shape}, expected that of u, {u.shape}"
-    for name in ("statistic", "p_value"):
-        if not np.isfinite(test[name].values).all():
-            yield f"{name}: got NaN or an infinite number, expected a finite one"
-
-
-def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
-    for name, values in variables.items():
-        if values.dtype.kind not in "fiu":
-            yield f"{group}: {name}: got values of dtype {values.dtype}, expected numbers"
