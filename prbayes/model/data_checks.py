@@ -23,7 +23,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
-from prbayes.specimens.proposals import Modes
+from prbayes.specimens.proposals import Modes, best_rows
 
 # Checks of the data against the first responses, for all metrics.
 
@@ -627,16 +627,14 @@ def misfit_findings(
     With gross errors in the likelihood half of the specimens may have such readings.
     """
     # For each specimen take the mode with the smallest misfit.
-    order = np.lexsort((modes.misfit, modes.specimen))
-    specimens, first = np.unique(modes.specimen[order], return_index=True)
-    best = order[first]
-    has_root = np.isfinite(modes.misfit[best])
-    is_poor = has_root & (modes.misfit[best] > largest)
-    poor, rows = specimens[is_poor], best[is_poor]
+    best = modes.rows(best_rows(modes.specimen, modes.misfit))
+    has_root = np.isfinite(best.misfit)
+    is_poor = has_root & (best.misfit > largest)
+    poor = best.specimen[is_poor]
     if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
-    off = np.sqrt(np.mean((modes.errors[rows] * sd) ** 2, axis=0))
+    off = np.sqrt(np.mean((best.errors[is_poor] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)
     return [
         Finding(

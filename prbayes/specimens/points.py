@@ -25,7 +25,17 @@ from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, half_difference
-from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
+from prbayes.specimens.proposals import (
+    Modes,
+    Normal,
+    Proposals,
+    Residuals,
+    best_rows,
+    find_modes,
+    mixing_weights,
+    with_covered_fibres,
+    without_covered,
+)
 from prbayes.specimens.weighted_points import fit_normal, normal_log_density
 
 
@@ -215,8 +225,8 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     parts = []
     for scale in sorted(data.scales, reverse=True):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
-        proposals = Proposals.at_modes(residuals, modes).without_covered()
-        parts.append(proposals.covering(starts, scale).modes)
+        proposals = without_covered(Proposals.at_modes(residuals, modes))
+        parts.append(with_covered_fibres(proposals, starts, scale).modes)
         starts = _as_starts(parts[-1], starts)
     return Proposals.at_modes(residuals, Modes.joined(parts))
 
@@ -371,7 +381,7 @@ class Plausible:
         # Scales of an unknown error that are not likely have points as well, because the prior
         # allows them.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
-            proposals = proposals.with_shares(masses[0] + masses[1])
+            proposals = replace(proposals, share=mixing_weights(modes, masses[0] + masses[1]))
         result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
         largest = np.zeros(len(data.known))
         np.maximum.at(largest, modes.specimen, masses[0])
@@ -494,9 +504,8 @@ def typical_specimens(
 
     An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
     """
-    order = np.lexsort((modes.misfit, modes.specimen))
-    specimens, first = np.unique(modes.specimen[order], return_index=True)
-    a, misfit = modes.a[order[first]], modes.misfit[order[first]]
+    best = modes.rows(best_rows(modes.specimen, modes.misfit))
+    specimens, a, misfit = best.specimen, best.a, best.misfit
     away = np.abs(a - np.median(a, axis=0))
     sd = 1.4826 * np.median(away, axis=0)
     is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)
