@@ -205,12 +205,7 @@ def gather(
     optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
         _require_group(label, tree, "optimum", (), "prb.minimize")
-        if "stderr" not in tree:
-            raise TypeError(
-                f"Report: {label}: got a DataTree without the group stderr, "
-                "expected one of prb.minimize"
-            )
-
+        _require_group(label, tree, "stderr", (), "prb.minimize")
     results = optima | posteriors
     identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
@@ -234,15 +229,6 @@ def gather(
         names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
-    diagnoses: dict[str, Diagnosis | None] = {}
-    for label, result in results.items():
-        if label in live_optima:
-            diagnoses[label] = diagnose(live_optima[label])
-            continue
-        own_model = _model_of(result, model)
-        needs_model = not {"optimum", "calibration"} & set(result.children)
-        is_possible = own_model is not None or not needs_model
-        diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
     return Material(
         model=model,
         description=description,
@@ -253,7 +239,10 @@ def gather(
         comparison=comparison,
         observed=observed,
         sheets=sheets,
-        diagnoses=diagnoses,
+        diagnoses={
+            label: _diagnosed(live_optima.get(label, result), model)
+            for label, result in results.items()
+        },
         decisions=decisions,
         validation=validations,
         labels=dict(labels or {}),
@@ -403,12 +392,20 @@ def _observed(
     return {name: y for name, y in observed.items() if name not in sheets}, sheets
 
 
-def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
-    """Return the model for diagnosing a saved result, or None if metric or priors differ."""
+def _diagnosed(result: Any, model: pm.Model | None) -> Diagnosis | None:
+    """Return the diagnosis of a result, or None if that needs the model, which is not known.
+
+    The model of a saved result is no other one, with a different metric or prior.
+    """
+    if isinstance(result, Optimum):
+        return diagnose(result)
     identity = identity_in(result)
-    if model is None or identity is None:
-        return model
-    return None if problem_differences(identity, identity_of(model), Level.OPTIMUM) else model
+    if model is not None and identity is not None:
+        is_other = problem_differences(identity, identity_of(model), Level.OPTIMUM)
+        model = None if is_other else model
+    if model is None and not {"optimum", "calibration"} & set(result.children):
+        return None
+    return diagnose(result, model=model)
 
 
 # -- decisions -------------------------------------------------------------------------------

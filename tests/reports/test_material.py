@@ -61,7 +61,7 @@ def test_damaged_descriptions_are_ignored(text: str, calibrated: Any) -> None:
     [
         ({"posterior": "an optimum"}, "group posterior"),
         ({"optimum": "a posterior"}, "group optimum"),
-        ({"optimum": "no errors"}, "without the group stderr"),
+        ({"optimum": "no errors"}, "a DataTree with the group stderr"),
         ({"posterior": "no draws"}, "without the dimensions"),
     ],
 )
