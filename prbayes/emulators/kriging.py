@@ -153,7 +153,7 @@ class Kriging:
         """Return predictive variances at points, (k, d) -> (k,)."""
         from scipy.linalg import solve_triangular
 
-        system, kernel = self._system, KERNELS[self.kernel]
+        system, kernel = _system_of(self), KERNELS[self.kernel]
         factor = system.factor(self.nugget)
         assert factor is not None  # the factor exists, since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
@@ -176,7 +176,7 @@ class Kriging:
         surfaces = []
         for mask in masks[:, self.rows]:
             part = replace(self, z=self.z[~mask], y=self.y[~mask], rows=self.rows[~mask])
-            system = part._system
+            system = _system_of(part)
             factor = system.factor(self.nugget)
             if factor is None:
                 raise np.linalg.LinAlgError("interpolation: the remaining runs are singular")
@@ -184,12 +184,6 @@ class Kriging:
             coefficients = system.trend(part.y, weights)
             surfaces.append(replace(part, weights=weights, coefficients=coefficients))
         return surfaces
-
-    @property
-    def _system(self) -> System:
-        """The linear system for the weights of the runs."""
-        matrix = kernel_matrix(self.kernel, self.z / self.lengths)
-        return System.of(matrix, *np.linalg.qr(self.polynomials(self.z).T))
 
     @cached_property
     def polynomials(self) -> Polynomials:
@@ -225,7 +219,7 @@ class Kriging:
         polynomials = self.polynomials
         if self.degree <= 2:
             # A quadratic form takes less time than products of polynomials.
-            constant, linear, hessian = self._quadratic_form
+            constant, linear, hessian = polynomials.quadratic_form(self.coefficients)
             u = polynomials.scaled(z).T
             slopes = u @ hessian + linear
             values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
@@ -239,20 +233,6 @@ class Kriging:
             factors[:, a] = derivative.T @ single[:-1, a]
             slopes[:, a] = self.coefficients @ polynomials.terms(factors) / half_width
         return self.coefficients @ polynomials.terms(single), slopes
-
-    @cached_property
-    def _quadratic_form(self) -> tuple[float, Floats, Floats]:
-        """Constant, slopes, (d,), and second derivatives, (d, d), of a polynomial of degree two."""
-        powers, coefficients = self.polynomials.powers, self.coefficients
-        degrees = powers.sum(axis=1)
-        # Squares are in the terms P_2(u) = (3 u^2 - 1) / 2.
-        is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
-        products = powers[is_product]
-        hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
-        of_squares = powers[is_square].T @ coefficients[is_square]
-        np.fill_diagonal(hessian, 1.5 * of_squares)
-        constant = coefficients[degrees == 0].sum() - 0.25 * of_squares.sum()
-        return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield the rows of blocks of points, the points (d, k), squared distances to runs (n, k).
@@ -303,6 +283,18 @@ class Polynomials:
     def scaled(self, z: Floats) -> Floats:
         """Return the variables of the polynomials, (k, d) -> (d, k)."""
         return np.ascontiguousarray(((z - self.center) / self.half_width).T)
+
+    def quadratic_form(self, coefficients: Floats) -> tuple[float, Floats, Floats]:
+        """Return constant, slopes, (d,), and second derivatives, (d, d), for a degree of two."""
+        powers, degrees = self.powers, self.powers.sum(axis=1)
+        # Squares are in the terms P_2(u) = (3 u^2 - 1) / 2.
+        is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
+        products = powers[is_product]
+        hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
+        of_squares = powers[is_square].T @ coefficients[is_square]
+        np.fill_diagonal(hessian, 1.5 * of_squares)
+        constant = coefficients[degrees == 0].sum() - 0.25 * of_squares.sum()
+        return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def by_input(self, z: Floats) -> Floats:
         """Return the Legendre polynomials of each input, (degree + 1, d, k)."""
@@ -383,6 +375,12 @@ class System:
         """Return the coefficients of the polynomials, (p,)."""
         rest = self.basis.T @ (y - self.kernels @ weights)
         return np.asarray(np.linalg.solve(self.root, rest))
+
+
+def _system_of(surface: Kriging) -> System:
+    """Return the linear system for the weights of the runs of a surface."""
+    matrix = kernel_matrix(surface.kernel, surface.z / surface.lengths)
+    return System.of(matrix, *np.linalg.qr(surface.polynomials(surface.z).T))
 
 
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:

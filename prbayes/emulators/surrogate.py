@@ -302,15 +302,7 @@ class Surrogate(Shown):
         refuse_misfit(name, response, [r.size for r in domain.inputs])
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
-        unit = sobol(n, domain.dimensions, seed)
-        if points == "predictive":
-            if predictive is None:
-                raise ValueError(
-                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
-                    "`.dist()` among them; leave points= out"
-                )
-            unit = domain.like(predictive, unit)
-        design = domain.at(unit)
+        design = domain.at(_unit_points(name, domain, predictive, n, points, seed))
 
         # Compute the coarse responses first, because an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
@@ -736,6 +728,21 @@ def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns
             "of the same inputs; repair it, or leave coarse= out"
         )
     return values
+
+
+def _unit_points(
+    name: str, domain: Ranges, predictive: Any, n: int, points: str, seed: int
+) -> Floats:
+    """Return n points of the unit cube: uniform, or distributed as the prior predictive."""
+    unit = sobol(n, domain.dimensions, seed)
+    if points != "predictive":
+        return unit
+    if predictive is None:
+        raise ValueError(
+            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
+            "among them; leave points= out"
+        )
+    return domain.like(predictive, unit)
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
