@@ -495,7 +495,7 @@ class _Shell:
         """Return n draws, (n, D), whose radius is at least half of the largest one."""
         z = rng.standard_normal((n, self.d))
         radius = self.radius * (1 + (np.arange(n) + rng.random(n)) / max(n, 1)) / 2
-        return np.asarray(z * (radius / np.linalg.norm(z, axis=1))[:, None])
+        return z * (radius / np.linalg.norm(z, axis=1))[:, None]
 
     def log_density(self, z: Floats) -> Floats:
         """Return the log-density, (n, D) -> (n,)."""

@@ -29,10 +29,9 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legder, legval
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 
 # Largest number of runs of a surface, whose cost grows with the cube of this number.
 MOST_RUNS = 2000
@@ -107,7 +106,7 @@ class Kriging:
 
     z: Floats  # (n, d): inputs of the runs
     y: Floats  # (n,): output of the runs
-    rows: NDArray[np.intp]  # (n,): indices of these runs among all runs
+    rows: Indices  # (n,): indices of these runs among all runs
     kernel: str
     lengths: Floats  # (d,): length scales, the units of distances
     degree: int  # degree of the polynomial
@@ -171,7 +170,7 @@ class Kriging:
             errors[rows] -= (solved**2).sum(axis=0)
         return np.maximum(errors, 0) * self.scale
 
-    def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
+    def without_each(self, masks: Bools) -> list[Kriging]:
         """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...)."""
         surfaces = []
         for mask in masks[:, self.rows]:
@@ -193,7 +192,7 @@ class Kriging:
     @cached_property
     def _scaled_runs(self) -> Floats:
         """The runs relative to the center, in units of lengths, (n, d)."""
-        return np.asarray((self.z - self.polynomials.center) / self.lengths)
+        return (self.z - self.polynomials.center) / self.lengths
 
     @cached_property
     def _on_line(self) -> tuple[Any, Floats] | None:
@@ -261,7 +260,7 @@ class Polynomials:
 
     center: Floats  # (d,): center of the box
     half_width: Floats  # (d,): half of the box's width
-    powers: NDArray[np.intp]  # (terms, d): degrees of the factors of each term, in order of degree
+    powers: Indices  # (terms, d): degrees of the factors of each term, in order of degree
 
     @classmethod
     def of(cls, z: Floats, degree: int) -> Polynomials:
@@ -357,7 +356,7 @@ class System:
 
     def contrasts(self, y: Floats) -> Floats:
         """Return P y, (n,)."""
-        return np.asarray(y - self.basis @ (self.basis.T @ y))
+        return y - self.basis @ (self.basis.T @ y)
 
     def weights(self, factor: Floats, y: Floats, nugget: float) -> tuple[Floats, Floats]:
         """Return the weights of outputs, (n,), and the last step of their refinement, (n,)."""
@@ -374,7 +373,7 @@ class System:
     def trend(self, y: Floats, weights: Floats) -> Floats:
         """Return the coefficients of the polynomials, (p,)."""
         rest = self.basis.T @ (y - self.kernels @ weights)
-        return np.asarray(np.linalg.solve(self.root, rest))
+        return np.linalg.solve(self.root, rest)
 
 
 def _system_of(surface: Kriging) -> System:
@@ -407,7 +406,7 @@ def spread_of(z: Floats) -> Floats:
     return np.where(spread > 0, spread, 1.0)
 
 
-def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
+def spread_rows(weights: Floats, most: int) -> Indices:
     """Return at most so many runs: half are those of the largest weights, others are spread."""
     n = len(weights)
     if n <= most:

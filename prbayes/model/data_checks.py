@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding, any_of, report
 from prbayes._stats import adjusted_p_values
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
@@ -305,7 +305,7 @@ def resolution(y: Floats, tolerance: float = 1e-6) -> float:
 
 def count_at_ends(
     y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0
-) -> tuple[NDArray[np.intp], Floats]:
+) -> tuple[Indices, Floats]:
     """Return the numbers of values at the largest and smallest one, (2,), and p-values, (2,).
 
     The hypothesis is that no value is censored; p-values are adjusted for both ends. Two exact

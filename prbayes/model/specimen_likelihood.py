@@ -17,7 +17,6 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pymc.logprob.abstract import ValuedRV, _logprob
 from pytensor.graph.basic import Constant
 from pytensor.graph.replace import graph_replace
@@ -25,7 +24,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, Indices, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -169,7 +168,7 @@ def _of_points(
     errors: Floats,
     parents: Sequence[Floats],
     points: WeightedPoints,
-    rows: NDArray[np.intp],
+    rows: Indices,
     columns: slice = slice(None),
 ) -> Floats:
     """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M).

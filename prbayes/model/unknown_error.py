@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.specimens.points import SpecimenPoints
@@ -31,7 +30,7 @@ class ReadingDensity:
     unit: Floats  # standard deviation of a reading in units of its error; broadcasts to outputs
     emulator_variance: Floats  # variance of the emulator's error; broadcasts to outputs
     # (S, k): indices of the outputs; None if these are all outputs in their order.
-    columns: NDArray[np.intp] | None
+    columns: Indices | None
     # For each unknown error of plain readings a tuple: index of an output that has the error, sums
     # of squared residuals (S, K), numbers of readings (S, 1), and variance of the emulator's error
     # in units of the scales.

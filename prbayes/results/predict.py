@@ -21,6 +21,7 @@ from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
+    Indices,
     Seed,
     finite_number,
     flag,
@@ -729,7 +730,7 @@ def data_digest(observed: Floats) -> str:
     return _array_digest(observed[in_order(observed)])
 
 
-def in_order(observed: Floats) -> NDArray[np.intp]:
+def in_order(observed: Floats) -> Indices:
     """Return the order of measured values, which is lexicographic for several outputs."""
     if observed.ndim == 1:
         return np.argsort(observed, kind="stable")

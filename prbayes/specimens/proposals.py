@@ -42,11 +42,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, ndtri, stdtrit
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.numerics.points import lattice, sobol
 from prbayes.numerics.threads import one_thread
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class Residuals:
     def whitened(self, z: Floats) -> Floats:
         """Return whitened inputs, (..., free), of coordinates (..., d)."""
         centred = z[..., self.free] - self.population.mean
-        return np.asarray(centred @ np.linalg.inv(self.population.root).T)
+        return centred @ np.linalg.inv(self.population.root).T
 
     def errors(
         self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
@@ -294,7 +292,7 @@ def _distinct(
         is_near = np.abs(difference).max(axis=2) < 1e-5
         is_same = is_near | (square < 1e-4)
         is_mode[:, k] &= ~(is_same & is_mode[:, :k]).any(axis=1)
-    return np.asarray(table[is_mode])
+    return table[is_mode]
 
 
 def rows_by_specimen(specimen: Indices) -> Indices:
@@ -339,7 +337,7 @@ class Proposals:
     orientation: Floats  # (R,): sign of the map's determinant at the mode
     log_det: Floats  # (R,): log of the determinant's absolute value
     # (R, free): directions that the readings leave open, along which populations differ
-    open_axes: NDArray[np.bool_]
+    open_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
 
     @classmethod
@@ -400,7 +398,7 @@ class Proposals:
         half = self.degrees / 2
         constant = gammaln(half + 0.5) - gammaln(half) - np.log(half) / 2
         student = constant - (half + 0.5) * np.log1p(xi**2 / self.degrees)
-        return np.asarray(np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1))
+        return np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
@@ -418,7 +416,7 @@ class Proposals:
         return xi, inputs + readings @ slopes
 
     @np.errstate(all="ignore")
-    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, Bools]:
         """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
 
         Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
@@ -518,7 +516,7 @@ class Proposals:
         return np.concatenate(parts) if parts else np.empty(0)
 
     @cached_property
-    def is_same_mode(self) -> NDArray[np.bool_]:
+    def is_same_mode(self) -> Bools:
         """Whether a mode is that in a slot of its specimen for another error, (R, most).
 
         Each is the nearest to the other among the modes for its error, in the map of the one for
@@ -667,7 +665,7 @@ def with_covered_fibres(proposals: Proposals, starts: Floats, scale: float) -> P
 
     def importance(modes: Modes) -> Floats:
         log_q = proposals.log_mixture(modes.specimen, modes.a, proposals.share)
-        return np.asarray(-0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q)
+        return -0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q
 
     for _ in range(4):
         of_modes = importance(modes)
