@@ -298,10 +298,7 @@ class SpecimenLikelihood:
     @property
     def by_group(self) -> list[tuple[int | None, Indices]]:
         """The index of each group, None without groups, and its specimens."""
-        groups = self.stacked.groups
-        if groups is None:
-            return [(None, np.arange(len(self.readings)))]
-        return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
+        return rows_by_group(self.stacked.groups, len(self.readings))
 
     @property
     def by_context(self) -> list[tuple[int | None, Indices]]:
@@ -361,6 +358,13 @@ class SpecimenLikelihood:
             model=self.model if is_same_model else weakref.ref(model),
             shared_emulation=prepared.emulation if prepared else self.shared_emulation,
         )
+
+
+def rows_by_group(groups: Indices | None, n: int) -> list[tuple[int | None, Indices]]:
+    """Return the index of each group, None without groups, and the rows in it, of n specimens."""
+    if groups is None:
+        return [(None, np.arange(n))]
+    return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> Indices:

@@ -31,6 +31,7 @@ from prbayes.model.measurement import (
     Measurement,
     SpecimenLikelihood,
     output_columns,
+    rows_by_group,
     specimen_numbers,
 )
 from prbayes.model.random_variable import (
@@ -357,12 +358,9 @@ def draw_readings(
         numbers = specimen_numbers(likelihood, measurement)
     # Observed specimens whose groups and covariates the drawn specimens have.
     like = np.resize(numbers, n)
-    conditions = likelihood.stacked.conditions
-    conditions = None if conditions is None else conditions[like]
-    by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
-    if likelihood.stacked.groups is not None:
-        groups = likelihood.stacked.groups[like]
-        by_group = [(group, np.flatnonzero(groups == group)) for group in np.unique(groups)]
+    of_observed = likelihood.stacked.conditions, likelihood.stacked.groups
+    conditions, groups = (None if values is None else values[like] for values in of_observed)
+    by_group = rows_by_group(groups, n)
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
