@@ -224,7 +224,7 @@ def exceedance(
             "responses": n_searched + sum(estimate.responses for estimate in estimates),
             "source": bounds[1].source,
             "random_seed": str(question.seed),
-            "findings": as_json(_findings(response, estimates, rough)),
+            "findings": as_json(_error_findings(response, estimates, rough)),
             **populations.provenance(),
             **decision,
         },
@@ -426,7 +426,7 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
     return float(np.nanstd(by_draw, ddof=1) / np.sqrt(n)) if populations.are_draws else 0.0
 
 
-def _findings(
+def _error_findings(
     response: Any, estimates: Sequence[_Estimate], rough: Sequence[_Estimate]
 ) -> tuple[Finding, ...]:
     """Report a probability with a large error, and a share of specimens without response."""

@@ -152,7 +152,7 @@ class Kriging:
         """Return predictive variances at points, (k, d) -> (k,)."""
         from scipy.linalg import solve_triangular
 
-        system, kernel = _system_of(self), KERNELS[self.kernel]
+        system, kernel = System.of_surface(self), KERNELS[self.kernel]
         factor = system.factor(self.nugget)
         assert factor is not None  # the factor exists, since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
@@ -175,7 +175,7 @@ class Kriging:
         surfaces = []
         for mask in masks[:, self.rows]:
             part = replace(self, z=self.z[~mask], y=self.y[~mask], rows=self.rows[~mask])
-            system = _system_of(part)
+            system = System.of_surface(part)
             factor = system.factor(self.nugget)
             if factor is None:
                 raise np.linalg.LinAlgError("interpolation: the remaining runs are singular")
@@ -340,6 +340,12 @@ class System:
         projected -= half.T
         return cls(kernels, basis, root, projected, sigma, float(np.abs(kernels).max()))
 
+    @classmethod
+    def of_surface(cls, surface: Kriging) -> System:
+        """Return the system for the weights of the runs of a surface."""
+        matrix = kernel_matrix(surface.kernel, surface.z / surface.lengths)
+        return cls.of(matrix, *np.linalg.qr(surface.polynomials(surface.z).T))
+
     def factor(self, nugget: float) -> Floats | None:
         """Return the lower factor of the matrix with a nugget; None if it is singular."""
         matrix = self.projected.copy()
@@ -374,12 +380,6 @@ class System:
         """Return the coefficients of the polynomials, (p,)."""
         rest = self.basis.T @ (y - self.kernels @ weights)
         return np.linalg.solve(self.root, rest)
-
-
-def _system_of(surface: Kriging) -> System:
-    """Return the linear system for the weights of the runs of a surface."""
-    matrix = kernel_matrix(surface.kernel, surface.z / surface.lengths)
-    return System.of(matrix, *np.linalg.qr(surface.polynomials(surface.z).T))
 
 
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:

@@ -358,9 +358,9 @@ def draw_readings(
         numbers = specimen_numbers(likelihood, measurement)
     # Observed specimens whose groups and covariates the drawn specimens have.
     like = np.resize(numbers, n)
-    of_observed = likelihood.stacked.conditions, likelihood.stacked.groups
-    conditions, groups = (None if values is None else values[like] for values in of_observed)
-    by_group = rows_by_group(groups, n)
+    conditions, groups = likelihood.stacked.conditions, likelihood.stacked.groups
+    conditions = None if conditions is None else conditions[like]
+    by_group = rows_by_group(None if groups is None else groups[like], n)
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)

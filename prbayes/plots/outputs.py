@@ -159,7 +159,7 @@ def plot_outputs(
         i, j = place
         x = columns[j]
         y = columns[i + 1]
-        _draw_pair(axis, x, y, populations)
+        _draw_outputs(axis, x, y, populations)
         axis.set(xlim=limits[j], ylim=limits[i + 1])
         axis.set_xticks(*round_ticks(*limits[j]))
         axis.set_yticks(*round_ticks(*limits[i + 1]))
@@ -249,7 +249,7 @@ def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> tupl
     return points[finite], weights[finite]
 
 
-def _draw_pair(
+def _draw_outputs(
     axis: Axes, x: Output, y: Output, populations: Mapping[str, tuple[Floats, Floats]]
 ) -> None:
     """Draw measured specimens, and outlines of regions of populations; the last is calibrated."""

@@ -160,6 +160,11 @@ def constants_of(description: Mapping[str, Any]) -> set[str]:
     return {name for name, _, text in inputs if text.startswith("=")}
 
 
+def names_in(description: Mapping[str, Any]) -> set[str]:
+    """Return the names of variables, and of inputs that are numbers."""
+    return {v["name"] for v in description["variables"]} | constants_of(description)
+
+
 def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
     """Return the attributes of a posterior or an optimum."""
     return dict(estimates_in(result).attrs)
@@ -200,7 +205,7 @@ def gather(
     tests = _by_label(validity, "validity")
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
-    validations = _validations({} if validation is None else validation)
+    validations = _validations(validation)
     live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
     optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
@@ -212,8 +217,7 @@ def gather(
     identities |= {label: identity_in(table) for label, table in decisions.items()}
     for label, data in validations.items():
         identities[f"validation, {label}"] = identity_from_attributes(data.predicted.attrs)
-    identities["comparison"] = identity_in(comparison)
-    require_together(identities, "Report", model=model)
+    require_together(identities | {"comparison": identity_in(comparison)}, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
     _require_tested(validations, tests)
 
@@ -224,11 +228,14 @@ def gather(
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)
     if labels and description["variables"]:
-        names = {*validations, *sheets, *observed, *constants_of(description)}
+        names = {*validations, *sheets, *observed, *names_in(description)}
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
-        names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
+    diagnoses: dict[str, Diagnosis | None] = {}
+    for label, result in (results | live_optima).items():
+        can_diagnose, own_model = _model_of_diagnosis(result, model)
+        diagnoses[label] = diagnose(result, model=own_model) if can_diagnose else None
     return Material(
         model=model,
         description=description,
@@ -239,10 +246,7 @@ def gather(
         comparison=comparison,
         observed=observed,
         sheets=sheets,
-        diagnoses={
-            label: _diagnosed(live_optima.get(label, result), model)
-            for label, result in results.items()
-        },
+        diagnoses=diagnoses,
         decisions=decisions,
         validation=validations,
         labels=dict(labels or {}),
@@ -301,6 +305,8 @@ def _validations(validation: Any) -> dict[str, Validation]:
         "expected by condition the measured responses and their prediction, such as "
         '{"80 000 cycles": (lengths, prb.predict(...))}'
     )
+    if validation is None:
+        return {}
     if not isinstance(validation, Mapping):
         raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
     validations = {}
@@ -392,20 +398,18 @@ def _observed(
     return {name: y for name, y in observed.items() if name not in sheets}, sheets
 
 
-def _diagnosed(result: Any, model: pm.Model | None) -> Diagnosis | None:
-    """Return the diagnosis of a result, or None if that needs the model, which is not known.
+def _model_of_diagnosis(result: Any, model: pm.Model | None) -> tuple[bool, pm.Model | None]:
+    """Return whether a result can be diagnosed, and the model for that.
 
     The model of a saved result is no other one, with a different metric or prior.
     """
     if isinstance(result, Optimum):
-        return diagnose(result)
+        return True, None
     identity = identity_in(result)
     if model is not None and identity is not None:
         is_other = problem_differences(identity, identity_of(model), Level.OPTIMUM)
         model = None if is_other else model
-    if model is None and not {"optimum", "calibration"} & set(result.children):
-        return None
-    return diagnose(result, model=model)
+    return model is not None or bool({"optimum", "calibration"} & set(result.children)), model
 
 
 # -- decisions -------------------------------------------------------------------------------

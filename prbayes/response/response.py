@@ -355,7 +355,7 @@ class Responses:
             row, again = change
             raise ResponseError(
                 f"{self.caller}: got {numbers_text(again)} from the response of {stored.name} "
-                f"{_place(self, points, row)}, expected "
+                f"{_place_of_specimen(self, points, row)}, expected "
                 f"{numbers_text(values[row])}, as in its runs: {names} "
                 "has changed since; build the model again for the response as it is now, or write "
                 "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
@@ -466,10 +466,10 @@ class Responses:
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
-                    f"response {_place(self, specimens, row)}, expected the same: it is random, "
-                    "or keeps a state from one specimen to the next; fix its random seed or "
-                    "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
-                    "prb.AreaMetric() with prb.Fresh() for random responses"
+                    f"response {_place_of_specimen(self, specimens, row)}, expected the same: it "
+                    "is random, or keeps a state from one specimen to the next; fix its random "
+                    "seed or state, model its scatter as an input, such as pm.Normal.dist(0, 1), "
+                    "or use prb.AreaMetric() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "
@@ -497,14 +497,14 @@ class Responses:
             row, then = change
             raise ResponseError(
                 f"{self.name}: got {numbers_text(values[row])} from the response "
-                f"{_place(self, specimens, row)}, expected {numbers_text(then)}, its "
+                f"{_place_of_specimen(self, specimens, row)}, expected {numbers_text(then)}, its "
                 "value when the simulator was created: a variable that it reads has changed since "
                 "then (runs begin at the first use); write a function without a state, and one "
                 "for each condition, such as functools.partial(response, load=2.0)"
             )
 
 
-def _place(responses: Responses, points: Sequence[Floats], row: int) -> str:
+def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int) -> str:
     """Return the aleatory inputs of a specimen as a text, with their names."""
     inputs = responses.inputs
     sizes = [math.prod(shape) for shape in inputs.event_shapes]

@@ -155,13 +155,13 @@ def compare(
     coords = {"result": list(results), "hyperparameter": names}
     attrs = {
         "interval": INTERVAL,
-        "findings": as_json(report(*_findings(results, naming))),
+        "findings": as_json(report(*_epsilon_findings(results, naming))),
         **as_attributes(identity),
     }
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-def _findings(results: Mapping[str, Any], model: pm.Model | None) -> list[Finding]:
+def _epsilon_findings(results: Mapping[str, Any], model: pm.Model | None) -> list[Finding]:
     """Return findings of draws whose width is that of epsilon, with the labels of the results."""
     return [
         replace(finding, text=f"{label}: {finding.text}")
