@@ -215,8 +215,9 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
     reason = request
     if not isinstance(request, str):
         arguments, keywords = request
-        pyplot: Any = import_module("matplotlib.pyplot")  # heavy, and partly annotated
-        open_figures = set(pyplot.get_fignums())
+        from matplotlib import pyplot as plt  # heavy, and only needed for pictures
+
+        open_figures = set(plt.get_fignums())
         try:
             picture = image(illustration.function(*arguments, **keywords))
             texts = {"alt": illustration.alt, "caption": illustration.caption}
@@ -225,8 +226,8 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
             # The picture refuses the results, or PyMC has no formula for a distribution.
             reason = str(error)
         finally:
-            for figure in set(pyplot.get_fignums()) - open_figures:
-                pyplot.close(figure)
+            for figure in set(plt.get_fignums()) - open_figures:
+                plt.close(figure)
     name = illustration.function.__name__
     report(Finding("no-picture", f"report: no picture by {name}: {reason}"))
     return str(reason)
@@ -256,7 +257,8 @@ def _graph(model: pm.Model) -> bytes | None:
 
 def _svg(model: pm.Model) -> bytes:
     """Return PyMC's graph of a model, with the simulators labelled."""
-    graphs: Any = import_module("pymc.model_graph")
+    from pymc import model_graph as graphs
+
     graph = graphs.ModelGraph(model)
     # PyMC collects variables and edges in sets of names, whose order changes from process to
     # process; in the model's order the drawing is always the same.
