@@ -210,7 +210,7 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
     total = array.sum(axis=-1, keepdims=True)
     if (total <= 0).any():
         raise ValueError(f"{name}: got weights that sum to zero, expected a positive sum")
-    return np.asarray(array / total)
+    return array / total
 
 
 def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:

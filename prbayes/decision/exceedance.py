@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress
 from os import PathLike
 from typing import Any
 
@@ -23,8 +22,6 @@ from prbayes._validate import (
     Bools,
     Floats,
     Seed,
-    finite_number,
-    flag,
     positive_integer,
     seed_number,
     share,
@@ -48,7 +45,7 @@ from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.response.response import Responses
 from prbayes.results.predict import call_settings
 
 
@@ -178,10 +175,7 @@ def exceedance(
     >>> bool(rarely.error < 0.15 * rarely.probability), rarely.attrs["responses"]
     (True, 1000)
     """
-    caller = "prb.exceedance"
-    refuse_uncallable(caller, response)
-    limit = finite_number(limit, "limit")
-    flag(below, "below")
+    quantity = Exceedance(response, *inputs, limit=limit, below=below, output=output)
     prob = share(prob, "prob")
     if requirement is not None:
         requirement = share(requirement, "requirement")
@@ -192,67 +186,55 @@ def exceedance(
         raise ValueError(f"n_points: got {n_points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
     calling = call_settings(executor, store, version)
-    seed = seed_number(random_seed)
-    populations = Populations.of(result, model, n_draws, caller, calling)
-    question = _Question(populations, response, limit, below, output, seed)
-    places = interval_grid(inputs, steps)
-    estimates = [question.estimate(place, n_points) for place in places]
-    n_searched = 0
-    if len(places) > 1:
-        respond = CentralSpecimens(populations, response, output, n_points or estimates[0].runs)
-        extremes = extreme_places(inputs, places, respond, [limit])
-        places += extremes
-        estimates += [question.estimate(place, n_points) for place in extremes]
-        n_searched = respond.count
+    populations = Populations.of(result, model, n_draws, "prb.exceedance", calling)
+    question = _Question(populations, quantity, seed_number(random_seed))
+    places, estimates, n_searched = question.over_intervals(steps, n_points)
     if n_points is None and requirement is not None:
         estimates = [
             question.refined(estimate, place) if estimate.is_unsure(requirement, prob) else estimate
             for estimate, place in zip(estimates, places, strict=True)
         ]
-    by_draw = np.array([estimate.by_draw for estimate in estimates])
-    means = np.array([estimate.mean for estimate in estimates])
-    errors = np.array([estimate.error for estimate in estimates])
-    low, high = np.transpose([estimate.interval(prob) for estimate in estimates])
-    bounds = [int(means.argmin()), int(means.argmax())]
-    verdict = "" if requirement is None else _verdict(estimates, requirement, prob)
+    intervals = np.array([estimate.interval(prob) for estimate in estimates])
+    bounds = [choose(estimates, key=lambda estimate: estimate.mean) for choose in (min, max)]
     # A probability is rough if two standard errors are about a factor of two, or would decide the
     # requirement.
-    is_rough = np.zeros(len(means), dtype=bool)
-    is_rough[bounds] = errors[bounds] > 0.3 * means[bounds]
-    if requirement is not None and verdict == "not decided":
-        is_rough |= [estimate.is_unsure(requirement, prob, 0.5) for estimate in estimates]
+    rough = [estimate for estimate in bounds if estimate.error > 0.3 * estimate.mean]
+    decision: dict[str, Any] = {}
+    if requirement is not None:
+        decision = {
+            "requirement": requirement,
+            "verdict": _verdict(estimates, requirement, prob),
+        }
+        if decision["verdict"] == "not decided":
+            rough += [x for x in estimates if x.is_unsure(requirement, prob, 0.5)]
     table = ExceedanceTable(
         {
-            "probability": ("bound", means[bounds]),
-            "error": ("bound", errors[bounds]),
-            "by_draw": (["bound", "draw"], by_draw[bounds]),
-            "lower": low.min(),
-            "upper": high.max(),
+            "probability": ("bound", [estimate.mean for estimate in bounds]),
+            "error": ("bound", [estimate.error for estimate in bounds]),
+            "by_draw": (["bound", "draw"], [estimate.by_draw for estimate in bounds]),
+            "lower": intervals[:, 0].min(),
+            "upper": intervals[:, 1].max(),
         },
         coords={"bound": ["lower", "upper"]},
         attrs={
             "prob": prob,
-            "limit": limit,
+            "limit": quantity.limit,
             "below": int(below),
             "response": response_name(response),
             "responses": n_searched + sum(estimate.responses for estimate in estimates),
-            "source": estimates[bounds[1]].source,
-            "random_seed": str(seed),
-            "findings": as_json(
-                report(
-                    *_rough_finding(response, estimates, is_rough),
-                    *_left_out_finding(response, max(estimate.lost for estimate in estimates)),
-                )
-            ),
+            "source": bounds[1].source,
+            "random_seed": str(question.seed),
+            "findings": as_json(_error_findings(response, estimates, rough)),
             **populations.provenance(),
+            **decision,
         },
     )
     if len(places) == 1:
         table = table.isel(bound=0, drop=True)
     else:
-        table.attrs["at"] = [interval_values(inputs, places[bound]) for bound in bounds]
-    if requirement is not None:
-        table.attrs |= {"requirement": requirement, "verdict": verdict}
+        table.attrs["at"] = [
+            interval_values(inputs, places[estimates.index(estimate)]) for estimate in bounds
+        ]
     return table
 
 
@@ -345,21 +327,16 @@ class _Question:
     """A response beyond a limit, in populations."""
 
     populations: Populations
-    response: Callable[..., Any]
-    limit: float
-    below: bool
-    output: Any
+    quantity: Exceedance
     seed: int
 
     def estimate(self, inputs: Sequence[Any], points: int | None) -> _Estimate:
         """Return the probabilities by new points near the limit, or by stored responses if none."""
-        quantity = Exceedance(
-            self.response, *inputs, limit=self.limit, below=self.below, output=self.output
-        )
+        quantity = self.quantity
         if points:
-            responses = self.populations.responses(self.response, inputs)
+            responses = self.populations.responses(quantity.response, inputs)
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
-        sample = self.populations.sample(self.response, inputs, self.output)
+        sample = self.populations.sample(quantity.response, inputs, quantity.output)
         by_draw = sample.evaluate(quantity.of, self.populations.thetas)
         error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
@@ -367,6 +344,21 @@ class _Question:
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
         count, n_runs = sample.responses.count, sample.design.n_runs
         return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
+
+    def over_intervals(
+        self, steps: int, n_points: int | None
+    ) -> tuple[list[tuple[Any, ...]], list[_Estimate], int]:
+        """Return places of the intervals with their estimates, and the responses of the search."""
+        quantity = self.quantity
+        places = interval_grid(quantity.inputs, steps)
+        estimates = [self.estimate(place, n_points) for place in places]
+        if len(places) == 1:
+            return places, estimates, 0
+        n_runs = n_points or estimates[0].runs
+        respond = CentralSpecimens(self.populations, quantity.response, quantity.output, n_runs)
+        extremes = extreme_places(quantity.inputs, places, respond, [quantity.limit])
+        estimates += [self.estimate(place, n_points) for place in extremes]
+        return places + extremes, estimates, respond.count
 
     def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
         """Return an estimate by new points, if they are no more than the runs of the first one.
@@ -434,31 +426,31 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
     return float(np.nanstd(by_draw, ddof=1) / np.sqrt(n)) if populations.are_draws else 0.0
 
 
-def _rough_finding(response: Any, estimates: Sequence[_Estimate], is_rough: Bools) -> list[Finding]:
-    """Return a finding if the error of a probability is too large."""
-    rough = list(compress(estimates, is_rough))
-    if not rough:
-        return []
-    worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)
-    more = "n_points=1000, which computes as many"
-    if worst.points:
-        more = f"more than n_points={worst.points}"
-    text = (
-        f"{response_name(response)}: a probability of {worst.mean:.2g} has a standard error "
-        f"of {worst.error:.2g}; pass {more} responses where the limit is exceeded."
-    )
-    return [Finding("rough-probability", text)]
-
-
-def _left_out_finding(response: Any, lost: float) -> list[Finding]:
-    """Return a finding if a share of the populations has no response."""
-    if lost < SMALLEST_SHARE:
-        return []
-    text = (
-        f"{response_name(response)}: {lost:.1%} of specimens {NO_RESPONSE}: the probability is "
-        "that of the others. A response that returns +inf counts as a specimen that failed."
-    )
-    return [Finding("specimens-left-out", text, "distributed.md#when-a-response-fails")]
+def _error_findings(
+    response: Any, estimates: Sequence[_Estimate], rough: Sequence[_Estimate]
+) -> tuple[Finding, ...]:
+    """Report a probability with a large error, and a share of specimens without response."""
+    name = response_name(response)
+    findings = []
+    if rough:
+        worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)
+        more = "n_points=1000, which computes as many"
+        if worst.points:
+            more = f"more than n_points={worst.points}"
+        text = (
+            f"{name}: a probability of {worst.mean:.2g} has a standard error of "
+            f"{worst.error:.2g}; pass {more} responses where the limit is exceeded."
+        )
+        findings.append(Finding("rough-probability", text))
+    lost = max(estimate.lost for estimate in estimates)
+    if lost >= SMALLEST_SHARE:
+        text = (
+            f"{name}: {lost:.1%} of specimens {NO_RESPONSE}: the probability is that of the "
+            "others. A response that returns +inf counts as a specimen that failed."
+        )
+        page = "distributed.md#when-a-response-fails"
+        findings.append(Finding("specimens-left-out", text, page))
+    return report(*findings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,7 +495,7 @@ class _Shell:
         """Return n draws, (n, D), whose radius is at least half of the largest one."""
         z = rng.standard_normal((n, self.d))
         radius = self.radius * (1 + (np.arange(n) + rng.random(n)) / max(n, 1)) / 2
-        return np.asarray(z * (radius / np.linalg.norm(z, axis=1))[:, None])
+        return z * (radius / np.linalg.norm(z, axis=1))[:, None]
 
     def log_density(self, z: Floats) -> Floats:
         """Return the log-density, (n, D) -> (n,)."""
@@ -674,12 +666,7 @@ class _Part:
     """A part of the region where responses are above a level, with a proposal in it."""
 
     level: float  # rises to the limit
-    proposal: _Normal
-
-    @property
-    def center(self) -> Floats:
-        """The center of the proposal, (D,)."""
-        return self.proposal.mean
+    proposal: _Normal  # centred on the part
 
 
 def _mixture(parts: list[_Part], wide: list[_Proposal]) -> list[_Proposal]:
@@ -705,7 +692,7 @@ def _first_parts(points: _Points, limit: float) -> list[_Part]:
 def _moved(parts: list[_Part], points: _Points, limit: float) -> list[_Part]:
     """Return parts whose level and proposal follow from the points nearest to their centers."""
     values = np.where(np.isnan(points.values), -np.inf, points.values)
-    centers = np.array([part.center for part in parts])
+    centers = np.array([part.proposal.mean for part in parts])
     distance = np.linalg.norm(points.z[:, None] - centers, axis=2)
     owner, log_weights = distance.argmin(axis=1), points.log_weights()
     result = []
@@ -736,7 +723,7 @@ def _separate(
     Two parts are the same if the response halfway between them is above the lower level. A part
     below the limit and one that has reached it stay: points nearer to the origin are more likely.
     """
-    parts = sorted(parts, key=lambda part: (-part.level, (part.center**2).sum()))
+    parts = sorted(parts, key=lambda part: (-part.level, (part.proposal.mean**2).sum()))
     pairs = [
         (i, j)
         for j in range(len(parts))
@@ -745,7 +732,9 @@ def _separate(
     ]
     if not pairs:
         return parts, 0
-    values = respond(np.array([(parts[i].center + parts[j].center) / 2 for i, j in pairs]))
+    values = respond(
+        np.array([(parts[i].proposal.mean + parts[j].proposal.mean) / 2 for i, j in pairs])
+    )
     is_same = {
         pair: value >= min(parts[pair[0]].level, parts[pair[1]].level)
         for pair, value in zip(pairs, values, strict=True)

@@ -137,22 +137,8 @@ def p_box(
         samples += [populations.sample(response, place, output) for place in extremes]
         y = _evaluation_points(samples)
         n_searched = respond.count
-    lower, upper, means, errors = [], [], [], []
-    tail = (1 - prob) / 2
-    for sample in samples:
-        functions = _distribution_functions(sample, y)
-        mean = functions.mean(axis=0)
-        error = sample.share_error(lambda values: (values[:, None] <= y).astype(float))
-        if populations.are_draws:
-            error = np.hypot(error, functions.std(axis=0, ddof=1) / np.sqrt(len(functions)))
-        least, most = probability_bounds(mean, error, tail)
-        low, high = np.quantile(functions, [tail, 1 - tail], axis=0)
-        lowest, highest = envelope(functions, 1 - prob)
-        at_top, at_bottom = mean > 1 - 1e-12, mean == 0
-        lower.append([np.where(at_top, least, band) for band in (low, lowest)])
-        upper.append([np.where(at_bottom, most, band) for band in (high, highest)])
-        means.append(mean)
-        errors.append(error)
+    bands = [_bands(sample, y, prob) for sample in samples]
+    lower, upper, means, errors = zip(*bands, strict=True)
     # Distribution functions increase, so that a bound at y also holds beyond it.
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
@@ -214,6 +200,22 @@ def _evaluation_points(samples: list[ResponseSample]) -> Floats:
         weights = sample.mean_weights()[is_finite]
         points.append(quantile(sample.values[is_finite], weights / weights.sum(), levels))
     return np.unique(np.concatenate(points))
+
+
+def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]:
+    """Return lower and upper ends of both bands at y, (2, m), the mean function and its error."""
+    functions = _distribution_functions(sample, y)
+    mean = functions.mean(axis=0)
+    error = sample.share_error(lambda values: (values[:, None] <= y).astype(float))
+    if sample.populations.are_draws:
+        error = np.hypot(error, functions.std(axis=0, ddof=1) / np.sqrt(len(functions)))
+    tail = (1 - prob) / 2
+    least, most = probability_bounds(mean, error, tail)
+    low, high = np.quantile(functions, [tail, 1 - tail], axis=0)
+    lowest, highest = envelope(functions, 1 - prob)
+    lower = np.where(mean > 1 - 1e-12, least, [low, lowest])
+    upper = np.where(mean == 0, most, [high, highest])
+    return lower, upper, mean, error
 
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:

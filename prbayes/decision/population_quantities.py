@@ -24,13 +24,12 @@ from prbayes.optimize.optimum import identity_in
 from prbayes.response.inputs import (
     Groups,
     event_shape,
-    is_group,
     unit_of,
 )
 from prbayes.response.moments import InputMoments
 from prbayes.response.outputs import SINGLE_OUTPUT
 from prbayes.response.pymc_dims import is_random
-from prbayes.results.predict import covariate_values
+from prbayes.results.predict import covariate_values, points_by_group
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,18 +103,11 @@ class PopulationReader:
         label = f"{self.populations.caller}: {name}"
         inputs = read_inputs_of_copy(label, [dist], self.populations.evaluator.model, fixed=True)
         at = {str(v.name): self.at[v.name] for v in inputs.covariates if v.name in self.at}
-        points = dict(self._points)
         size = len(self._thetas)
-        for covariate, value in covariate_values(label, inputs, at, {}, has_runs=False).items():
-            points[covariate] = np.full((size, 1), value)
-        by_group = [points]
-        if inputs.groups is not None:
-            (index,) = [str(parent.name) for parent in inputs.parents if is_group(parent)]
-            places = range(len(inputs.groups.labels))
-            by_group = [points | {index: np.full(size, place)} for place in places]
+        points = self._points | covariate_values(label, inputs, at, {}, size, has_runs=False)
         moments = InputMoments(label, inputs, list(self.levels.values()))
         arrays = []  # (k, q, elements): numbers of each group
-        for group_points in by_group:
+        for group_points in points_by_group(inputs, points):
             arrays.append(moments.numbers([group_points[str(p.name)] for p in inputs.parents]))
         numbers = np.stack(arrays)
         numbers = np.broadcast_to(numbers, (len(arrays), size, *numbers.shape[2:]))

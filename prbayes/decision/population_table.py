@@ -128,26 +128,13 @@ def population(
     prob = share(prob, f"{_CALLER}: prob")
     upper = flag(upper, f"{_CALLER}: upper")
     positive_integer(n_draws, f"{_CALLER}: n_draws", minimum=2)
-    if not isinstance(quantiles, Sequence | np.ndarray) or isinstance(quantiles, str):
-        raise TypeError(
-            f"{_CALLER}: quantiles: got {called(quantiles)}, expected probabilities between 0 and "
-            "1, such as (0.05, 0.5, 0.95)"
-        )
-    probabilities = [share(p, f"{_CALLER}: quantiles") for p in quantiles]
+    probabilities = [share(p, f"{_CALLER}: quantiles") for p in np.atleast_1d(quantiles).tolist()]
     levels = {f"{100 * p:g}% quantile": p for p in probabilities}
     populations = Populations.of(
         result, model, n_draws, _CALLER, call_settings(executor, store, version)
     )
-    simulators = populations.evaluator.simulators
-    covariates = {str(v.name) for node in simulators for v in node.inputs.covariates}
-    if at is not None and not (isinstance(at, Mapping) and set(at) <= covariates):
-        raise ValueError(
-            f"{_CALLER}: at: got {called(at)}, expected values of covariates of the model, some of "
-            f"{sorted(covariates)}"
-        )
     bases = {name: 1 - p if upper else p for name, p in BASES.items()}
-    levels |= bases
-    reader = PopulationReader(populations, levels, at or {})
+    reader = PopulationReader(populations, levels | bases, _covariates(populations, at))
     elements = reader.elements(inputs)
     names = list(dict.fromkeys(name for x in elements for name in x.numbers))
     groups = {x.groups.dim: list(x.groups.labels) for x in elements if x.groups is not None}
@@ -159,20 +146,15 @@ def population(
     n_groups = max(map(len, groups.values()), default=1)
     # table, (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
-    tails = tail_levels(prob)
-    confidence = 0.95 if upper else 0.05
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
             draws = values if populations.are_draws else values[..., 1:]
             q = names.index(name)
             if name in bases:
-                table[0, i, :, q] = _quantiles(draws, [confidence])[0]
-                continue
-            low, high = _quantiles(draws, tails)
-            estimate = values[:, 0]
-            if populations.are_draws:
-                estimate = np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
-            table[:, i, :, q] = [estimate, low, high]
+                table[0, i, :, q] = _quantiles(draws, [0.95 if upper else 0.05])[0]
+            else:
+                estimate = _means(draws) if populations.are_draws else values[:, 0]
+                table[:, i, :, q] = [estimate, *_quantiles(draws, tail_levels(prob))]
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -193,6 +175,23 @@ def population(
             **populations.provenance(),
         },
     )
+
+
+def _covariates(populations: Populations, at: Any) -> Mapping[str, float]:
+    """Return the values of covariates, or raise if the model has no such covariate."""
+    simulators = populations.evaluator.simulators
+    covariates = {str(v.name) for node in simulators for v in node.inputs.covariates}
+    if at is not None and not (isinstance(at, Mapping) and set(at) <= covariates):
+        raise ValueError(
+            f"{_CALLER}: at: got {called(at)}, expected values of covariates of the model, some of "
+            f"{sorted(covariates)}"
+        )
+    return at or {}
+
+
+def _means(draws: Floats) -> Floats:
+    """Return means over populations, (groups, k) -> (groups,), without infinite draws."""
+    return np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
 
 
 def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:

@@ -27,14 +27,12 @@ from prbayes.decision.quantities import (
     refuse_quantity,
 )
 from prbayes.inference.asymptotics import oriented
-from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedSample, EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
-from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.numerics.points import inside, sobol
-from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
+from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
@@ -49,6 +47,7 @@ from prbayes.results.predict import (
     known_scatter,
     model_of,
     named_response,
+    provenance,
     refuse_unsupported,
     serving,
     thetas_of,
@@ -96,8 +95,7 @@ class Populations:
 
     def provenance(self) -> dict[str, Any]:
         """Return the attributes of a table: the problem's fingerprint, and versions."""
-        identity = identity_in(self.result) or identity_of(self.evaluator.model)
-        return {**as_attributes(identity), **versions()}
+        return provenance(self.result, self.evaluator.model)
 
     def thinned(self) -> Floats:
         """Return about `N_CHECKED` thetas, evenly spaced in their order."""

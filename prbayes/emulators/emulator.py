@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
@@ -43,7 +42,7 @@ class Emulator:
     components: Floats | None
     surfaces: tuple[FittedSurface, ...]  # surface of each output, or of each principal component
 
-    def __call__(self, z: Floats, columns: NDArray[np.intp] | None = None) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats, columns: Indices | None = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
 
         With ``columns``, (k, c), they are those of the outputs listed in the row of each point.
@@ -67,16 +66,16 @@ class Emulator:
         values = np.stack([surface.values(z) for surface in self.surfaces], axis=1)
         if self.components is not None:
             values = values @ self.components
-        return np.asarray(self.center + self.unit * values)
+        return self.center + self.unit * values
 
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances at points, (k, d) -> (k, m), in squared units of outputs."""
         variances = np.stack([surface.variance(z) for surface in self.surfaces], axis=1)
         if self.components is not None:
             variances = variances @ self.components**2
-        return np.asarray(self.unit**2 * variances)
+        return self.unit**2 * variances
 
-    def without_each(self, masks: NDArray[np.bool_]) -> list[Emulator]:
+    def without_each(self, masks: Bools) -> list[Emulator]:
         """Return emulators with the same settings that lack some runs each, (B, n)."""
         parts = zip(*(surface.without_each(masks) for surface in self.surfaces), strict=True)
         return [replace(self, surfaces=surfaces) for surfaces in parts]
@@ -86,7 +85,7 @@ class Emulator:
 def fit_emulator(
     z: Floats,
     y: Floats,
-    near: Floats | NDArray[np.bool_] | None = None,
+    near: Floats | Bools | None = None,
     *,
     tried: Sequence[Surface] = CANDIDATES,
     start: Emulator | None = None,

@@ -16,9 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.emulators.surfaces import Surface
 
@@ -27,7 +26,7 @@ from prbayes.emulators.surfaces import Surface
 class Follower:
     """An emulator of one output, with a coarse response as its last input."""
 
-    rows: NDArray[np.bool_]  # (n,): runs with a finite coarse response, used in the fit
+    rows: Bools  # (n,): runs with a finite coarse response, used in the fit
     center: float  # location of the coarse response
     unit: float  # scale of the coarse response; after scaling it has the spread of the inputs
     emulator: Emulator

@@ -29,10 +29,9 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legder, legval
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 
 # Largest number of runs of a surface, whose cost grows with the cube of this number.
 MOST_RUNS = 2000
@@ -107,7 +106,7 @@ class Kriging:
 
     z: Floats  # (n, d): inputs of the runs
     y: Floats  # (n,): output of the runs
-    rows: NDArray[np.intp]  # (n,): indices of these runs among all runs
+    rows: Indices  # (n,): indices of these runs among all runs
     kernel: str
     lengths: Floats  # (d,): length scales, the units of distances
     degree: int  # degree of the polynomial
@@ -153,7 +152,7 @@ class Kriging:
         """Return predictive variances at points, (k, d) -> (k,)."""
         from scipy.linalg import solve_triangular
 
-        system, kernel = self._system, KERNELS[self.kernel]
+        system, kernel = System.of_surface(self), KERNELS[self.kernel]
         factor = system.factor(self.nugget)
         assert factor is not None  # the factor exists, since the fit has solved the same system
         errors, at_zero = np.empty(len(z)), kernel(np.zeros(1))[0]
@@ -171,12 +170,12 @@ class Kriging:
             errors[rows] -= (solved**2).sum(axis=0)
         return np.maximum(errors, 0) * self.scale
 
-    def without_each(self, masks: NDArray[np.bool_]) -> list[Kriging]:
+    def without_each(self, masks: Bools) -> list[Kriging]:
         """Return the surfaces, of the same lengths, that lack some of all runs each, (B, ...)."""
         surfaces = []
         for mask in masks[:, self.rows]:
             part = replace(self, z=self.z[~mask], y=self.y[~mask], rows=self.rows[~mask])
-            system = part._system
+            system = System.of_surface(part)
             factor = system.factor(self.nugget)
             if factor is None:
                 raise np.linalg.LinAlgError("interpolation: the remaining runs are singular")
@@ -184,12 +183,6 @@ class Kriging:
             coefficients = system.trend(part.y, weights)
             surfaces.append(replace(part, weights=weights, coefficients=coefficients))
         return surfaces
-
-    @property
-    def _system(self) -> System:
-        """The linear system for the weights of the runs."""
-        matrix = kernel_matrix(self.kernel, self.z / self.lengths)
-        return System.of(matrix, *np.linalg.qr(self.polynomials(self.z).T))
 
     @cached_property
     def polynomials(self) -> Polynomials:
@@ -199,7 +192,7 @@ class Kriging:
     @cached_property
     def _scaled_runs(self) -> Floats:
         """The runs relative to the center, in units of lengths, (n, d)."""
-        return np.asarray((self.z - self.polynomials.center) / self.lengths)
+        return (self.z - self.polynomials.center) / self.lengths
 
     @cached_property
     def _on_line(self) -> tuple[Any, Floats] | None:
@@ -225,7 +218,7 @@ class Kriging:
         polynomials = self.polynomials
         if self.degree <= 2:
             # A quadratic form takes less time than products of polynomials.
-            constant, linear, hessian = self._quadratic_form
+            constant, linear, hessian = polynomials.quadratic_form(self.coefficients)
             u = polynomials.scaled(z).T
             slopes = u @ hessian + linear
             values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
@@ -239,20 +232,6 @@ class Kriging:
             factors[:, a] = derivative.T @ single[:-1, a]
             slopes[:, a] = self.coefficients @ polynomials.terms(factors) / half_width
         return self.coefficients @ polynomials.terms(single), slopes
-
-    @cached_property
-    def _quadratic_form(self) -> tuple[float, Floats, Floats]:
-        """Constant, slopes, (d,), and second derivatives, (d, d), of a polynomial of degree two."""
-        powers, coefficients = self.polynomials.powers, self.coefficients
-        degrees = powers.sum(axis=1)
-        # Squares are in the terms P_2(u) = (3 u^2 - 1) / 2.
-        is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
-        products = powers[is_product]
-        hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
-        of_squares = powers[is_square].T @ coefficients[is_square]
-        np.fill_diagonal(hessian, 1.5 * of_squares)
-        constant = coefficients[degrees == 0].sum() - 0.25 * of_squares.sum()
-        return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield the rows of blocks of points, the points (d, k), squared distances to runs (n, k).
@@ -281,7 +260,7 @@ class Polynomials:
 
     center: Floats  # (d,): center of the box
     half_width: Floats  # (d,): half of the box's width
-    powers: NDArray[np.intp]  # (terms, d): degrees of the factors of each term, in order of degree
+    powers: Indices  # (terms, d): degrees of the factors of each term, in order of degree
 
     @classmethod
     def of(cls, z: Floats, degree: int) -> Polynomials:
@@ -303,6 +282,18 @@ class Polynomials:
     def scaled(self, z: Floats) -> Floats:
         """Return the variables of the polynomials, (k, d) -> (d, k)."""
         return np.ascontiguousarray(((z - self.center) / self.half_width).T)
+
+    def quadratic_form(self, coefficients: Floats) -> tuple[float, Floats, Floats]:
+        """Return constant, slopes, (d,), and second derivatives, (d, d), for a degree of two."""
+        powers, degrees = self.powers, self.powers.sum(axis=1)
+        # Squares are in the terms P_2(u) = (3 u^2 - 1) / 2.
+        is_square, is_product = powers.max(axis=1) == 2, powers.max(axis=1) < degrees
+        products = powers[is_product]
+        hessian = (products * coefficients[is_product, None]).T @ products.astype(np.float64)
+        of_squares = powers[is_square].T @ coefficients[is_square]
+        np.fill_diagonal(hessian, 1.5 * of_squares)
+        constant = coefficients[degrees == 0].sum() - 0.25 * of_squares.sum()
+        return float(constant), powers[degrees == 1].T @ coefficients[degrees == 1], hessian
 
     def by_input(self, z: Floats) -> Floats:
         """Return the Legendre polynomials of each input, (degree + 1, d, k)."""
@@ -349,6 +340,12 @@ class System:
         projected -= half.T
         return cls(kernels, basis, root, projected, sigma, float(np.abs(kernels).max()))
 
+    @classmethod
+    def of_surface(cls, surface: Kriging) -> System:
+        """Return the system for the weights of the runs of a surface."""
+        matrix = kernel_matrix(surface.kernel, surface.z / surface.lengths)
+        return cls.of(matrix, *np.linalg.qr(surface.polynomials(surface.z).T))
+
     def factor(self, nugget: float) -> Floats | None:
         """Return the lower factor of the matrix with a nugget; None if it is singular."""
         matrix = self.projected.copy()
@@ -365,7 +362,7 @@ class System:
 
     def contrasts(self, y: Floats) -> Floats:
         """Return P y, (n,)."""
-        return np.asarray(y - self.basis @ (self.basis.T @ y))
+        return y - self.basis @ (self.basis.T @ y)
 
     def weights(self, factor: Floats, y: Floats, nugget: float) -> tuple[Floats, Floats]:
         """Return the weights of outputs, (n,), and the last step of their refinement, (n,)."""
@@ -382,7 +379,7 @@ class System:
     def trend(self, y: Floats, weights: Floats) -> Floats:
         """Return the coefficients of the polynomials, (p,)."""
         rest = self.basis.T @ (y - self.kernels @ weights)
-        return np.asarray(np.linalg.solve(self.root, rest))
+        return np.linalg.solve(self.root, rest)
 
 
 def kernel_matrix(kernel: str, scaled: Floats) -> Floats:
@@ -409,7 +406,7 @@ def spread_of(z: Floats) -> Floats:
     return np.where(spread > 0, spread, 1.0)
 
 
-def spread_rows(weights: Floats, most: int) -> NDArray[np.intp]:
+def spread_rows(weights: Floats, most: int) -> Indices:
     """Return at most so many runs: half are those of the largest weights, others are spread."""
     n = len(weights)
     if n <= most:

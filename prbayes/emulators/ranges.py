@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pytensor.graph.basic import Variable
 
-from prbayes._validate import Floats, real_array
+from prbayes._validate import Bools, Floats, Shape, real_array
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, PriorSampler, valid
@@ -38,7 +38,7 @@ class Range:
         return self.low.size
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """The shape of one value."""
         return self.low.shape
 
@@ -60,7 +60,7 @@ class Ranges:
         return np.concatenate([r.high.ravel() for r in self.inputs])
 
     @cached_property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bools:
         """Which columns are not constant."""
         return np.repeat(self.varying, [r.size for r in self.inputs])
 
@@ -78,7 +78,7 @@ class Ranges:
         """Return the free columns with their ranges mapped to [0, 1]."""
         low = self.low[self.free]
         high = self.high[self.free]
-        return np.asarray((columns[:, self.free] - low) / (high - low))
+        return (columns[:, self.free] - low) / (high - low)
 
     def at(self, unit: Floats) -> Floats:
         """Return rows for points of the unit cube, shape (n, dimensions)."""
@@ -91,15 +91,15 @@ class Ranges:
         scaled = self.scaled(rows)
         return np.stack([np.quantile(x, u) for x, u in zip(scaled.T, unit.T, strict=True)], axis=1)
 
-    def outside(self, columns: Floats) -> NDArray[np.bool_]:
+    def outside(self, columns: Floats) -> Bools:
         """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
         # The slack, far above rounding, is for bounds that the user has computed in another way.
         slack = 1e-9 * (self.high - self.low)
         # Comparisons with NaN are false, so that NaN is outside.
         inside = (columns >= self.low - slack) & (columns <= self.high + slack)
-        return np.asarray(~inside)
+        return ~inside
 
-    def complaint(self, columns: Floats, is_outside: NDArray[np.bool_]) -> str:
+    def complaint(self, columns: Floats, is_outside: Bools) -> str:
         """Return a sentence about the inputs of rows that are `outside`."""
         inputs = []
         for r, place in self._places():
@@ -119,7 +119,7 @@ class Ranges:
             for r, place in self._places()
         ]
 
-    def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, tuple[int, ...]]:
+    def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, Shape]:
         """Return inputs, (..., *event) each, as rows, and their leading shape; or raise."""
         if len(values) != len(self.inputs):
             names = ", ".join(r.name for r in self.inputs)

@@ -8,11 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from prbayes._display import without_constructor
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.emulator import Emulator, fit_emulator, with_failures
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
@@ -94,15 +93,15 @@ class TrainingRuns:
     x: Floats  # (n, d): inputs
     y: Floats  # (n, m): outputs; a run with an output that is not finite is left out
     importance: Floats  # (n,): mean importance weights in the populations of interest, of sum one
-    blocks: NDArray[np.intp]  # (n,): block of each run; each block is spread over all runs
+    blocks: Indices  # (n,): block of each run; each block is spread over all runs
 
     @cached_property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Bools:
         """Which have outputs, shape (n,)."""
         return np.isfinite(self.y).all(axis=1)
 
     @cached_property
-    def rows(self) -> NDArray[np.intp]:
+    def rows(self) -> Indices:
         """The different runs with outputs, on which an emulator is fitted."""
         rows = np.flatnonzero(self.good)
         return np.sort(rows[np.unique(self.x[rows], axis=0, return_index=True)[1]])
@@ -115,10 +114,10 @@ class TrainingRuns:
 
     def scaled(self, x: Floats) -> Floats:
         """Return inputs in units of their spread."""
-        return np.asarray(x / self.spread)
+        return x / self.spread
 
     @cached_property
-    def block_masks(self) -> NDArray[np.bool_]:
+    def block_masks(self) -> Bools:
         """The runs of each block, (B, n)."""
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
@@ -134,9 +133,7 @@ class TrainingRuns:
         near = self.importance[rows] + 0.1 / len(self.y)
         return fit_emulator(self.scaled(self.x[rows]), self.y[rows], near, tried=usable)
 
-    def predict(
-        self, emulator: Emulator, at: Floats, without: NDArray[np.bool_] | None = None
-    ) -> Floats:
+    def predict(self, emulator: Emulator, at: Floats, without: Bools | None = None) -> Floats:
         """Return outputs at points, (k, d) -> (k, m), by an emulator without some runs, (n,).
 
         Where the nearest run failed, the outputs are those of that run. Predictions are at most one
@@ -164,9 +161,7 @@ class TrainingRuns:
         return values
 
 
-def weight_of_runs(
-    weights: Floats, y: Floats, predictions: Floats, blocks: NDArray[np.intp]
-) -> float:
+def weight_of_runs(weights: Floats, y: Floats, predictions: Floats, blocks: Indices) -> float:
     """Return the share of a population that the runs have, from 0 (the emulator alone) to 1.
 
     The emulator's distribution functions have a bias, estimated from runs that were left out; those
@@ -226,4 +221,4 @@ class SmoothedSteps:
         if not self.width > 0:
             return (values[:, None] <= self.levels).astype(float)
         ramp = (self.levels - values[:, None]) / self.width + 0.5
-        return np.asarray(np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0))
+        return np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0)

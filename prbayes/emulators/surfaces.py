@@ -17,9 +17,8 @@ from math import comb
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats, positive_integer
+from prbayes._validate import Bools, Floats, positive_integer
 from prbayes.emulators.kriging import Kriging, Polynomials, spread_of
 
 Predict = Callable[[Floats], Floats]
@@ -48,7 +47,7 @@ class FittedSurface(Protocol):
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances at points, (k, d) -> (k,)."""
 
-    def without_each(self, masks: NDArray[np.bool_]) -> Sequence[FittedSurface]:
+    def without_each(self, masks: Bools) -> Sequence[FittedSurface]:
         """Return surfaces with the same settings that lack some runs each, (B, n)."""
 
 
@@ -148,9 +147,9 @@ class Refitted:
     model: Surface
     z: Floats  # (n, d): inputs of the runs
     y: Floats  # (n,): output of the runs
-    folds: NDArray[np.bool_]  # (B, n): which runs each fold leaves out
+    folds: Bools  # (B, n): which runs each fold leaves out
     weights: Floats  # (n,): weights of the runs' errors
-    used: NDArray[np.bool_] | slice = slice(None)  # runs that the surface is fitted to
+    used: Bools | slice = slice(None)  # runs that the surface is fitted to
 
     @cached_property
     def predict(self) -> Predict:
@@ -195,7 +194,7 @@ class Refitted:
         distances, nearest = tree.query(z / spread)
         return np.asarray((self.error * distances / gaps[nearest]) ** 2)
 
-    def without_each(self, masks: NDArray[np.bool_]) -> list[Refitted]:
+    def without_each(self, masks: Bools) -> list[Refitted]:
         """Return surfaces that lack some runs each, (B, n)."""
         return [replace(self, used=~mask) for mask in masks]
 
@@ -287,4 +286,4 @@ class Following(Surface):
 
 def _followed(rho: float, rest: Predict, at: Floats) -> Floats:
     """Return rho times the last input plus a surface of the other inputs, (k, d) -> (k,)."""
-    return np.asarray(rho * at[:, -1] + np.asarray(rest(at[:, :-1])).reshape(len(at)))
+    return rho * at[:, -1] + np.asarray(rest(at[:, :-1])).reshape(len(at))

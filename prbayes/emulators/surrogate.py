@@ -17,8 +17,10 @@ from prbayes._display import Shown, View, without_constructor
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import (
+    Bools,
     Floats,
     Seed,
+    Shape,
     file_path,
     flag,
     plain_text,
@@ -55,8 +57,8 @@ class DesignSurface:
 
     domain: Ranges
     unit: Floats  # (n, d): the design in the unit cube
-    usable: NDArray[np.bool_]  # (n,): whether all outputs of a run are finite
-    event: tuple[int, ...]  # shape of a response
+    usable: Bools  # (n,): whether all outputs of a run are finite
+    event: Shape  # shape of a response
     emulator: Emulator  # emulator, fitted in the unit cube
     # The coarse response that the surface follows, and the emulator that has it as an input.
     coarse: Callable[..., Any] | None = None
@@ -302,15 +304,7 @@ class Surrogate(Shown):
         refuse_misfit(name, response, [r.size for r in domain.inputs])
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
-        unit = sobol(n, domain.dimensions, seed)
-        if points == "predictive":
-            if predictive is None:
-                raise ValueError(
-                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
-                    "`.dist()` among them; leave points= out"
-                )
-            unit = domain.like(predictive, unit)
-        design = domain.at(unit)
+        design = domain.at(_unit_points(name, domain, predictive, n, points, seed))
 
         # Compute the coarse responses first, because an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
@@ -522,7 +516,7 @@ class Surrogate(Shown):
         columns, batch = self.domain.columns(inputs)
         residuals = self._surface.nearby(self.error.residuals, columns)
         rms = np.sqrt((residuals**2).mean(axis=1))
-        return np.asarray(rms.reshape((*batch, *self.responses.shape[1:])))
+        return rms.reshape((*batch, *self.responses.shape[1:]))
 
     def with_error(self, random_seed: Seed = 0) -> Surrogate:
         """Return the surrogate with its error added.
@@ -642,7 +636,7 @@ def values_inside(surrogate: Surrogate, columns: Floats) -> Floats:
     return with_failures(values, unit, surface.unit, surrogate.responses)
 
 
-def with_output_labels(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
+def with_output_labels(surrogate: Surrogate, values: Floats, batch: Shape) -> Any:
     """Return values of rows in the shape of a batch, with the labels of the outputs."""
     values = values.reshape((*batch, *surrogate.responses.shape[1:]))
     outputs = surrogate._surface.outputs
@@ -665,7 +659,7 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
     return h
 
 
-def _usable(responses: Floats) -> NDArray[np.bool_]:
+def _usable(responses: Floats) -> Bools:
     """Return whether all outputs of each run are finite, (n,)."""
     return ~is_missing(np.where(np.isfinite(responses), responses, np.nan))
 
@@ -736,6 +730,21 @@ def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns
             "of the same inputs; repair it, or leave coarse= out"
         )
     return values
+
+
+def _unit_points(
+    name: str, domain: Ranges, predictive: Any, n: int, points: str, seed: int
+) -> Floats:
+    """Return n points of the unit cube: uniform, or distributed as the prior predictive."""
+    unit = sobol(n, domain.dimensions, seed)
+    if points != "predictive":
+        return unit
+    if predictive is None:
+        raise ValueError(
+            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
+            "among them; leave points= out"
+        )
+    return domain.like(predictive, unit)
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:

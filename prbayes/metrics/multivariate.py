@@ -164,7 +164,7 @@ def repelled(u: Floats, steps: int = 2000) -> Floats:
     """
 
     def normalized(vectors: Floats) -> Floats:
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
     u = normalized(u)
     number, m = u.shape

@@ -49,7 +49,7 @@ class WeightSlopes:
         """Standard deviations of the derivatives of the log weights, (d,)."""
         # At an edge of the support a weight may be zero although its derivative is not.
         positive = np.maximum(self.weights, 1e-3 * self.weights.mean())
-        return np.asarray(np.sqrt((self.slopes**2 / positive).sum(axis=1)))
+        return np.sqrt((self.slopes**2 / positive).sum(axis=1))
 
     def neighbours(
         self, part: Part, options: ScoreOptions
@@ -90,7 +90,7 @@ class ShiftedResponses:
         scale = np.nanstd(finite, axis=0)
         relative = np.where(np.isfinite(slopes), slopes, 0.0) / np.where(scale > 0, scale, 1.0)
         squares = np.mean(relative**2, axis=1)
-        return np.asarray(np.sqrt(squares.reshape(len(steps), -1).sum(axis=1)))
+        return np.sqrt(squares.reshape(len(steps), -1).sum(axis=1))
 
     def neighbours(
         self, part: Part, options: ScoreOptions
@@ -229,4 +229,4 @@ def _part_scores(
         block = values[start : start + options.block]
         single = target.with_observed(block, np.eye(len(block))[:, None])
         blocks.append(single.outer(*upper, xp=np) - single.outer(*lower, xp=np))
-    return np.asarray(np.concatenate(blocks) / (2 * steps))
+    return np.concatenate(blocks) / (2 * steps)

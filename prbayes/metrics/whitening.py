@@ -244,7 +244,7 @@ def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
     threshold = np.sqrt(deficit) * np.arccosh(chance ** (-1 / max(n - 2, 1)))
     gaps = np.maximum(-np.diff(log_size) - threshold, 0)
     shrunk = -np.concatenate([[0.0], np.cumsum(gaps)])
-    return np.asarray(axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean()))
+    return axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean())
 
 
 def units(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:

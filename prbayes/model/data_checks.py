@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding, any_of, report
 from prbayes._stats import adjusted_p_values
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.propagation.base import DesignError
-from prbayes.specimens.proposals import Modes
+from prbayes.specimens.proposals import Modes, best_rows
 
 # Checks of the data against the first responses, for all metrics.
 
@@ -305,7 +305,7 @@ def resolution(y: Floats, tolerance: float = 1e-6) -> float:
 
 def count_at_ends(
     y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0
-) -> tuple[NDArray[np.intp], Floats]:
+) -> tuple[Indices, Floats]:
     """Return the numbers of values at the largest and smallest one, (2,), and p-values, (2,).
 
     The hypothesis is that no value is censored; p-values are adjusted for both ends. Two exact
@@ -627,16 +627,14 @@ def misfit_findings(
     With gross errors in the likelihood half of the specimens may have such readings.
     """
     # For each specimen take the mode with the smallest misfit.
-    order = np.lexsort((modes.misfit, modes.specimen))
-    specimens, first = np.unique(modes.specimen[order], return_index=True)
-    best = order[first]
-    has_root = np.isfinite(modes.misfit[best])
-    is_poor = has_root & (modes.misfit[best] > largest)
-    poor, rows = specimens[is_poor], best[is_poor]
+    best = modes.rows(best_rows(modes.specimen, modes.misfit))
+    has_root = np.isfinite(best.misfit)
+    is_poor = has_root & (best.misfit > largest)
+    poor = best.specimen[is_poor]
     if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
-    off = np.sqrt(np.mean((modes.errors[rows] * sd) ** 2, axis=0))
+    off = np.sqrt(np.mean((best.errors[is_poor] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)
     return [
         Finding(

@@ -17,7 +17,7 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Indices, Shape
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -29,6 +29,7 @@ from prbayes.model.measurement import (
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
+from prbayes.numerics.mixtures import effective_sample_size, normalised_weights
 from prbayes.propagation.base import MAX_LOST, DesignError, responding_weights
 from prbayes.propagation.importance import new_specimens
 from prbayes.response.distributions import compiled_log_density
@@ -65,7 +66,7 @@ class EmulatedResponse:
     y: Floats  # (n, m): outputs of the runs; +inf is a failed specimen, NaN no response
     surface: Surface  # surface through the finite runs
     columns: slice  # columns of the surface that belong to the response
-    event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
+    event: Shape  # shape of a specimen's outputs, () or (m,)
     error: Floats  # (m,): root mean square cross-validation error near the specimens
     # Whether responses beyond the runs' range are those at its end, or NaN.
     is_continued: bool = True
@@ -134,7 +135,7 @@ class EmulatedSimulator:
     place: int | None = None  # index of the group; None without groups
     name: str = field(init=False)  # name such as 'y', or 'y[Adler]' of a group
     group: str = field(init=False)  # name of the group, empty without groups
-    rows: NDArray[np.intp] = field(init=False)  # (N,): indices among the rows of the measurement
+    rows: Indices = field(init=False)  # (N,): indices among the rows of the measurement
     observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
     weights: Floats = field(init=False)  # (N,): weights of the specimens, of sum one
     specimens: NDArray[Any] | None = field(init=False)  # (N,): labels of the specimens
@@ -166,7 +167,7 @@ class EmulatedSimulator:
             observed=m.observed[rows],
             weights=weights,
             specimens=None if m.specimens is None else m.specimens[rows],
-            n_specimens=float(1 / (weights**2).sum()),
+            n_specimens=float(effective_sample_size(weights)),
             metric=m.metric,
             inputs=m.inputs,
             responses=m.responses,
@@ -292,7 +293,7 @@ class EmulatedSample:
     points: list[Floats]  # values of each input, (n, *event)
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
     # (n,): batch of each specimen; each of the eight batches represents the mixture itself.
-    blocks: NDArray[np.intp]
+    blocks: Indices
     inputs: Inputs  # inputs of the simulator
     n_points: int  # number of specimens
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
@@ -349,15 +350,13 @@ class EmulatedSample:
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
         log_p = _population_log_densities(self.inputs, parents, self.points) - self.log_mixture
-        largest = log_p.max(axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
-            weights = np.exp(log_p - largest)
-            return None, weights / weights.sum(axis=1, keepdims=True)
+            return None, normalised_weights(log_p)
 
     def refuse_unsupported(self, name: str, parents: Sequence[Floats]) -> None:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(parents)
-        size = float(np.median(1 / (weights**2).sum(axis=1)))
+        size = float(np.median(effective_sample_size(weights)))
         if not size >= _SIZES.of_each / 2:
             raise DesignError(
                 f"{name}: got a weight effective sample size of {size:.0f} of {self.n_points} "

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
@@ -407,7 +406,7 @@ def _log_other(model: pm.Model, variables: list[Any]) -> Any:
     return likelihood + model.potentiallogp
 
 
-def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
+def only_through_prior(evaluator: Evaluator) -> Bools:
     """Return which elements of theta only the prior links to the data, shape (d,).
 
     Such as the spread between groups, or the mean of a group that was not measured.
@@ -565,14 +564,14 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
 
 def supports_each(
     support: dict[str, Floats], required_ess: float, max_lost: float, requirement: Requirement
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return which populations a design supports, shape (P,); parameters as in `shortcoming`."""
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     least, most = requirement.mass
     covered = (mass >= least) & (mass <= most)
     # A sum of weights that are zero may differ from zero by rounding.
     lost_little = lost <= max(max_lost, 1e-12)
-    return np.asarray((ess >= requirement.ess * required_ess) & covered & lost_little)
+    return (ess >= requirement.ess * required_ess) & covered & lost_little
 
 
 def shortcoming(

@@ -19,7 +19,7 @@ import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Shape
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
@@ -82,7 +82,7 @@ class SimulatorIdentity:
 class Identity:
     """What identifies a problem."""
 
-    shapes: dict[str, tuple[int, ...]]  # shapes of value variables by name, such as 'sigma_log__'
+    shapes: dict[str, Shape]  # shapes of value variables by name, such as 'sigma_log__'
     priors: dict[str, str]  # distributions of free variables, as PyMC prints them
     terms: tuple[str, ...]  # other observed variables, and names of potentials
     simulators: tuple[SimulatorIdentity, ...]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices, Shape
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
@@ -45,7 +45,7 @@ class Measurement:
     responses: Responses
     propagation: Propagation
     outputs: Outputs
-    groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
+    groups: Indices | None = None  # (N,): index of each specimen's group
     # Conditions on which the population of a specimen depends, as values (N,) by name.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
@@ -54,7 +54,7 @@ class Measurement:
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
     @property
-    def event(self) -> tuple[int, ...]:
+    def event(self) -> Shape:
         """Shape of the outputs of a row, () or (m,)."""
         return self.observed.shape[1:]
 
@@ -109,8 +109,8 @@ class StackedReadings:
     scale: Floats
     repeats: Repeats | None  # scatter of repeated readings; None if there are none
     # For each simulator, (N,): index of the specimen of each row.
-    numbers: tuple[NDArray[np.intp], ...]
-    groups: NDArray[np.intp] | None  # (S,): index of each specimen's group
+    numbers: tuple[Indices, ...]
+    groups: Indices | None  # (S,): index of each specimen's group
     covariates: Floats  # (C, S): values of the conditions that populations depend on
     # (S,): log-density of a gross error, which is uniform over twice the range of each output.
     log_gross: Floats
@@ -166,7 +166,7 @@ class StackedReadings:
 
 
 def _averaged(
-    measurement: Measurement, numbers: NDArray[np.intp], size: int
+    measurement: Measurement, numbers: Indices, size: int
 ) -> tuple[Readings, Floats, Repeats]:
     """Return the averaged readings of one simulator by specimen, their scale and their repeats."""
     readings = measurement.readings
@@ -200,7 +200,7 @@ def _value_by_specimen(
     kind: str,
     measurements: Sequence[Measurement],
     values: Sequence[NDArray[Any]],
-    numbers: Sequence[NDArray[np.intp]],
+    numbers: Sequence[Indices],
     size: int,
 ) -> Floats:
     """Return a value for each specimen, (S,), from values for the rows of each simulator, (N,)."""
@@ -296,17 +296,14 @@ class SpecimenLikelihood:
         return Coordinates.of_prior(self.inputs, len(self.readings), sampler=self.density.sampler)
 
     @property
-    def by_group(self) -> list[tuple[int | None, NDArray[np.intp]]]:
+    def by_group(self) -> list[tuple[int | None, Indices]]:
         """The index of each group, None without groups, and its specimens."""
-        groups = self.stacked.groups
-        if groups is None:
-            return [(None, np.arange(len(self.readings)))]
-        return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
+        return rows_by_group(self.stacked.groups, len(self.readings))
 
     @property
-    def by_context(self) -> list[tuple[int | None, NDArray[np.intp]]]:
+    def by_context(self) -> list[tuple[int | None, Indices]]:
         """The group, and the specimens, of each combination of group and covariates."""
-        contexts: list[tuple[int | None, NDArray[np.intp]]] = []
+        contexts: list[tuple[int | None, Indices]] = []
         for group, rows in self.by_group:
             covariates = self.stacked.covariates[:, rows]
             _, number = np.unique(covariates, axis=1, return_inverse=True)
@@ -314,7 +311,7 @@ class SpecimenLikelihood:
         return contexts
 
     def parents(
-        self, values: Mapping[str, Floats], group: int | None, specimens: NDArray[np.intp]
+        self, values: Mapping[str, Floats], group: int | None, specimens: Indices
     ) -> list[Floats]:
         """Return the parents of the inputs of specimens in a group, (P, *shape).
 
@@ -363,7 +360,14 @@ class SpecimenLikelihood:
         )
 
 
-def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:
+def rows_by_group(groups: Indices | None, n: int) -> list[tuple[int | None, Indices]]:
+    """Return the index of each group, None without groups, and the rows in it, of n specimens."""
+    if groups is None:
+        return [(None, np.arange(n))]
+    return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
+
+
+def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> Indices:
     """Return the specimen of each row of a simulator, (N,)."""
     return likelihood.stacked.numbers[likelihood.measurements.index(measurement)]
 

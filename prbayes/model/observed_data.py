@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import Floats, called, real_array, sample_labels
+from prbayes._validate import Floats, Indices, Shape, called, real_array, sample_labels
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.random_variable import known_value
@@ -40,11 +40,11 @@ class ObservedData:
     original: Any  # observed values as the user has them: numbers or `pymc.Data`
     values: Floats  # (N,) or (N, m): measured responses
     outputs: Outputs
-    groups: NDArray[np.intp] | None  # (N,): index of the group; None without groups
+    groups: Indices | None  # (N,): index of the group; None without groups
     weights: Any  # (N,): relative weights; None for equal ones
     labels: NDArray[Any] | None  # (N,): labels of the specimens; None without labels
     # (N,): observed row of each specimen if the weights are frequencies, else None
-    rows: NDArray[np.intp] | None
+    rows: Indices | None
     n_rows: int  # number of observed rows
     dims: tuple[str, ...] | None  # names of the observed dimensions
     # (N,): labels in the index or the coordinate of the specimens; None if these only count them
@@ -126,8 +126,8 @@ def _present_numbers(name: str, observed: Any) -> Any:
 
 
 def _rows_of_frequencies(
-    name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
-) -> NDArray[np.intp]:
+    name: str, weights: Any, shape: Shape, observed: Any, specimens: Any
+) -> Indices:
     """Return the observed row of each specimen if the weights are frequencies."""
     frequencies = np.asarray(weights)
     if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
@@ -145,9 +145,7 @@ def _rows_of_frequencies(
     return np.repeat(np.arange(frequencies.size), frequencies)
 
 
-def _checked_dims(
-    name: str, dims: object, shape: tuple[int, ...], model: pm.Model
-) -> tuple[str, ...]:
+def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> tuple[str, ...]:
     """Return names of the observed dimensions; raise if their lengths in the model differ."""
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:

@@ -17,11 +17,10 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
-from numpy.typing import NDArray
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._validate import Floats, called, real_array, refuse_single_precision
+from prbayes._validate import Floats, Indices, Shape, called, real_array, refuse_single_precision
 from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
@@ -46,7 +45,7 @@ class Hyperparameters:
     model: pm.Model
     point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
     # Shapes of the value variables, in their order in theta.
-    shapes: dict[str, tuple[int, ...]] = field(init=False)
+    shapes: dict[str, Shape] = field(init=False)
     initial: Floats = field(init=False)  # the initial point as theta, (d,)
     size: int = field(init=False)  # length d of theta
     # Names of the elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'.
@@ -303,7 +302,7 @@ def log_posterior(
     return result
 
 
-def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, NDArray[np.intp]]:
+def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, Indices]:
     """Return thetas, (size, d), and the alphabetical order of their elements, (d,).
 
     In this order the thetas are the same for clones of a model, which may order variables in other

@@ -51,6 +51,7 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.locking import lock
 from prbayes.model.simulator_with_data import new_observed
+from prbayes.numerics.mixtures import effective_sample_size
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import RunCost, duration
@@ -301,7 +302,7 @@ def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> flo
     # If all labels differ, the number is the same to the last digit.
     if weights.size == target.weights.size:
         return target.n_effective
-    return float(1 / (weights**2).sum())
+    return float(effective_sample_size(weights))
 
 
 def shared_epsilon(name: str, value: float) -> Any:

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.emulators.ranges import Ranges
 from prbayes.emulators.runs import Runs
 from prbayes.emulators.surrogate import Surrogate
@@ -101,7 +100,7 @@ def _relative_distance(surrogate: Surrogate, m: Measurement, columns: Floats) ->
     return np.asarray(tree.query(unit / steps)[0] / np.quantile(between, 0.9))
 
 
-def _may_be_measured(surrogate: Surrogate, m: Measurement, columns: Floats) -> NDArray[np.bool_]:
+def _may_be_measured(surrogate: Surrogate, m: Measurement, columns: Floats) -> Bools:
     """Return whether the response at the end of the ranges is within a tenth of the readings."""
     domain = surrogate.domain
     unit = np.clip(np.nan_to_num(domain.scaled(columns), nan=0.5), 0, 1)

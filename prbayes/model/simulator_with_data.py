@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.metrics.base import Metric
 from prbayes.response.condition import is_condition
 from prbayes.response.inputs import Inputs
@@ -54,7 +54,7 @@ class SimulatorWithData(Protocol):
 
 def number_specimens(
     simulators: Sequence[SimulatorWithData],
-) -> tuple[list[NDArray[np.intp]], int]:
+) -> tuple[list[Indices], int]:
     """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     An observation without a label is a specimen of its own.

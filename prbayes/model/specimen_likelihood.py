@@ -17,7 +17,6 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pymc.logprob.abstract import ValuedRV, _logprob
 from pytensor.graph.basic import Constant
 from pytensor.graph.replace import graph_replace
@@ -25,13 +24,14 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, Indices, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
     SpecimenLikelihood,
     output_columns,
+    rows_by_group,
     specimen_numbers,
 )
 from prbayes.model.random_variable import (
@@ -169,7 +169,7 @@ def _of_points(
     errors: Floats,
     parents: Sequence[Floats],
     points: WeightedPoints,
-    rows: NDArray[np.intp],
+    rows: Indices,
     columns: slice = slice(None),
 ) -> Floats:
     """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M).
@@ -358,12 +358,9 @@ def draw_readings(
         numbers = specimen_numbers(likelihood, measurement)
     # Observed specimens whose groups and covariates the drawn specimens have.
     like = np.resize(numbers, n)
-    conditions = likelihood.stacked.conditions
+    conditions, groups = likelihood.stacked.conditions, likelihood.stacked.groups
     conditions = None if conditions is None else conditions[like]
-    by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
-    if likelihood.stacked.groups is not None:
-        groups = likelihood.stacked.groups[like]
-        by_group = [(group, np.flatnonzero(groups == group)) for group in np.unique(groups)]
+    by_group = rows_by_group(None if groups is None else groups[like], n)
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)

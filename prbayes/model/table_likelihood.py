@@ -14,9 +14,8 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -130,7 +129,7 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
     return Emulation(z, y, surface, error, 0.0, ranges), ranges
 
 
-def _is_inside(z: Floats, ranges: Floats) -> NDArray[np.bool_]:
+def _is_inside(z: Floats, ranges: Floats) -> Bools:
     """Return which coordinates (..., d) are within the runs' ranges, up to rounding."""
     slack = 1e-9 * (ranges[1] - ranges[0])
     return np.asarray(((z >= ranges[0] - slack) & (z <= ranges[1] + slack)).all(axis=-1))

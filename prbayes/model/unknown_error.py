@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.specimens.points import SpecimenPoints
@@ -31,7 +30,7 @@ class ReadingDensity:
     unit: Floats  # standard deviation of a reading in units of its error; broadcasts to outputs
     emulator_variance: Floats  # variance of the emulator's error; broadcasts to outputs
     # (S, k): indices of the outputs; None if these are all outputs in their order.
-    columns: NDArray[np.intp] | None
+    columns: Indices | None
     # For each unknown error of plain readings a tuple: index of an output that has the error, sums
     # of squared residuals (S, K), numbers of readings (S, 1), and variance of the emulator's error
     # in units of the scales.
@@ -54,29 +53,27 @@ class ReadingDensity:
             first += len(of_simulator)
             if "error" not in m.extras or m.extras["error"].type.ndim:
                 continue
-            is_measured = readings.is_measured[:, of_simulator]
+            of_outputs = readings.at_columns(np.tile(of_simulator, (len(readings), 1)))
+            is_measured = of_outputs.is_measured
             unit = np.where(is_measured, scale[:, of_simulator], 1.0)
             relative = (emulator_error[of_simulator] / unit) ** 2
-            is_plain = (readings.step[:, of_simulator] == 0) & ~readings.is_relative[
-                :, of_simulator
-            ]
-            is_plain &= ~readings.is_censored[:, of_simulator]
+            is_special = (of_outputs.step != 0) | of_outputs.is_relative | of_outputs.is_censored
             # With this tolerance a log-density changes by less than 1e-4 at an eighth of the
             # largest plausible error.
-            is_plain &= relative <= 1e-6 * (readings.error[:, of_simulator] / unit) ** 2
-            if not is_plain[is_measured].all():
+            is_special |= relative > 1e-6 * (of_outputs.error / unit) ** 2
+            if is_special[is_measured].any():
                 continue
-            measured = np.where(is_measured, readings.values[:, of_simulator], 0.0)
+            measured = np.where(is_measured, of_outputs.values, 0.0)
             inverse = np.where(is_measured, 1 / unit, 0.0)
             squares = np.zeros(outputs.shape[:2])
             for column, y, c in zip(of_simulator, measured.T, inverse.T, strict=True):
                 squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
-            count = is_measured.sum(axis=1, keepdims=True).astype(float)
+            count = is_measured.sum(axis=1, keepdims=True, dtype=float)
             constant -= np.log(unit).sum(axis=1, keepdims=True)
             sums.append((int(of_simulator[0]), squares, count, float(relative[is_measured].mean())))
             is_missing[:, of_simulator] = True
         variance, columns = emulator_error**2, None
-        size = int((~is_missing).sum(axis=1).max())
+        size = (~is_missing).sum(axis=1).max()
         if size < outputs.shape[-1]:
             columns = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
             is_outside = np.take_along_axis(is_missing, columns, axis=1)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from prbayes._validate import Floats, Indices
+from prbayes._validate import Floats, Indices, Shape
 
 
 def inside(points: Floats) -> Floats:
@@ -75,7 +75,7 @@ def points_from(points: object) -> Callable[[int, int, int], Floats]:
 
 
 def base_points(
-    shapes: Sequence[tuple[int, ...]],
+    shapes: Sequence[Shape],
     n: int,
     seed: int,
     points: Callable[[int, int, int], Floats] = sobol,

@@ -23,7 +23,7 @@ from prbayes.plots.canvas import (
     round_ticks,
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
-from prbayes.results.compare import COSTS
+from prbayes.results.compare import scores_in
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,26 +89,20 @@ def plot_comparison(
     if not isinstance(comparison, xr.Dataset) or not variables <= set(comparison.data_vars):
         raise wrong_type(comparison, "plot_comparison", "the Dataset of prb.compare")
     comparison = subset(comparison, coords)
+    names = list(map(str, comparison.hyperparameter.values))
     if scores:
-        names = [
-            str(name)
-            for name, values in comparison.data_vars.items()
-            if values.dims == ("result",) and name not in COSTS
-        ]
+        names = [str(name) for name in scores_in(comparison)]
         if not names:
             raise ValueError(
                 "plot_comparison: got no scores, expected those of prb.compare(results, "
                 "model=model)"
             )
-    else:
-        names = list(map(str, comparison.hyperparameter.values))
     names = select_variables(names, var_names, filter_vars)
     results = list(map(str, comparison.result.values))
     refuse_labels(labels, [*names, *results])
     texts = [named(result, labels) for result in results]
     n = len(results)
     rows = np.arange(n - 1.0, -1.0, -1.0)  # heights of the rows; the first result is on top
-    limits = (-0.6, n - 0.4)
 
     figure, axes = panels(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
     for name, axis in axes.items():
@@ -121,8 +115,13 @@ def plot_comparison(
             lower, upper, estimate = row.lower.values, row.upper.values, row.estimate.values
             values = np.concatenate([lower, upper, estimate])
             if n > 1:  # The line shows how far the other estimates are from the first.
-                text = f"estimate of {texts[0]}"
-                axis.axvline(estimate[0], color=GREY, linestyle=":", label=text, gid="first")
+                axis.axvline(
+                    estimate[0],
+                    color=GREY,
+                    linestyle=":",
+                    label=f"estimate of {texts[0]}",
+                    gid="first",
+                )
             text = f"{percentage(comparison.attrs.get('interval', 0.89))} interval"
             has_ends = np.isfinite(lower) & np.isfinite(upper)
             ends = rows[has_ends], lower[has_ends], upper[has_ends]
@@ -134,8 +133,9 @@ def plot_comparison(
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # room for markers
         xlim = float(low - margin), float(high + margin)
-        label = named(name, METRIC_LABELS | dict(labels or {}))
-        axis.set(xlabel=label, xlim=xlim, ylim=limits)
+        axis.set(
+            xlabel=named(name, METRIC_LABELS | dict(labels or {})), xlim=xlim, ylim=(-0.6, n - 0.4)
+        )
         axis.set_xticks(*round_ticks(*xlim))
         axis.set_yticks(rows, texts)
     return finish(figure)

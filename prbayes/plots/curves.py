@@ -64,7 +64,7 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
     at = np.clip(np.searchsorted(centers, grid) - 1, 0, centers.size - 2)
     fraction = (grid - centers[at]) / np.diff(centers)[at]
     between = heights[..., at] * (1 - fraction) + heights[..., at + 1] * fraction
-    return np.asarray(np.maximum(between, 0.0))
+    return np.maximum(between, 0.0)
 
 
 def bounded_density(draws: Floats, grid: Floats) -> Floats:

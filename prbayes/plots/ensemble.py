@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from prbayes._display import percentage
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Floats, positive_integer, wrong_type
+from prbayes._validate import AT_ONCE, Bools, Floats, positive_integer, wrong_type
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
@@ -100,7 +99,7 @@ def read_result(
     return Ensemble(evaluator, thetas[:0], thetas, "posterior predictive", "posterior")
 
 
-def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
+def supported(evaluator: Evaluator, thetas: Floats) -> Bools:
     """Return which populations stored responses support well enough to be drawn, shape (P,)."""
     out = np.zeros(len(thetas), dtype=bool)
     indices = np.flatnonzero(np.isfinite(thetas).all(axis=1))

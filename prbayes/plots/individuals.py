@@ -110,31 +110,37 @@ def plot_individuals(
     for name, axis in axes.items():
         axis.set_ylabel(named(name, labels))
         if name in inputs:
-            values = inputs[name]
-            mean = values.mean(axis=0)
-            order = np.argsort(mean, kind="stable")
-            places = np.arange(len(order))
-            text = f"{percentage(prob)} of the draws of a specimen"
-            _draw_intervals(axis, places, values[:, order], prob, label=text, gid="interval")
-            axis.scatter(
-                places, mean[order], 14, color=BLUE, label="their mean", gid="mean", zorder=3
-            )
-            axis.set_xlabel("specimens in ascending order")
+            _draw_inputs(axis, inputs[name], prob)
         elif name in readings:
             y = readings[name]
             of_rows = {str(key): x.values for key, x in conditions.items() if x.size == y.size}
             x_name, x = next(iter(of_rows.items()), ("specimen", np.arange(y.size)))
-            text = f"{percentage(prob)} of replicates"
-            _draw_intervals(axis, x, replicated[name], prob, label=text, gid="replicates")
-            median = np.nanmedian(replicated[name], axis=0)
-            look: dict[str, Any] = {"color": GREY, "zorder": 3}
-            axis.scatter(x, median, 10, label="their median", gid="median", **look)
-            axis.scatter(x, y[0], 18, color=ink(), label="measured", gid="observed", zorder=3)
+            _draw_readings(axis, x, y[0], replicated[name], prob)
             axis.set_xlabel(named(x_name, labels))
         else:
             _draw_curve(axis, observed[name], replicates[name], prob)
             axis.set_xlabel(named(str(observed[name].dims[-1]), labels))
     return finish(figure)
+
+
+def _draw_inputs(axis: Axes, draws: Floats, prob: float) -> None:
+    """Draw an interval of the draws of each specimen, (P, n), in ascending order of their means."""
+    mean = draws.mean(axis=0)
+    order = np.argsort(mean, kind="stable")
+    places = np.arange(len(order))
+    text = f"{percentage(prob)} of the draws of a specimen"
+    _draw_intervals(axis, places, draws[:, order], prob, label=text, gid="interval")
+    axis.scatter(places, mean[order], 14, color=BLUE, label="their mean", gid="mean", zorder=3)
+    axis.set_xlabel("specimens in ascending order")
+
+
+def _draw_readings(axis: Axes, x: Any, y: Floats, replicates: Floats, prob: float) -> None:
+    """Draw the reading of each specimen, (n,), on an interval of replicates, (P, n)."""
+    text = f"{percentage(prob)} of replicates"
+    _draw_intervals(axis, x, replicates, prob, label=text, gid="replicates")
+    median = np.nanmedian(replicates, axis=0)
+    axis.scatter(x, median, 10, color=GREY, label="their median", gid="median", zorder=3)
+    axis.scatter(x, y, 18, color=ink(), label="measured", gid="observed", zorder=3)
 
 
 def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: float) -> None:

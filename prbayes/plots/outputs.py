@@ -148,7 +148,9 @@ def plot_outputs(
     side = 5.4 if size == 1 else 3.7
     options = {"col_wrap": size} | pc_kwargs
     figure, axes = panels(list(names), size=(side, side), pc_kwargs=options)
-    legend = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
+    populations = {f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}": calibrated}
+    if earlier is not None:
+        populations = {f"before: {text}": earlier} | populations
     for name, axis in axes.items():
         place = names[name]
         if place is None:
@@ -157,20 +159,8 @@ def plot_outputs(
         i, j = place
         x = columns[j]
         y = columns[i + 1]
-        if earlier is not None:
-            points = _finite_pairs(x, y, *earlier)
-            _draw_regions(
-                axis, "before", points, f"before: {text}", color=VERMILION, linestyle="--"
-            )
-        points = _finite_pairs(x, y, *calibrated)
-        _draw_regions(axis, "after", points, legend, color=BLUE)
-        measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
-        look: dict[str, Any] = {"color": ink(), "zorder": 3}
-        first, second = measured[0].T
-        axis.scatter(first, second, 14, label="measured", gid="measured", **look)
-        correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
-        title = "rank correlation\nmeasured {}, calibrated {}".format(*correlations)
-        axis.set(title=title, xlim=limits[j], ylim=limits[i + 1])
+        _draw_outputs(axis, x, y, populations)
+        axis.set(xlim=limits[j], ylim=limits[i + 1])
         axis.set_xticks(*round_ticks(*limits[j]))
         axis.set_yticks(*round_ticks(*limits[i + 1]))
         if i == size - 1:  # Names stand below the last row and beside the first column alone.
@@ -259,15 +249,26 @@ def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> tupl
     return points[finite], weights[finite]
 
 
-def _draw_regions(
-    axis: Axes, name: str, sample: tuple[Floats, Floats], text: str, **look: Any
+def _draw_outputs(
+    axis: Axes, x: Output, y: Output, populations: Mapping[str, tuple[Floats, Floats]]
 ) -> None:
-    """Draw the outlines of regions of a weighted sample of points."""
-    if len(sample[0]) < 2:
-        return
+    """Draw measured specimens, and outlines of regions of populations; the last is calibrated."""
+    *_, calibrated = populations
     probs = (0.5, INTERVAL)
-    for prob, line in zip(probs, outlines(*sample, probs), strict=True):
-        axis.plot(*line, linewidth=1.5, label=text, gid=f"{name}_{100 * prob:.0f}", **look)
+    for text, population in populations.items():
+        points = _finite_pairs(x, y, *population)
+        name, color, style = "after", BLUE, "-"
+        if text != calibrated:
+            name, color, style = "before", VERMILION, "--"
+        lines = outlines(*points, probs) if len(points[0]) > 1 else []
+        for prob, line in zip(probs, lines, strict=False):
+            look: dict[str, Any] = {"color": color, "linestyle": style, "label": text}
+            axis.plot(*line, linewidth=1.5, gid=f"{name}_{100 * prob:.0f}", **look)
+    measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
+    first, second = measured[0].T
+    axis.scatter(first, second, 14, color=ink(), label="measured", gid="measured", zorder=3)
+    correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
+    axis.set_title("rank correlation\nmeasured {}, calibrated {}".format(*correlations))
 
 
 def _written(r: float) -> str:

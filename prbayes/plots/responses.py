@@ -255,20 +255,15 @@ class _Drawing:
         y = self.text
         if is_curve(outputs):
             places = np.array(outputs.labels, dtype=np.float64)
-            order = np.argsort(places)
             center, unit = np.zeros(places.size), np.ones(places.size)
         else:  # Outputs with names have different units: each is divided by its spread.
-            order = np.arange(len(outputs.labels))
-            places = order.astype(np.float64)
+            places = np.arange(len(outputs.labels), dtype=np.float64)
             finite = np.where(np.isfinite(observed), observed, np.nan)
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
-            axis.set_xticks(places, list(outputs.names))
-            # An inch takes twelve characters of the default font. Longer names are turned.
-            inches = axis.bbox.width / axis.figure.dpi
-            if max(map(len, outputs.names)) + 1 > 12 * inches / places.size:
-                axis.tick_params(axis="x", labelrotation=90)
+            _name_ticks(axis, places, outputs.names)
             y += ", standard deviations from the mean"
+        order = np.argsort(places)
         x = places[order]
         measured = ((observed - center) / unit)[:, order]
         lines = ((quantiles(*population, LEVELS) - center) / unit)[..., order]
@@ -300,6 +295,15 @@ class _Drawing:
             failed=np.isinf(observed).any(axis=1).sum(),
         )
         axis.set(xlabel=named(outputs.dim, self.labels), ylabel=y, title=title, ylim=(low, high))
+
+
+def _name_ticks(axis: Axes, places: Floats, names: Sequence[str]) -> None:
+    """Give the ticks of the x axis names, which are turned if they are long."""
+    axis.set_xticks(places, list(names))
+    # An inch takes twelve characters of the default font.
+    inches = axis.bbox.width / axis.figure.dpi
+    if max(map(len, names)) + 1 > 12 * inches / places.size:
+        axis.tick_params(axis="x", labelrotation=90)
 
 
 def _finite_range(values: Floats) -> Limits:

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._display import p_digits, percentage
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.plots.canvas import (
     BLUE,
     PALE,
@@ -123,7 +122,7 @@ def in_directions(test: ValidityTest) -> list[Floats]:
     ]
 
 
-def _is_of_direction(test: ValidityTest) -> NDArray[np.bool_]:
+def _is_of_direction(test: ValidityTest) -> Bools:
     """Return which u-values are of several outputs, in a direction."""
     return np.array([DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
 

@@ -17,12 +17,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats, flag, positive_integer, positive_number
+from prbayes._validate import Floats, Indices, flag, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
@@ -162,7 +161,7 @@ class Bound(ABC):
         return self.n_points
 
     @property
-    def blocks(self) -> NDArray[np.intp]:
+    def blocks(self) -> Indices:
         """Which of eight smaller sets of the same kind each point belongs to, shape (n_points,)."""
         return np.arange(self.n_points) * N_BLOCKS // self.n_points
 

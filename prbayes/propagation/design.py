@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import (
     SIZES,
@@ -61,7 +60,7 @@ class Design:
         """Whether there are points between the runs, whose responses are emulated."""
         return self.emulated is not None
 
-    def rows(self, mask: NDArray[np.bool_]) -> Design:
+    def rows(self, mask: Bools) -> Design:
         """Return the design with some of its points only."""
         return replace(self, sample=self.sample.rows(mask))
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices, Shape
 from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator
 from prbayes.emulators.selection import TrainingRuns, weight_of_runs
 from prbayes.emulators.surfaces import as_surface
@@ -229,12 +228,12 @@ class Sample:
     points: tuple[Floats, ...]  # (n, *event): points, an array for each aleatory input
     values: Floats  # (n,) or (n, m): responses; NaN without a response
     log_density: Floats  # (n,): log-density of the mixture that the points were drawn from
-    blocks: NDArray[np.intp]  # (n,): index of the batch, of eight, that each point belongs to
+    blocks: Indices  # (n,): index of the batch, of eight, that each point belongs to
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def rows(self, mask: NDArray[np.bool_]) -> Sample:
+    def rows(self, mask: Bools) -> Sample:
         """Return some of the points."""
         points = tuple(x[mask] for x in self.points)
         return Sample(points, self.values[mask], self.log_density[mask], self.blocks[mask])
@@ -247,7 +246,7 @@ class DesignEmulator:
     runs: TrainingRuns
     emulator: Emulator
     left_out: Floats  # (n, m): cross-validation predictions at the runs
-    event: tuple[int, ...]  # shape of one response: () or (m,)
+    event: Shape  # shape of one response: () or (m,)
     weights: Floats  # (T, n): importance weights of the runs in T populations of interest
     run_share: float = 1.0  # mixing weight of the runs among the points of a population
     # Root mean square cross-validation error of the worst output, in units of the output's spread

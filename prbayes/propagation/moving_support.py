@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pymc.distributions.censored import CensoredRV
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, Indices
 from prbayes.response.compile import compile_batched, with_leading_axis
 from prbayes.response.distributions import ELLIPTICAL
 from prbayes.response.inputs import Inputs
@@ -84,7 +83,7 @@ def _moving_atoms(name: str, dist: TensorVariable, what: str) -> str:
 
 
 def refuse_moving_atoms(
-    name: str, inputs: Inputs, points: Sequence[Floats], population: NDArray[np.intp]
+    name: str, inputs: Inputs, points: Sequence[Floats], population: Indices
 ) -> None:
     """Refuse values that repeat among the points, (n, *event), of a single population, (n,)."""
     number = population.max() + 1

@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats
 from prbayes.numerics.threads import one_thread
 from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
@@ -104,7 +103,7 @@ class ExponentialForm:
 
     # (q + 1, n): sufficient statistics of all inputs, then ones; zero outside of the support
     statistics: Floats
-    is_inside: NDArray[np.bool_]  # (n,): whether a point is in the support
+    is_inside: Bools  # (n,): whether a point is in the support
     # (q + 1, *event): points whose log-densities determine the natural parameters
     anchors: tuple[Floats, ...]
     inverse: Floats  # (q + 1, q + 1): inverse of the statistics at the anchors
@@ -146,7 +145,7 @@ class ExponentialForm:
         anchors = tuple(values[inside[pivots]] for values in points)
         return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
-    def natural_parameters(self, at_anchors: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def natural_parameters(self, at_anchors: Floats) -> tuple[Floats, Bools]:
         """Return H from log-densities at the anchors, (S, q + 1), and which rows are rounded, (S,).
 
         The last column of H is minus the log-normaliser. Log-densities at points would be off by
@@ -200,7 +199,7 @@ class PopulationDensity:
                 logs = natural @ form.statistics[:, rows]
             if is_rounded.any():
                 (logs[is_rounded],) = self.log_density(*narrow, *[x[rows] for x in points])
-            return np.asarray(logs)
+            return logs
 
         return log_densities
 
@@ -214,4 +213,4 @@ def normalise(logs: Floats) -> Floats:
     totals = logs.sum(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         logs /= totals
-        return np.asarray((np.log(totals) + largest)[:, 0])
+        return (np.log(totals) + largest)[:, 0]

@@ -12,13 +12,12 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, positive_integer
 from prbayes.emulators.kriging import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Basis, Discrepancy
@@ -295,7 +294,7 @@ class ReweightedBound(Bound):
         return len(self._design.runs)
 
     @property
-    def blocks(self) -> NDArray[np.intp]:
+    def blocks(self) -> Indices:
         """Which of eight coarser designs each point belongs to, shape (n,)."""
         return self._design.sample.blocks
 

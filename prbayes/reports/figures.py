@@ -131,13 +131,6 @@ def requests(m: Material) -> dict[str, Request]:
     of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
     common: dict[str, Any] = {"model": m.model, "labels": of_model}
     prob = {"prob": m.prob}
-
-    def labels_of(names: Iterable[Any]) -> dict[str, Any]:
-        """Return the labels of names, as keywords of a picture without a model."""
-        variables = {variable_of(str(name)) for name in names}
-        texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": texts}
-
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
         requested["population"] = ((result,), common | prob)
@@ -151,7 +144,7 @@ def requests(m: Material) -> dict[str, Request]:
         if any(len(y.columns()) > 1 for y in m.observed.values()):
             requested["outputs"] = ((result,), common)
     if posterior is not None:
-        shown = {} if m.model is not None else labels_of(posterior["posterior"].data_vars)
+        shown = {} if m.model is not None else _labels_of(m, posterior["posterior"].data_vars)
         shown |= {"optimum": optimum, "backend": "matplotlib"}
         requested["posterior"] = ((posterior,), common | prob | shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
@@ -162,18 +155,25 @@ def requests(m: Material) -> dict[str, Request]:
             requested["landscape"] = ((optimum,), common)
     if m.comparison is not None and m.prob == INTERVAL:
         names = m.comparison["hyperparameter"].values
-        requested["comparison"] = ((m.comparison,), labels_of(names))
+        requested["comparison"] = ((m.comparison,), _labels_of(m, names))
     if m.tests:
         tests = m.tests if len(m.tests) > 1 else next(iter(m.tests.values()))
         requested["validity"] = ((tests,), {})
     tables = [t for t in m.decisions.values() if kind_of_decision(t) == "sensitivity"]
     if tables:
-        requested["sensitivity"] = (tuple(tables[:1]), labels_of(tables[0]["factor"].values))
+        requested["sensitivity"] = (tuple(tables[:1]), _labels_of(m, tables[0]["factor"].values))
     if m.validation:
         measured = {name: data.measured for name, data in m.validation.items()}
         predicted = {name: data.predicted for name, data in m.validation.items()}
-        requested["prediction"] = ((measured, predicted), labels_of(m.validation) | prob)
+        requested["prediction"] = ((measured, predicted), _labels_of(m, m.validation) | prob)
     return requested
+
+
+def _labels_of(m: Material, names: Iterable[Any]) -> dict[str, Any]:
+    """Return the labels of names, as keywords of a picture without a model."""
+    variables = {variable_of(str(name)) for name in names}
+    texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+    return {"labels": texts}
 
 
 def _computes_responses(model: pm.Model) -> bool:
@@ -215,8 +215,9 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
     reason = request
     if not isinstance(request, str):
         arguments, keywords = request
-        pyplot: Any = import_module("matplotlib.pyplot")  # heavy, and partly annotated
-        open_figures = set(pyplot.get_fignums())
+        from matplotlib import pyplot as plt  # heavy, and only needed for pictures
+
+        open_figures = set(plt.get_fignums())
         try:
             picture = image(illustration.function(*arguments, **keywords))
             texts = {"alt": illustration.alt, "caption": illustration.caption}
@@ -225,8 +226,8 @@ def _picture(illustration: Illustration, request: Request) -> Section | str:
             # The picture refuses the results, or PyMC has no formula for a distribution.
             reason = str(error)
         finally:
-            for figure in set(pyplot.get_fignums()) - open_figures:
-                pyplot.close(figure)
+            for figure in set(plt.get_fignums()) - open_figures:
+                plt.close(figure)
     name = illustration.function.__name__
     report(Finding("no-picture", f"report: no picture by {name}: {reason}"))
     return str(reason)
@@ -256,7 +257,8 @@ def _graph(model: pm.Model) -> bytes | None:
 
 def _svg(model: pm.Model) -> bytes:
     """Return PyMC's graph of a model, with the simulators labelled."""
-    graphs: Any = import_module("pymc.model_graph")
+    from pymc import model_graph as graphs
+
     graph = graphs.ModelGraph(model)
     # PyMC collects variables and edges in sets of names, whose order changes from process to
     # process; in the model's order the drawing is always the same.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -12,7 +12,6 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, texts, wrong_type
 from prbayes.metrics.summary_likelihood import data_sheet
@@ -161,6 +160,11 @@ def constants_of(description: Mapping[str, Any]) -> set[str]:
     return {name for name, _, text in inputs if text.startswith("=")}
 
 
+def names_in(description: Mapping[str, Any]) -> set[str]:
+    """Return the names of variables, and of inputs that are numbers."""
+    return {v["name"] for v in description["variables"]} | constants_of(description)
+
+
 def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
     """Return the attributes of a posterior or an optimum."""
     return dict(estimates_in(result).attrs)
@@ -201,25 +205,19 @@ def gather(
     tests = _by_label(validity, "validity")
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
-    validations = _validations({} if validation is None else validation)
+    validations = _validations(validation)
     live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
     optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
         _require_group(label, tree, "optimum", (), "prb.minimize")
-        if "stderr" not in tree:
-            raise TypeError(
-                f"Report: {label}: got a DataTree without the group stderr, "
-                "expected one of prb.minimize"
-            )
-
+        _require_group(label, tree, "stderr", (), "prb.minimize")
     results = optima | posteriors
     identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
     for label, data in validations.items():
         identities[f"validation, {label}"] = identity_from_attributes(data.predicted.attrs)
-    identities["comparison"] = identity_in(comparison)
-    require_together(identities, "Report", model=model)
+    require_together(identities | {"comparison": identity_in(comparison)}, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
     _require_tested(validations, tests)
 
@@ -230,20 +228,14 @@ def gather(
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)
     if labels and description["variables"]:
-        names = {*validations, *sheets, *observed, *constants_of(description)}
+        names = {*validations, *sheets, *observed, *names_in(description)}
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
-        names |= {variable["name"] for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
-    for label, result in results.items():
-        if label in live_optima:
-            diagnoses[label] = diagnose(live_optima[label])
-            continue
-        own_model = _model_of(result, model)
-        needs_model = not {"optimum", "calibration"} & set(result.children)
-        is_possible = own_model is not None or not needs_model
-        diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
+    for label, result in (results | live_optima).items():
+        can_diagnose, own_model = _model_of_diagnosis(result, model)
+        diagnoses[label] = diagnose(result, model=own_model) if can_diagnose else None
     return Material(
         model=model,
         description=description,
@@ -313,6 +305,8 @@ def _validations(validation: Any) -> dict[str, Validation]:
         "expected by condition the measured responses and their prediction, such as "
         '{"80 000 cycles": (lengths, prb.predict(...))}'
     )
+    if validation is None:
+        return {}
     if not isinstance(validation, Mapping):
         raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
     validations = {}
@@ -404,15 +398,21 @@ def _observed(
     return {name: y for name, y in observed.items() if name not in sheets}, sheets
 
 
-def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
-    """Return the model for diagnosing a saved result, or None if metric or priors differ."""
+def _model_of_diagnosis(result: Any, model: pm.Model | None) -> tuple[bool, pm.Model | None]:
+    """Return whether a result can be diagnosed, and the model for that.
+
+    The model of a saved result is no other one, with a different metric or prior.
+    """
+    if isinstance(result, Optimum):
+        return True, None
     identity = identity_in(result)
-    if model is None or identity is None:
-        return model
-    return None if problem_differences(identity, identity_of(model), Level.OPTIMUM) else model
+    if model is not None and identity is not None:
+        is_other = problem_differences(identity, identity_of(model), Level.OPTIMUM)
+        model = None if is_other else model
+    return model is not None or bool({"optimum", "calibration"} & set(result.children)), model
 
 
-# -- schema of results in files --------------------------------------------------------------
+# -- decisions -------------------------------------------------------------------------------
 
 
 # variables that identify a table of a decision, and functions that return the tables
@@ -422,17 +422,6 @@ _TABLES = {
     "plan": {"sd", "now"},
 }
 CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
-# variables and attributes that a report reads
-_OF_DECISION = {
-    "risk": ("lower", "upper", "limit", "below", "prob"),
-    "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
-    "plan": ("name", "candidate", "k"),
-}
-_OF_CALIBRATION = (
-    *("epsilon", "metric", "propagation", "n_points", "required_ess", "max_lost"),
-    *("discrepancy", "discrepancy_error", "weight_ess", "mean_weight", "lost_mass"),
-)
-_OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
 
 
 def kind_of_decision(table: Any) -> str | None:
@@ -442,86 +431,3 @@ def kind_of_decision(table: Any) -> str | None:
             if variables <= set(table.data_vars):
                 return kind
     return None
-
-
-def complaints(tree: xr.DataTree) -> Iterator[str]:
-    """Yield what is wrong with the contents of a file: posterior, optimum, test or decision."""
-    groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
-    if "posterior" in groups or "optimum" in groups:
-        yield from _of_estimates(groups)
-    elif "u" in tree.data_vars:
-        yield from _of_test(tree.to_dataset())
-    else:
-        table = tree.to_dataset()
-        kind = kind_of_decision(table) or ""
-        present = {*table.variables, *table.attrs}
-        lacking = [name for name in _OF_DECISION[kind] if name not in present]
-        if lacking:
-            yield f"got no {lacking}, expected a table of prb.{CALLED[kind]}"
-        yield from _not_numbers("a decision", table.data_vars)
-    for group in {"posterior", "optimum"} & set(groups):
-        attrs = groups[group].attrs
-        for name in ("n_responses", "seconds"):
-            value = np.asarray(attrs.get(name, 0.0))
-            if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
-                yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
-        try:
-            from_json(str(attrs.get("findings", "[]")))
-        except ValueError as error:
-            yield f"{group}: {error}"
-    if "observed_data" in groups:
-        yield from _not_numbers("observed_data", groups["observed_data"].data_vars)
-
-
-def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    """Yield what is wrong with a posterior or an optimum."""
-    kind = "posterior" if "posterior" in groups else "optimum"
-    variables = groups[kind].data_vars
-    yield from _not_numbers(kind, variables)
-    for name, values in variables.items():
-        if not values.size:
-            yield f"{kind}: {name}: got no values (shape {values.shape}), expected some"
-        elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
-            yield f"{kind}: {name}: got NaN or infinite values only, expected finite ones"
-    needed: dict[str, tuple[str, ...]] = {"calibration": ("discrepancy", "metric")}
-    if kind == "posterior":
-        needed = {"calibration": _OF_CALIBRATION}
-        if "sample_stats" in groups and "stage" in groups["sample_stats"].dims:
-            needed["sample_stats"] = ("beta", "accept_rate", "n_steps")
-    elif "stderr" in groups:
-        errors = groups["stderr"]
-        for name, value in variables.items():
-            if name not in errors or errors[name].shape != value.shape:
-                yield f"stderr: got no standard error of {name}, expected one of the same shape"
-    for group, names in needed.items():
-        lacking = [name for name in names if group in groups and name not in groups[group]]
-        if lacking:
-            yield f"{group}: got no {lacking}, expected them beside {list(groups[group])}"
-    if "sample_stats" in needed:
-        yield from _not_numbers("sample_stats", groups["sample_stats"].data_vars)
-
-
-def _of_test(test: xr.Dataset) -> Iterator[str]:
-    lacking = [name for name in (*_OF_TEST, "lower", "upper") if name not in test.variables]
-    if lacking:
-        yield f"got no {lacking}, expected a validity test saved by to_dataset()"
-        return
-    for name in _OF_TEST:
-        if test[name].size != 1 or test[name].dtype.kind not in "fiub":
-            yield f"{name}: got shape {test[name].shape}, expected one number"
-    u = test["u"]
-    yield from _not_numbers("a validity test", {"u": u})
-    if u.ndim != 1 or not u.size or not bool(((u >= 0) & (u <= 1)).all()):
-        yield f"u: got shape {u.shape}, expected one or more numbers between 0 and 1"
-    for name in ("condition", "specimen", "lower", "upper"):
-        if name in test.variables and test[name].shape != u.shape:
-            yield f"{name}: got shape {test[name].shape}, expected that of u, {u.shape}"
-    for name in ("statistic", "p_value"):
-        if not np.isfinite(test[name].values).all():
-            yield f"{name}: got NaN or an infinite number, expected a finite one"
-
-
-def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
-    for name, values in variables.items():
-        if values.dtype.kind not in "fiu":
-            yield f"{group}: {name}: got values of dtype {values.dtype}, expected numbers"

@@ -6,10 +6,10 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from prbayes._display import View
@@ -199,10 +199,9 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
     """Return a table without columns that are empty in every row, or None; NaN is not empty."""
     if not rows:
         return None
-    pandas: Any = import_module("pandas")
     keys = dict.fromkeys(key for row in rows for key in row)
     columns = {key: [row.get(key) for row in rows] for key in keys}
-    return pandas.DataFrame(
+    return pd.DataFrame(
         {
             key: column
             for key, column in columns.items()
@@ -213,8 +212,7 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
 
 def view_table(shown: View) -> Any:
     """Return the rows of what a reader sees of a result, as a table."""
-    pandas: Any = import_module("pandas")
-    return pandas.DataFrame(shown.rows, columns=shown.header)
+    return pd.DataFrame(shown.rows, columns=shown.header)
 
 
 def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:

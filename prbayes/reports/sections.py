@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
@@ -353,9 +353,10 @@ def posteriors(m: Material) -> list[Section]:
 
 def _posterior_rows(tree: xr.DataTree, names: Sequence[str], prob: float) -> list[dict[str, Any]]:
     """Return estimates and diagnostics of the draws of each variable."""
-    arviz: Any = import_module("arviz")  # heavy, and partly annotated
+    import arviz as az  # heavy
+
     with np.errstate(all="ignore"):  # a variable that never moves
-        table = arviz.summary(tree, kind="diagnostics", round_to="none")
+        table = az.summary(tree, kind="diagnostics", round_to="none")
     estimates, _ = estimates_of(tree, prob)
     rows = []
     # ArviZ has the same elements in the same order, with names of its own.
@@ -574,9 +575,8 @@ def measured_values(m: Material) -> list[Section]:
 
 def _correlations(name: str, y: Observed) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    pandas: Any = import_module("pandas")
     columns = {output: np.where(np.isfinite(x), x, np.nan) for output, _, x in shown_columns(y)}
-    r = pandas.DataFrame(columns).corr(min_periods=3).values
+    r = pd.DataFrame(columns).corr(min_periods=3).values
     about = "Each of the specimens that have both outputs, without those that failed."
     table = correlation_table(list(columns), r, 3)
     return Section(f"Correlations of {name}", about, table, level=3)

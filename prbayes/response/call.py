@@ -816,11 +816,10 @@ def chunks(
     that have begun are yielded before the error is raised.
     """
     # Other processes get the function as bytes, because pickle does not take lambdas.
-    options: dict[str, Any] = {"outputs": settings.outputs}
-    function: Function | bytes = settings.function
+    work = partial(compute, settings.function, outputs=settings.outputs)
     if settings.executor is not None and not isinstance(settings.executor, ThreadPoolExecutor):
-        function, options["timeout"] = packed(settings.function), settings.timeout
-    work = partial(compute, function, **options)
+        function = packed(settings.function)
+        work = partial(compute, function, timeout=settings.timeout, outputs=settings.outputs)
     workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
     # Chunks in progress when a worker was lost: they are repeated one at a time, so that the point
@@ -831,6 +830,10 @@ def chunks(
     begun: dict[Future[Chunk], Indices] = {}
     waiting = rows
     error: BaseException | None = None
+
+    def begin(rows: Indices) -> None:
+        begun[pool.submitted(work, points.at(rows), tolerant)] = rows
+
     with progress(f"responses of {settings.name}", rows.size) as report:
         while waiting.size or begun or suspects:
             if loss is not None and not begun:
@@ -841,7 +844,7 @@ def chunks(
             if not begun:
                 suspect = suspects.pop() if suspects else None
                 if suspect is not None:
-                    begun[pool.submitted(work, points.at(suspect), tolerant)] = suspect
+                    begin(suspect)
             while waiting.size and suspect is None and loss is None and len(begun) < most_chunks:
                 size = chunk_size(settings, tally, waiting.size, workers)
                 try:
@@ -850,9 +853,8 @@ def chunks(
                     error = error or spent
                     waiting = waiting[:0]
                     break
-                chunk_rows = waiting[:size]
+                begin(waiting[:size])
                 waiting = waiting[size:]
-                begun[pool.submitted(work, points.at(chunk_rows), tolerant)] = chunk_rows
             finished = []
             for future in pool.done(begun):
                 chunk_rows = begun.pop(future)

@@ -134,7 +134,7 @@ def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) ->
         order = np.argsort(numbers[0])
         rank = np.argsort(np.argsort(numbers[1]))
         if np.allclose(numbers[0][order], np.sort(numbers[1]), rtol=1e-9, atol=0):
-            return np.asarray(order[rank])
+            return order[rank]
     elif set(labels) == set(expected) and len(set(labels)) == len(labels):
         return np.array([labels.index(label) for label in expected], dtype=np.intp)
     raise KeyError(

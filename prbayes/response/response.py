@@ -355,7 +355,7 @@ class Responses:
             row, again = change
             raise ResponseError(
                 f"{self.caller}: got {numbers_text(again)} from the response of {stored.name} "
-                f"{self._place(points, row)}, expected "
+                f"{_place_of_specimen(self, points, row)}, expected "
                 f"{numbers_text(values[row])}, as in its runs: {names} "
                 "has changed since; build the model again for the response as it is now, or write "
                 "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
@@ -416,12 +416,6 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _place(self, points: Sequence[Floats], row: int) -> str:
-        """Return the aleatory inputs of a specimen as a text, with their names."""
-        sizes = [math.prod(shape) for shape in self.inputs.event_shapes]
-        names = column_names(aleatory_names(self.inputs, self.function), sizes)
-        return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
-
     def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if one of a few specimens differs when it is computed again, by itself.
 
@@ -458,7 +452,7 @@ class Responses:
                 second = by_itself(part)
             except ResponseError as error:  # the response rejects small batches
                 if self.is_batched:
-                    self._refuse_one_size(specimens, (len(values),), error)
+                    _refuse_one_size(self, specimens, error)
                 return
             is_random = first_change(again, second, tolerance_of(values)) is not None
             if is_random and self.scatter is None:
@@ -472,10 +466,10 @@ class Responses:
             if is_random:
                 raise ResponseError(
                     f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
-                    f"response {self._place(specimens, row)}, expected the same: it is random, "
-                    "or keeps a state from one specimen to the next; fix its random seed or "
-                    "state, model its scatter as an input, such as pm.Normal.dist(0, 1), or use "
-                    "prb.AreaMetric() with prb.Fresh() for random responses"
+                    f"response {_place_of_specimen(self, specimens, row)}, expected the same: it "
+                    "is random, or keeps a state from one specimen to the next; fix its random "
+                    "seed or state, model its scatter as an input, such as pm.Normal.dist(0, 1), "
+                    "or use prb.AreaMetric() with prb.Fresh() for random responses"
                 )
             raise ResponseError(
                 f"{self.name}: the response of a specimen depends on the other specimens of a "
@@ -485,26 +479,6 @@ class Responses:
                 "for a mean, a sum, a sort or another order over the axis of specimens, and for a "
                 "state from one specimen to the next, or write it for one specimen, in prb.scalar"
             )
-
-    def _refuse_one_size(
-        self, values: Sequence[Floats], batch: Shape, error: ResponseError
-    ) -> None:
-        """Raise if the response takes no other number of specimens than that of its batch.
-
-        Such a response contains an array with a value for each specimen, whose values would be
-        paired with points of the population.
-        """
-        size = math.prod(batch)
-        few = (*[1] * (len(batch) - 1), 3 if size == 2 else 2)
-        rows = np.arange(few[-1]) % size
-        specimens = [v.reshape(size, *v.shape[len(batch) :])[rows] for v in values]
-        try:
-            self._called([x.reshape(few + x.shape[1:]) for x in specimens], few, is_run=False)
-        except ResponseError:
-            raise ResponseError(
-                f"{self.name}: the response takes {size} specimens, but not one or {few[-1]}, "
-                f"expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
-            ) from None
 
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
@@ -523,11 +497,38 @@ class Responses:
             row, then = change
             raise ResponseError(
                 f"{self.name}: got {numbers_text(values[row])} from the response "
-                f"{self._place(specimens, row)}, expected {numbers_text(then)}, its "
+                f"{_place_of_specimen(self, specimens, row)}, expected {numbers_text(then)}, its "
                 "value when the simulator was created: a variable that it reads has changed since "
                 "then (runs begin at the first use); write a function without a state, and one "
                 "for each condition, such as functools.partial(response, load=2.0)"
             )
+
+
+def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int) -> str:
+    """Return the aleatory inputs of a specimen as a text, with their names."""
+    inputs = responses.inputs
+    sizes = [math.prod(shape) for shape in inputs.event_shapes]
+    names = column_names(aleatory_names(inputs, responses.function), sizes)
+    return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
+
+
+def _refuse_one_size(
+    responses: Responses, specimens: Sequence[Floats], error: ResponseError
+) -> None:
+    """Raise if the response takes no other number of specimens than that of its batch.
+
+    Such a response contains an array with a value for each specimen, whose values would be
+    paired with points of the population.
+    """
+    size = len(specimens[0])
+    few = 3 if size == 2 else 2
+    try:
+        responses._called([x[np.arange(few) % size] for x in specimens], (few,), is_run=False)
+    except ResponseError:
+        raise ResponseError(
+            f"{responses.name}: the response takes {size} specimens, but not one or {few}, "
+            f"expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
+        ) from None
 
 
 def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, tally: Tally) -> None:

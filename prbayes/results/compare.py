@@ -136,13 +136,11 @@ def compare(
     in_table = _in_all(shown)
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
-        got = dict(zip(results, columns, strict=True))
-        if model is not None:
-            got["the model"] = variables
-        texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
+        pairs = zip(results, columns, strict=True)
+        texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in pairs)
         raise ValueError(
-            f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
-            "names"
+            f"compare: got results that share no hyperparameter ({texts:.500}) with each other and "
+            "the model, expected the same names"
         )
     data = _estimate_variables(np.array([[column[name] for name in names] for column in columns]))
     for key in COSTS:
@@ -155,17 +153,21 @@ def compare(
         for key, scores in _scores(model, shared, values, metrics, is_covered=is_covered).items():
             data[key] = ("result", scores)
     coords = {"result": list(results), "hyperparameter": names}
-    findings = [
-        replace(finding, text=f"{label}: {finding.text}")
-        for label, result in results.items()
-        for finding in width_of_epsilon(result, naming)
-    ]
     attrs = {
         "interval": INTERVAL,
-        "findings": as_json(report(*findings)),
+        "findings": as_json(report(*_epsilon_findings(results, naming))),
         **as_attributes(identity),
     }
     return Comparison(data, coords=coords, attrs=attrs)
+
+
+def _epsilon_findings(results: Mapping[str, Any], model: pm.Model | None) -> list[Finding]:
+    """Return findings of draws whose width is that of epsilon, with the labels of the results."""
+    return [
+        replace(finding, text=f"{label}: {finding.text}")
+        for label, result in results.items()
+        for finding in width_of_epsilon(result, model)
+    ]
 
 
 def _refuse_wrong_arguments(results: Any, metrics: Any) -> None:
@@ -232,13 +234,18 @@ class Comparison(Table):
                 shift = f"{float(row['shift']) + 0.0:.2f}"  # The sum turns -0.0 into 0.0.
                 rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}", shift])
         sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
-        for key, scores in self.data_vars.items():
-            if scores.dims == ("result",) and key not in COSTS:
-                items = scores.to_series().items()
-                listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
-                sentences.append(f"Discrepancy by {key}: {listed}.")
+        for key, scores in scores_in(self).items():
+            items = scores.to_series().items()
+            listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
+            sentences.append(f"Discrepancy by {key}: {listed}.")
         header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval", "shift in sd"]
         return View("Comparison", header, rows, sentences)
+
+
+def scores_in(comparison: xr.Dataset) -> dict[Any, xr.DataArray]:
+    """Return the scores of a comparison, each by result."""
+    variables = comparison.data_vars.items()
+    return {key: x for key, x in variables if x.dims == ("result",) and key not in COSTS}
 
 
 def _tree_of(label: str, result: Any) -> xr.DataTree:

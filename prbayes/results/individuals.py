@@ -96,10 +96,7 @@ def individuals(
             "prb.individuals: got a model whose metrics compare distributions, expected a "
             "prb.Simulator with metric=prb.LogLikelihood(), which has a record of each specimen"
         )
-    points, coords = populations_of(result, model, n_draws, "prb.individuals")
-    if isinstance(result, Optimum):
-        points = {name: np.repeat(values, n_draws, axis=0) for name, values in points.items()}
-        coords["draw"] = np.arange(n_draws)
+    points, coords = populations_of(result, model, n_draws, "prb.individuals", copies=n_draws)
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
     names = ("posterior", "posterior_predictive", "observed_data", "constant_data")
@@ -110,8 +107,9 @@ def individuals(
         size = len(likelihood.readings)
         specimens = {f"specimen{suffix}": np.arange(size) if labels is None else labels}
         inputs, gross_error = draw_inputs(with_more_points(likelihood), rng, points)
-        function = likelihood.measurements[0].responses.function
-        input_names = aleatory_names(likelihood.inputs, function)
+        input_names = aleatory_names(
+            likelihood.inputs, likelihood.measurements[0].responses.function
+        )
         columns = likelihood.stacked.conditions  # values of the specimens, (S, C), or None
         conditions = {}
         if columns is not None:
@@ -123,19 +121,16 @@ def individuals(
                 groups["constant_data"][name + suffix] = array
                 continue
             is_log = isinstance(likelihood.inputs.aleatory[position].owner.op, _LOG_NORMAL)
-            scale: Any = np.log if is_log else np.positive
-            within = scale(population[position]).std(axis=1).mean(axis=0)
-            shrinkage = 1 - scale(values).mean(axis=0).std(axis=0) / within
+            shrinkage = _shrinkage(values, population[position], is_log=is_log)
             array = _array(name, values, coords | specimens)
             groups["posterior"][name + suffix] = array.assign_attrs(shrinkage=shrinkage.tolist())
         if gross_error is not None:
-            array = _array("gross_error", gross_error, coords | specimens)
-            groups["posterior"][f"gross_error{suffix}"] = array
+            name = "gross_error"
+            groups["posterior"][name + suffix] = _array(name, gross_error, coords | specimens)
         for m in likelihood.measurements:
             rows = specimens
             if len(m.observed) != size:
-                row_labels = np.asarray(m.specimens)
-                rows = {f"specimen of {m.name}": row_labels}
+                rows = {f"specimen of {m.name}": np.asarray(m.specimens)}
             replicates = draw_readings(likelihood, rng, points, len(m.observed), m)
             array = _array(m.name, replicates, coords | rows, m.outputs)
             groups["posterior_predictive"][m.name] = array
@@ -186,6 +181,13 @@ class Individuals(Tree):
         ]
         header = ["", "mean", "sd", f"{INTERVAL:.0%} interval"]
         return View("Inputs of the measured specimens", header, rows, sentences)
+
+
+def _shrinkage(values: Floats, population: Floats, *, is_log: bool) -> Floats:
+    """Return one minus the spread of the specimens' means over that of the population, (*event)."""
+    scale: Any = np.log if is_log else np.positive
+    within = scale(population).std(axis=1).mean(axis=0)
+    return np.asarray(1 - scale(values).mean(axis=0).std(axis=0) / within)
 
 
 def _population(

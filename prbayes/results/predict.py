@@ -21,6 +21,7 @@ from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
+    Indices,
     Seed,
     finite_number,
     flag,
@@ -191,20 +192,20 @@ def predict(
     positive_integer(n_samples, "n_samples", minimum=2)
     positive_integer(n_draws, "n_draws")
     flag(stored, "stored")
-    if max_lost is not None:
-        refuse_max_lost(max_lost, "prb.predict")
     if name is not None:
         plain_text(name, "name")
     calling = call_settings(executor, store, version)
     label = name or named_response(response, calling, "pass name=")
     model = model_of(result, model, "prb.predict")
-    points, coords = populations_of(result, model, n_draws, "prb.predict")
     sources = population_simulators(model)
+    if max_lost is None:
+        max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
+    refuse_max_lost(max_lost, "prb.predict")
     arguments, conditions = with_known_conditions(label, inputs, sources, stored=stored)
-    if conditions is not None and isinstance(result, Optimum):
-        points = {key: np.repeat(value, n_samples, axis=0) for key, value in points.items()}
-        coords["draw"] = np.arange(n_samples)
-    n_samples = n_samples if conditions is None else len(conditions)
+    copies = 1
+    if conditions is not None:  # A sample has a specimen for each condition.
+        copies, n_samples = n_samples, len(conditions)
+    points, coords = populations_of(result, model, n_draws, "prb.predict", copies)
     inputs_read = read_inputs_of_copy(label, arguments, model)
     n_stored = sum(s.responses.count for s in sources)
     responses = Responses(
@@ -218,21 +219,17 @@ def predict(
     )
     seed = None if random_seed is None else seed_number(random_seed)
     # A table of runs needs no emulator: it costs no run, and is NaN outside its ranges.
-    is_served = stored and not isinstance(response, Runs)
-    simulator = serving(sources, responses) if is_served else None
+    simulator = None
+    if stored and not isinstance(response, Runs):
+        simulator = serving(sources, responses)
     size = len(next(iter(points.values())))
     # A condition that is an input and a covariate has the same values as both.
-    stated = {} if conditions is None else _by_name(inputs_read, conditions)
-    values = covariate_values(label, inputs_read, at, stated, has_runs=simulator is not None)
-    points |= {
-        covariate: np.broadcast_to(value, (size, np.size(value)))
-        for covariate, value in values.items()
-    }
+    stated = _by_name(inputs_read, conditions)
+    has_runs = simulator is not None
+    points |= covariate_values(label, inputs_read, at, stated, size, has_runs=has_runs)
+    rng = np.random.default_rng(seed)
     with shown(progressbar):
-        rng = np.random.default_rng(seed)
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
-    if max_lost is None:
-        max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
     missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
@@ -245,13 +242,10 @@ def predict(
         "random_seed": str(seed),
         "findings": as_json((*findings_of(response), *report(*width_of_epsilon(result, model)))),
         **_calibration_attributes(result, model),
-        **as_attributes(identity_in(result) or identity_of(model)),
-        **versions(),
+        **provenance(result, model),
     }
-    result_values = _labelled(drawn.values, responses, coords, n_samples)
-    if conditions is not None:
-        result_values = result_values.rename(sample="specimen")
-    return Prediction(result_values.rename(label).assign_attrs(attrs))
+    coords["sample" if conditions is None else "specimen"] = np.arange(n_samples)
+    return Prediction(_labelled(drawn.values, responses, coords).rename(label).assign_attrs(attrs))
 
 
 class Prediction(ShownArray, xr.DataArray):
@@ -297,22 +291,20 @@ class Prediction(ShownArray, xr.DataArray):
 
 
 def _labelled(
-    values: Floats, responses: Responses, coords: dict[str, NDArray[Any]], n_samples: int
+    values: Floats, responses: Responses, coords: dict[str, NDArray[Any]]
 ) -> xr.DataArray:
-    """Return predicted responses with dimensions and coordinates."""
-    groups = responses.inputs.groups
-    group_coords = {} if groups is None else {groups.dim: list(groups.labels)}
-    n_leading = 1 + len(group_coords)
-    leading = values.shape[1:n_leading]
-    event = values.shape[n_leading + 1 :]
-    outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
-    output_coords = {outputs.dim: list(outputs.labels)} if event else {}
-    sizes = (len(coords["chain"]), len(coords["draw"]), *leading)
-    return xr.DataArray(
-        values.reshape(*sizes, n_samples, *event),
-        dims=("chain", "draw", *group_coords, "sample", *output_coords),
-        coords={**coords, **group_coords, "sample": np.arange(n_samples), **output_coords},
-    )
+    """Return predicted responses with dimensions; ``coords`` are of chains, draws and specimens."""
+    (chain, draw, specimen), groups = coords, responses.inputs.groups
+    labels: dict[str, Any] = {chain: coords[chain], draw: coords[draw]}
+    if groups is not None:
+        labels[groups.dim] = list(groups.labels)
+    labels[specimen] = coords[specimen]
+    event = values.shape[len(labels) - 1 :]
+    if event:
+        outputs = responses.outputs or Outputs(tuple(range(event[0])))
+        labels[outputs.dim] = list(outputs.labels)
+    sizes = [len(label) for label in labels.values()]
+    return xr.DataArray(values.reshape(sizes), labels, tuple(labels))
 
 
 def covariate_values(
@@ -320,32 +312,44 @@ def covariate_values(
     inputs: Inputs,
     at: Mapping[str, float] | None,
     stated: Mapping[str, Floats],
+    size: int,
     *,
     has_runs: bool,
-) -> dict[str, Any]:
-    """Return the value of each covariate: a number, or the values of a stated condition, (N,).
+) -> dict[str, Floats]:
+    """Return the values of each covariate in ``size`` populations, (size, 1).
 
-    With ``has_runs`` numbers outside the range of the runs are refused.
+    The values of a stated condition are those of N specimens, (size, N). With ``has_runs`` numbers
+    outside the range of the runs are refused.
     """
     names = [str(covariate.name) for covariate in inputs.covariates]
-    by_name = {name: stated[name] for name in names if name in stated}
-    names = [name for name in names if name not in by_name]
+    unknown = [name for name in names if name not in stated]
     numbers = {} if at is None else at
-    if not isinstance(numbers, Mapping) or set(numbers) != set(names):
+    if not isinstance(numbers, Mapping) or set(numbers) != set(unknown):
         raise ValueError(
-            f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, {names}; "
-            "pass at={'hardness': 250.0}, for example"
+            f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, "
+            f"{unknown}; pass at={{'hardness': 250.0}}, for example"
         )
-    values = {name: finite_number(numbers[name], f"{label}: at: {name}") for name in names}
-    for covariate in inputs.covariates:
-        name = str(covariate.name)
-        if name in by_name:
-            continue
-        if has_runs:
-            ends = covariate.owner.op.dist_params(covariate.owner)
-            low, high = (float(end.eval()) for end in ends)
-            _refuse_outside(f"{label}: at", name, [values[name]], low, high)
-    return values | by_name
+    values = {}
+    for covariate, name in zip(inputs.covariates, names, strict=True):
+        value: Any = stated.get(name)
+        if value is None:
+            value = finite_number(numbers[name], f"{label}: at: {name}")
+            if has_runs:
+                ends = covariate.owner.op.dist_params(covariate.owner)
+                low, high = (float(end.eval()) for end in ends)
+                _refuse_outside(f"{label}: at", name, [value], low, high)
+        values[name] = np.broadcast_to(value, (size, np.size(value)))
+    return values
+
+
+def points_by_group(inputs: Inputs, points: dict[str, Floats]) -> list[dict[str, Floats]]:
+    """Return the variables of the populations of each group, or the only ones without groups."""
+    if inputs.groups is None:
+        return [points]
+    size = len(next(iter(points.values())))
+    (index,) = [str(parent.name) for parent in inputs.parents if is_group(parent)]
+    places = range(len(inputs.groups.labels))
+    return [points | {index: np.full(size, place)} for place in places]
 
 
 def _refuse_outside(
@@ -360,8 +364,10 @@ def _refuse_outside(
         )
 
 
-def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
+def _by_name(inputs: Inputs, conditions: Floats | None) -> dict[str, Floats]:
     """Return the values of conditions that are inputs, (N, C), by name."""
+    if conditions is None:
+        return {}
     names = [str(inputs.aleatory[place].name) for place in inputs.conditions]
     return dict(zip(names, conditions.T, strict=True))
 
@@ -401,11 +407,12 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
 
 
 def populations_of(
-    result: Any, model: pm.Model, draws: int, caller: str
+    result: Any, model: pm.Model, draws: int, caller: str, copies: int = 1
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
     """Return variables, (k, *shape), at evenly thinned draws, and the coordinates of the draws.
 
-    These are the free variables, and those that `pymc.do` or `pymc.observe` fixed.
+    These are the free variables, and those that `pymc.do` or `pymc.observe` fixed. An optimum has
+    one draw, which is repeated ``copies`` times.
     """
     names = [str(rv.name) for rv in model.free_RVs]
     result = one_posterior(result, caller)
@@ -426,8 +433,9 @@ def populations_of(
             f"{caller}: got a result without {missing}, expected the model's free variables {names}"
         )
     if isinstance(result, Optimum):
-        points = {name: np.asarray(values[name], dtype=np.float64)[None] for name in names}
-        coords = {"chain": np.arange(1), "draw": np.arange(1)}
+        of_optimum = {name: np.asarray(values[name], dtype=np.float64) for name in names}
+        points = {name: np.repeat(value[None], copies, 0) for name, value in of_optimum.items()}
+        coords = {"chain": np.arange(1), "draw": np.arange(copies)}
     else:
         points = finite_draws(values, names)
         coords = {dim: np.asarray(values[dim]) for dim in ("chain", "draw")}
@@ -500,15 +508,9 @@ def _predicted(
     Specimens of a data set have known conditions, (n, C).
     """
     inputs = responses.inputs
-    by_group = [points]
-    if inputs.groups is not None:
-        size = len(next(iter(points.values())))
-        (index,) = [str(parent.name) for parent in inputs.parents if is_group(parent)]
-        places = range(len(inputs.groups.labels))
-        by_group = [{**points, index: np.full(size, place)} for place in places]
     results: list[_Predicted] = []
     emulated: EmulatedResponse | None = None
-    for group_points in by_group:
+    for group_points in points_by_group(inputs, points):
         if isinstance(simulator, Node):
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
             continue
@@ -728,7 +730,7 @@ def data_digest(observed: Floats) -> str:
     return _array_digest(observed[in_order(observed)])
 
 
-def in_order(observed: Floats) -> NDArray[np.intp]:
+def in_order(observed: Floats) -> Indices:
     """Return the order of measured values, which is lexicographic for several outputs."""
     if observed.ndim == 1:
         return np.argsort(observed, kind="stable")
@@ -763,3 +765,8 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
     attributes = {"calibration_data": digests, "calibration_specimens": list(labels)}
     # netCDF has no empty lists.
     return {key: value for key, value in attributes.items() if value}
+
+
+def provenance(result: Any, model: pm.Model) -> dict[str, Any]:
+    """Return the fingerprint of the problem of a result, and versions of packages, for a table."""
+    return {**as_attributes(identity_in(result) or identity_of(model)), **versions()}

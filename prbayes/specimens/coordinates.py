@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices, Shape
 from prbayes.response.distributions import PopulationSampler, PriorSampler
 from prbayes.response.inputs import Inputs
 
@@ -17,10 +16,10 @@ from prbayes.response.inputs import Inputs
 class Coordinates:
     """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1]."""
 
-    shapes: tuple[tuple[int, ...], ...]  # event shape of each aleatory input
+    shapes: tuple[Shape, ...]  # event shape of each aleatory input
     # (d,): whether z is linear in the logarithm of the input: for positive inputs whose prior spans
     # more than a factor of ten.
-    is_log: NDArray[np.bool_]
+    is_log: Bools
     # (d,): middle of the prior range, which has 99 % of the specimens of the prior predictive
     # population
     center: Floats
@@ -31,7 +30,7 @@ class Coordinates:
     # (2, d): ends of the range of inputs between zero and one whose density may be infinite there;
     # infinite numbers for other inputs.
     ends: Floats
-    is_condition: NDArray[np.bool_]  # (d,): whether the value is known for each specimen
+    is_condition: Bools  # (d,): whether the value is known for each specimen
 
     @classmethod
     def of_prior(
@@ -92,7 +91,7 @@ class Coordinates:
         return len(self.center)
 
     @property
-    def inputs_of_population(self) -> NDArray[np.intp]:
+    def inputs_of_population(self) -> Indices:
         """The coordinates that are not known for each specimen."""
         return np.flatnonzero(~self.is_condition)
 
@@ -112,7 +111,7 @@ class Coordinates:
         """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""
         batch = inputs[0].shape[:batch_ndim]
         flat = np.concatenate([x.reshape(*batch, -1) for x in inputs], axis=-1)
-        return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
+        return (_logs(flat, self.is_log) - self.center) / self.half_width
 
     def log_jacobian(self, z: Floats) -> Floats:
         """Return log|dx/dz|, (..., d) -> (...), of all inputs that are no conditions."""
@@ -122,6 +121,6 @@ class Coordinates:
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def _logs(flat: Floats, is_log: NDArray[np.bool_]) -> Floats:
+def _logs(flat: Floats, is_log: Bools) -> Floats:
     """Return inputs (..., d), with the logarithm of those selected; NaN for negative values."""
     return np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)

@@ -19,13 +19,23 @@ from scipy.special import ndtri
 
 from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, half_difference
-from prbayes.specimens.proposals import Modes, Normal, Proposals, Residuals, find_modes
+from prbayes.specimens.proposals import (
+    Modes,
+    Normal,
+    Proposals,
+    Residuals,
+    best_rows,
+    find_modes,
+    mixing_weights,
+    with_covered_fibres,
+    without_covered,
+)
 from prbayes.specimens.weighted_points import fit_normal, normal_log_density
 
 
@@ -63,11 +73,11 @@ class SpecimenPoints:
     # (N, K): log of the number of points times the proposal density: ``log_a`` without the density
     # of the readings, for an error that is not known in advance
     log_proposal: Floats
-    n_roots: NDArray[np.intp]  # (N,): modes of the readings' density with a thousandth of the mass
-    mode: NDArray[np.intp]  # (N, K): mode whose proposal drew the point
+    n_roots: Indices  # (N,): modes of the readings' density with a thousandth of the mass
+    mode: Indices  # (N, K): mode whose proposal drew the point
     difference: float = np.nan  # the half difference of the log-likelihoods
 
-    def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
+    def rows(self, index: Indices) -> SpecimenPoints:
         """Return the points of selected specimens."""
         arrays = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **arrays)  # type: ignore[arg-type]
@@ -124,7 +134,7 @@ class SpecimenData:
     # (2, d): ends of the range of inputs, at which a density may be infinite
     ends: Floats | None = None
     # (free,): columns of unknown coordinates, the narrowest possible populations first
-    order: NDArray[np.intp] | None = None
+    order: Indices | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
     gross_errors: bool = False  # whether readings of single specimens may have gross errors
     options: SpecimenOptions = SpecimenOptions()
@@ -136,7 +146,7 @@ class SpecimenData:
     seed: int = 0
 
     @property
-    def free(self) -> NDArray[np.intp]:
+    def free(self) -> Indices:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
 
@@ -152,7 +162,7 @@ class SpecimenData:
         """Return units of all coordinates, (d,), from those of the unknown coordinates, (free,)."""
         scale = np.maximum(np.ptp(self.known, axis=0), 1e-9)
         scale[self.free] = sd
-        return np.asarray(scale)
+        return scale
 
     @cached_property
     def inner(self) -> Floats:
@@ -215,8 +225,8 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     parts = []
     for scale in sorted(data.scales, reverse=True):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
-        proposals = Proposals.at_modes(residuals, modes).without_covered()
-        parts.append(proposals.covering(starts, scale).modes)
+        proposals = without_covered(Proposals.at_modes(residuals, modes))
+        parts.append(with_covered_fibres(proposals, starts, scale).modes)
         starts = _as_starts(parts[-1], starts)
     return Proposals.at_modes(residuals, Modes.joined(parts))
 
@@ -254,7 +264,7 @@ def _starts(
     for column in near[:, 1:].T:
         is_minimum &= distance <= distance[:, column]
     order = np.lexsort((distance, ~is_minimum), axis=1)[:, : data.options.starts]
-    return np.asarray(a[order])
+    return a[order]
 
 
 def _as_starts(modes: Modes, starts: Floats) -> Floats:
@@ -371,7 +381,7 @@ class Plausible:
         # Scales of an unknown error that are not likely have points as well, because the prior
         # allows them.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
-            proposals = proposals.with_shares(masses[0] + masses[1])
+            proposals = replace(proposals, share=mixing_weights(modes, masses[0] + masses[1]))
         result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
         largest = np.zeros(len(data.known))
         np.maximum.at(largest, modes.specimen, masses[0])
@@ -487,16 +497,13 @@ def _half_difference(
     return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf, np.inf)
 
 
-def typical_specimens(
-    modes: Modes, n: int, far: float = 5.0, largest: float = 50.0
-) -> NDArray[np.bool_]:
+def typical_specimens(modes: Modes, n: int, far: float = 5.0, largest: float = 50.0) -> Bools:
     """Return which specimens have no gross error, (n,), by the best mode of each.
 
     An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
     """
-    order = np.lexsort((modes.misfit, modes.specimen))
-    specimens, first = np.unique(modes.specimen[order], return_index=True)
-    a, misfit = modes.a[order[first]], modes.misfit[order[first]]
+    best = modes.rows(best_rows(modes.specimen, modes.misfit))
+    specimens, a, misfit = best.specimen, best.a, best.misfit
     away = np.abs(a - np.median(a, axis=0))
     sd = 1.4826 * np.median(away, axis=0)
     is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)

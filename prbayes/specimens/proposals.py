@@ -42,11 +42,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, ndtri, stdtrit
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.numerics.points import lattice, sobol
 from prbayes.numerics.threads import one_thread
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class Residuals:
     def whitened(self, z: Floats) -> Floats:
         """Return whitened inputs, (..., free), of coordinates (..., d)."""
         centred = z[..., self.free] - self.population.mean
-        return np.asarray(centred @ np.linalg.inv(self.population.root).T)
+        return centred @ np.linalg.inv(self.population.root).T
 
     def errors(
         self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
@@ -168,9 +166,7 @@ class Modes:
 
     def best_misfit(self) -> Floats:
         """Return the least misfit of each specimen that has a mode, (N,)."""
-        least = np.full(self.specimen.max() + 1, np.inf)
-        np.minimum.at(least, self.specimen, self.misfit)
-        return least[np.unique(self.specimen)]
+        return self.misfit[best_rows(self.specimen, self.misfit)]
 
     @property
     def arrays(self) -> list[NDArray[Any]]:
@@ -211,8 +207,7 @@ def find_modes(
     a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
     misfit = (e**2).sum(axis=1) / 2
     # Modes far from the reference population are kept, because another population may be likely.
-    least = np.full(n, np.inf)
-    np.minimum.at(least, specimen, np.where(np.isfinite(value), misfit, np.inf))
+    least = _lowest(specimen, np.where(np.isfinite(value), misfit, np.inf), n)
     value = np.where(misfit <= least[specimen] + gap, value, np.inf)
     rows = _distinct(specimen, a, value, slopes, precision)
     rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
@@ -297,16 +292,33 @@ def _distinct(
         is_near = np.abs(difference).max(axis=2) < 1e-5
         is_same = is_near | (square < 1e-4)
         is_mode[:, k] &= ~(is_same & is_mode[:, :k]).any(axis=1)
-    return np.asarray(table[is_mode])
+    return table[is_mode]
 
 
 def rows_by_specimen(specimen: Indices) -> Indices:
     """Return the rows of each specimen, (N, most), filled up with -1; specimens are ascending."""
     count = np.bincount(specimen)
-    slot = np.arange(len(specimen)) - np.repeat(np.cumsum(count) - count, count)
     table = np.full((len(count), count.max()), -1)
-    table[specimen, slot] = np.arange(len(specimen))
+    table[specimen, _place_among_equals(specimen)] = np.arange(len(specimen))
     return table
+
+
+def _place_among_equals(values: Indices) -> Indices:
+    """Return the place of each element among those equal to it; values are ascending."""
+    return np.arange(len(values)) - np.searchsorted(values, values)
+
+
+def best_rows(specimen: Indices, cost: Floats) -> Indices:
+    """Return the row with the lowest cost of each specimen that has rows, by specimen."""
+    order = np.lexsort((cost, specimen))
+    return order[np.unique(specimen[order], return_index=True)[1]]
+
+
+def _lowest(specimen: Indices, values: Floats, n: int) -> Floats:
+    """Return the lowest value of each of n specimens; infinite for one without a value."""
+    lowest = np.full(n, np.inf)
+    np.minimum.at(lowest, specimen, values)
+    return lowest
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +337,7 @@ class Proposals:
     orientation: Floats  # (R,): sign of the map's determinant at the mode
     log_det: Floats  # (R,): log of the determinant's absolute value
     # (R, free): directions that the readings leave open, along which populations differ
-    open_axes: NDArray[np.bool_]
+    open_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
 
     @classmethod
@@ -358,52 +370,6 @@ class Proposals:
             residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
         )
 
-    def rows(self, index: Indices) -> Proposals:
-        """Return the proposals of selected modes, with equal mixing weights."""
-        modes = self.modes.rows(index)
-        share = 1 / np.bincount(modes.specimen)[modes.specimen]
-        return Proposals(
-            self.residuals,
-            modes,
-            self.inputs[index],
-            self.readings[index],
-            self.orientation[index],
-            self.log_det[index],
-            self.open_axes[index],
-            share,
-        )
-
-    def without_covered(self) -> Proposals:
-        """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
-        modes = self.modes
-        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
-        ordered = self.rows(order)
-        table = ordered.modes.table
-        is_kept = np.ones(len(order), dtype=bool)
-        for k in range(1, table.shape[1]):
-            for better in range(k):
-                pairs = table[:, k] >= 0
-                at, rows = table[pairs, better], table[pairs, k]
-                pairs = (
-                    is_kept[at]
-                    & is_kept[rows]
-                    & (ordered.modes.scale[at] == ordered.modes.scale[rows])
-                )
-                at, rows = at[pairs], rows[pairs]
-                if not rows.size:
-                    continue
-                value, jacobian = ordered.mapped(at, ordered.modes.a[rows])
-                sign, log_det = np.linalg.slogdet(jacobian)
-                is_in_bulk = (value**2).sum(axis=1) < 1.0
-                is_in_bulk &= (sign == ordered.orientation[at]) & (
-                    log_det > ordered.log_det[at] - 1.0
-                )
-                at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
-                end, _, _, converged = ordered.solved(at, value)
-                is_reached = np.abs(end - ordered.modes.a[rows]).max(axis=1, initial=0) < 1e-2
-                is_kept[rows[converged & is_reached]] = False
-        return ordered.rows(np.flatnonzero(is_kept))
-
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
 
@@ -432,16 +398,16 @@ class Proposals:
         half = self.degrees / 2
         constant = gammaln(half + 0.5) - gammaln(half) - np.log(half) / 2
         student = constant - (half + 0.5) * np.log1p(xi**2 / self.degrees)
-        return np.asarray(np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1))
+        return np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
         modes = self.modes
-        return self._of_errors(
+        return self.mapped_errors(
             mode, a, *self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
         )
 
-    def _of_errors(
+    def mapped_errors(
         self, mode: Indices, a: Floats, e: Floats, slopes: Floats
     ) -> tuple[Floats, Floats]:
         """Return xi and its Jacobian at points with standardised errors e and slopes G."""
@@ -450,7 +416,7 @@ class Proposals:
         return xi, inputs + readings @ slopes
 
     @np.errstate(all="ignore")
-    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, Bools]:
         """Return inputs a with xi(a) = xi by a damped Newton method from the mode.
 
         Also xi at these inputs, the log of the determinant of its Jacobian, and whether the method
@@ -491,28 +457,6 @@ class Proposals:
         log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
         return a, value, log_det, converged
 
-    def with_shares(self, mass: Floats) -> Proposals:
-        """Return the proposals with mixing weights by the mass of each mode, (R,).
-
-        A tenth of the points is for all modes alike: another population may be the likely one.
-        """
-        specimen = self.modes.specimen
-        total = np.bincount(specimen, mass)[specimen]
-        count = np.bincount(specimen)[specimen]
-        by_mass = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
-        return replace(self, share=0.9 * by_mass + 0.1 / count)
-
-    def _counts(self, count: int) -> Indices:
-        """Return the number of points of each mode, (R,), which have the sum ``count``."""
-        share, table = self.share, self.modes.table
-        least = np.where(table >= 0, np.floor(count * share[table]), -1)
-        rest = np.where(table >= 0, count * share[table] - least, -1.0)
-        missing = count - np.where(table >= 0, least, 0).sum(axis=1)
-        # The largest remainders get one point more.
-        rank = np.argsort(np.argsort(-rest, axis=1, kind="stable"), axis=1, kind="stable")
-        counts = least + (rank < missing[:, None])
-        return np.asarray(counts[table >= 0], dtype=np.intp)
-
     @one_thread()
     def draw(self, count: int, seed: int) -> tuple[Floats, Floats, Indices]:
         """Draw ``count`` points of each specimen.
@@ -522,9 +466,9 @@ class Proposals:
         """
         modes, residuals = self.modes, self.residuals
         n, d = len(residuals.known), modes.a.shape[1]
-        counts = self._counts(count)
+        counts = _point_counts(self.share, modes.table, count)
         mode = np.repeat(np.arange(len(counts)), counts)
-        place = np.arange(len(mode)) - np.repeat(np.cumsum(counts) - counts, counts)
+        place = _place_among_equals(mode)
         shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
         u = (lattice(place, counts[mode], d) + shifts[mode]) % 1.0
         u = np.clip(u, 1e-12, 1 - 1e-12)
@@ -540,15 +484,14 @@ class Proposals:
         a[~converged] = 0.0
         specimen = modes.specimen[mode]
         # A specimen that no inputs reproduce has its best mode, as if the map were linear there.
-        order = np.lexsort((modes.misfit, modes.specimen))
-        best = order[np.unique(modes.specimen[order], return_index=True)[1]]
+        best = best_rows(modes.specimen, modes.misfit)
         lost = best[~np.isin(modes.specimen[best], specimen[rows])]
         first = np.searchsorted(specimen, modes.specimen[lost])
         a[first] = modes.a[lost]
         log_q[first] = self.log_det[lost] - np.log(np.diag(residuals.population.root)).sum()
         z = np.zeros((n, count, residuals.known.shape[1]))
         by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
-        slot = np.arange(len(mode)) - np.searchsorted(specimen, specimen)
+        slot = _place_among_equals(specimen)
         z[specimen, slot] = residuals.coordinates(specimen, a)
         by_specimen[specimen, slot], owner[specimen, slot] = log_q, mode
         return z, by_specimen, owner
@@ -565,50 +508,15 @@ class Proposals:
         ``weights`` are of the modes, (R,). ``drawn`` has the mode that drew each point and the log
         of its density there, up to a constant, both (k,).
         """
-        m, d = self.residuals.target.shape[1], self.modes.a.shape[1]
-        blocks = list(_blocks(len(a), m * d))
-        if len(blocks) > 1:
-            parts = []
-            for block in blocks:
-                of_block = None if drawn is None else (drawn[0][block], drawn[1][block])
-                parts.append(self.log_mixture(specimen[block], a[block], weights, of_block))
-            return np.concatenate(parts)
-        with np.errstate(divide="ignore"):
-            logs = np.log(weights)
-        modes, table = self.modes, self.modes.table[specimen]
-        values, jacobian = self.residuals.simulated(specimen, a)
-        largest, terms = np.full(len(a), -np.inf), []
-        if drawn is not None:
-            largest = drawn[1] + logs[drawn[0]]
-            terms = [largest]
-        for slot, at in enumerate(table.T):
-            rows = np.flatnonzero((at >= 0) & (logs[at] > -np.inf))
-            if drawn is not None:
-                rows = rows[at[rows] != drawn[0][rows]]
-            term = np.full(len(a), -np.inf)
-            if rows.size:
-                at = at[rows]
-                errors = self.residuals.standardised(
-                    specimen[rows], values[rows], jacobian[rows], modes.scale[at]
-                )
-                value, slopes = self._of_errors(at, a[rows], *errors)
-                sign, log_det = np.linalg.slogdet(slopes)
-                density = log_det + self.log_density(at, value) + logs[at]
-                matters = (sign == self.orientation[at]) & (density > largest[rows] - 5)
-                rows, at, density = rows[matters], at[matters], density[matters]
-                is_reached = np.zeros(len(rows), dtype=bool)
-                if drawn is not None:
-                    is_reached = self._is_same_mode[drawn[0][rows], slot]
-                check = np.flatnonzero(~is_reached)
-                end, _, _, converged = self.solved(at[check], value[matters][check])
-                distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
-                is_reached[check] = converged & (distance < 1e-3)
-                term[rows[is_reached]] = density[is_reached]
-            terms.append(term)
-        return log_sum_exp(np.stack(terms, axis=1))
+        width = self.residuals.target.shape[1] * self.modes.a.shape[1]
+        parts = []
+        for block in _blocks(len(a), width):
+            of_block = None if drawn is None else (drawn[0][block], drawn[1][block])
+            parts.append(_log_mixture(self, specimen[block], a[block], weights, of_block))
+        return np.concatenate(parts) if parts else np.empty(0)
 
     @cached_property
-    def _is_same_mode(self) -> NDArray[np.bool_]:
+    def is_same_mode(self) -> Bools:
         """Whether a mode is that in a slot of its specimen for another error, (R, most).
 
         Each is the nearest to the other among the modes for its error, in the map of the one for
@@ -638,57 +546,139 @@ class Proposals:
         result[table[n, slot]] = is_same[n, slot]
         return result
 
-    def covering(self, starts: Floats, scale: float, most: int = 4) -> Proposals:
-        """Return proposals with further ones where the fibre of a specimen is not covered.
 
-        A proposal ends at folds. Candidates are points at which the readings are met, nearest to
-        starts (N, S, free), and points around each mode: an inaccurate reading may have both sides
-        of a fold. They are not covered if their importance under a wide population is more than
-        three times that of the modes; the most important one gets a proposal.
-        """
-        residuals, result = self.residuals, self
-        n, count, d = starts.shape
-        specimen = np.repeat(np.arange(n), count)
-        met = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)[0]
-        g = self.modes.slopes
-        # The precision G'G + 1/4 is R'R; as a sum it would lose its small eigenvalues.
-        half = np.broadcast_to(0.5 * np.eye(d), (len(g), d, d))
-        triangles = np.linalg.qr(np.concatenate([g, half], axis=1), mode="r")
-        roots = np.linalg.inv(triangles).swapaxes(1, 2)
-        around = self.modes.a[:, None] + ndtri(sobol(8, d, 1)) @ roots
-        specimen = np.concatenate([specimen, np.repeat(self.modes.specimen, 8)])
-        a = np.concatenate([met, around.reshape(-1, d)])
-        e, slopes = residuals.errors(specimen, a, scale)
-        misfit = (e**2).sum(axis=1) / 2
-        least = np.full(n, np.inf)
-        np.minimum.at(least, self.modes.specimen, self.modes.misfit)
-        is_near = misfit <= least[specimen] + np.where(np.arange(len(a)) < len(met), 10.0, 3.0)
-        scales = np.full(len(a), scale)
-        points = Modes(specimen, a, misfit, e, slopes, scales)
-        rows = np.flatnonzero(is_near)
-        rows = rows[np.argsort(specimen[rows], kind="stable")]
-        points = points.rows(rows)
+def mixing_weights(modes: Modes, mass: Floats) -> Floats:
+    """Return mixing weights by the mass of each mode, (R,).
 
-        def importance(modes: Modes) -> Floats:
-            log_q = result.log_mixture(modes.specimen, modes.a, result.share)
-            return np.asarray(-0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q)
+    A tenth of the points is for all modes alike: another population may be the likely one.
+    """
+    total = np.bincount(modes.specimen, mass)[modes.specimen]
+    count = np.bincount(modes.specimen)[modes.specimen]
+    by_mass = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
+    return 0.9 * by_mass + 0.1 / count
 
-        for _ in range(most):
-            usual = np.full(n, -np.inf)
-            of_modes = importance(result.modes)
-            np.maximum.at(
-                usual, result.modes.specimen, np.where(np.isfinite(of_modes), of_modes, -np.inf)
-            )
-            excess = importance(points) - usual[points.specimen]
-            excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
-            order = np.lexsort((-excess, points.specimen))
-            first = order[np.unique(points.specimen[order], return_index=True)[1]]
-            added = first[excess[first] > np.log(3.0)]
-            if not added.size:
-                break
-            modes = Modes.joined([result.modes, points.rows(added)])
-            result = Proposals.at_modes(residuals, modes)
-        return result
+
+def _point_counts(share: Floats, table: Indices, count: int) -> Indices:
+    """Return the number of points of each mode, (R,), which have the sum ``count``."""
+    least = np.where(table >= 0, np.floor(count * share[table]), -1)
+    rest = np.where(table >= 0, count * share[table] - least, -1.0)
+    missing = count - np.where(table >= 0, least, 0).sum(axis=1)
+    # The largest remainders get one point more.
+    rank = np.argsort(np.argsort(-rest, axis=1, kind="stable"), axis=1, kind="stable")
+    counts = least + (rank < missing[:, None])
+    return np.asarray(counts[table >= 0], dtype=np.intp)
+
+
+def _log_mixture(
+    proposals: Proposals,
+    specimen: Indices,
+    a: Floats,
+    weights: Floats,
+    drawn: tuple[Indices, Floats] | None,
+) -> Floats:
+    """Return `Proposals.log_mixture` of a block of points."""
+    with np.errstate(divide="ignore"):
+        logs = np.log(weights)
+    modes, residuals = proposals.modes, proposals.residuals
+    values, jacobian = residuals.simulated(specimen, a)
+    largest, terms = np.full(len(a), -np.inf), []
+    if drawn is not None:
+        largest = drawn[1] + logs[drawn[0]]
+        terms = [largest]
+    for slot, at in enumerate(modes.table[specimen].T):
+        rows = np.flatnonzero((at >= 0) & (logs[at] > -np.inf))
+        if drawn is not None:
+            rows = rows[at[rows] != drawn[0][rows]]
+        at = at[rows]
+        errors = residuals.standardised(
+            specimen[rows], values[rows], jacobian[rows], modes.scale[at]
+        )
+        value, slopes = proposals.mapped_errors(at, a[rows], *errors)
+        sign, log_det = np.linalg.slogdet(slopes)
+        density = log_det + proposals.log_density(at, value) + logs[at]
+        matters = (sign == proposals.orientation[at]) & (density > largest[rows] - 5)
+        rows, at, density = rows[matters], at[matters], density[matters]
+        is_reached = np.zeros(len(rows), dtype=bool)
+        if drawn is not None:
+            is_reached = proposals.is_same_mode[drawn[0][rows], slot]
+        check = np.flatnonzero(~is_reached)
+        end, _, _, converged = proposals.solved(at[check], value[matters][check])
+        distance = np.abs(end - a[rows[check]]).max(axis=1, initial=0)
+        is_reached[check] = converged & (distance < 1e-3)
+        term = np.full(len(a), -np.inf)
+        term[rows[is_reached]] = density[is_reached]
+        terms.append(term)
+    return log_sum_exp(np.stack(terms, axis=1))
+
+
+def without_covered(proposals: Proposals) -> Proposals:
+    """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
+    residuals, modes = proposals.residuals, proposals.modes
+    order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
+    modes = modes.rows(order)
+    ordered = Proposals.at_modes(residuals, modes)
+    is_kept = np.ones(len(order), dtype=bool)
+    for k, column in enumerate(modes.table.T):
+        for better in modes.table.T[:k]:
+            pairs = column >= 0
+            at, rows = better[pairs], column[pairs]
+            pairs = is_kept[at] & is_kept[rows] & (modes.scale[at] == modes.scale[rows])
+            at, rows = at[pairs], rows[pairs]
+            value, jacobian = ordered.mapped(at, modes.a[rows])
+            sign, log_det = np.linalg.slogdet(jacobian)
+            is_in_bulk = (value**2).sum(axis=1) < 1.0
+            is_in_bulk &= (sign == ordered.orientation[at]) & (log_det > ordered.log_det[at] - 1.0)
+            at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
+            end, _, _, converged = ordered.solved(at, value)
+            is_reached = np.abs(end - modes.a[rows]).max(axis=1, initial=0) < 1e-2
+            is_kept[rows[converged & is_reached]] = False
+    return Proposals.at_modes(residuals, modes.rows(np.flatnonzero(is_kept)))
+
+
+def with_covered_fibres(proposals: Proposals, starts: Floats, scale: float) -> Proposals:
+    """Return proposals with up to four more where the fibre of a specimen is not covered.
+
+    A proposal ends at folds. Candidates are points at which the readings are met, nearest to
+    starts (N, S, free), and points around each mode: an inaccurate reading may have both sides
+    of a fold. They are not covered if their importance under a wide population is more than
+    three times that of the modes; the most important one gets a proposal.
+    """
+    residuals, modes = proposals.residuals, proposals.modes
+    n, count, d = starts.shape
+    specimen = np.repeat(np.arange(n), count)
+    met = _minimised(residuals, specimen, starts.reshape(-1, d), 1e-6, 15, scale)[0]
+    g = modes.slopes
+    # The precision G'G + 1/4 is R'R; as a sum it would lose its small eigenvalues.
+    half = np.broadcast_to(0.5 * np.eye(d), (len(g), d, d))
+    triangles = np.linalg.qr(np.concatenate([g, half], axis=1), mode="r")
+    roots = np.linalg.inv(triangles).swapaxes(1, 2)
+    around = modes.a[:, None] + ndtri(sobol(8, d, 1)) @ roots
+    specimen = np.concatenate([specimen, np.repeat(modes.specimen, 8)])
+    a = np.concatenate([met, around.reshape(-1, d)])
+    e, slopes = residuals.errors(specimen, a, scale)
+    misfit = (e**2).sum(axis=1) / 2
+    least = _lowest(modes.specimen, modes.misfit, n)
+    is_near = misfit <= least[specimen] + np.where(np.arange(len(a)) < len(met), 10.0, 3.0)
+    rows = np.flatnonzero(is_near)
+    rows = rows[np.argsort(specimen[rows], kind="stable")]
+    points = Modes(specimen, a, misfit, e, slopes, np.full(len(a), scale)).rows(rows)
+
+    def importance(modes: Modes) -> Floats:
+        log_q = proposals.log_mixture(modes.specimen, modes.a, proposals.share)
+        return -0.125 * (modes.a**2).sum(axis=1) - modes.misfit - log_q
+
+    for _ in range(4):
+        of_modes = importance(modes)
+        usual = -_lowest(modes.specimen, np.where(np.isfinite(of_modes), -of_modes, np.inf), n)
+        excess = importance(points) - usual[points.specimen]
+        excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
+        first = best_rows(points.specimen, -excess)
+        added = first[excess[first] > np.log(3.0)]
+        if not added.size:
+            break
+        modes = Modes.joined([modes, points.rows(added)])
+        proposals = Proposals.at_modes(residuals, modes)
+    return proposals
 
 
 @np.errstate(all="ignore")

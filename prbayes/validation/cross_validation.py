@@ -562,7 +562,7 @@ def log_scores(
         density = _density(part, points[is_scored], part.of(values), weights, gross)
         share = part.share * part.target.weights[is_scored]
         scores[index[is_scored]] += share * np.log(density)
-    return np.asarray(scores[rows] * len(observed))
+    return scores[rows] * len(observed)
 
 
 def _density(

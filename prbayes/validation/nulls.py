@@ -479,7 +479,7 @@ class JointNull(Null):
             ]
             u.append(np.array(rows))
         joined = np.concatenate(u, axis=1)
-        return np.asarray(joined[~np.isnan(joined).any(axis=1)])
+        return joined[~np.isnan(joined).any(axis=1)]
 
     def _tested(self, case: Case, condition: TestedCondition) -> _Tested:
         """Return a condition with the simulator whose points are its specimens."""

@@ -419,7 +419,7 @@ def _simulated(name: str, values: Any, event: Shape) -> Floats:
             f"{name}: predicted: got -inf, or nothing but NaN, expected numbers; +inf is a failed "
             "specimen"
         )
-    return np.asarray(y.reshape(-1, *y.shape[y.ndim - n_axes :]))
+    return y.reshape(-1, *y.shape[y.ndim - n_axes :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,25 +446,14 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     At most eight outputs are returned, since these fill three rows of panels. Raises TypeError or
     ValueError if conditions or outputs differ.
     """
-    if not isinstance(predicted, Mapping):
-        name = str(getattr(predicted, "name", None) or "response")
-        observed = {name: observed}
-        predicted = {name: predicted}
-    for name, prediction in predicted.items():
+    pairs: list[Comparable] = []
+    for name, y, prediction, _ in _by_condition(observed, predicted, None):
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
                 f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
                 "prb.predict"
             )
-    if not isinstance(observed, Mapping) or list(map(str, observed)) != list(map(str, predicted)):
-        got = list(observed) if isinstance(observed, Mapping) else called(observed)
-        raise ValueError(
-            f"{caller}: observed: got {got}, expected values under the names of the predictions, "
-            f"{list(predicted)}"
-        )
-    pairs: list[Comparable] = []
-    for name, prediction in zip(observed, predicted.values(), strict=True):
-        values = real_array(observed[name], f"{caller}: {name}: observed")
+        values = real_array(y, f"{caller}: {name}: observed")
         dims = [dim for dim in prediction.dims if dim not in _SAMPLE_DIMS]
         event = tuple(prediction.sizes[dim] for dim in dims)
         if values.ndim != 1 + len(event) or values.shape[1:] != event or not values.size:
@@ -476,14 +465,14 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
         m = event[0] if event else 1
         columns = values.reshape(-1, m)
         samples = prediction.values.reshape(-1, prediction.sizes["sample"], m)
-        attrs = {**getattr(observed[name], "attrs", {}), **prediction.attrs}
+        attrs = {**getattr(y, "attrs", {}), **prediction.attrs}
         units = np.broadcast_to(attrs.get("units", ""), m)
         for j in map(round, np.linspace(0, m - 1, min(m, 8)).tolist()):
             coords = {str(dim): prediction[dim].values.tolist()[j] for dim in dims}
-            label = element_name(str(name), list(coords.values()))
+            label = element_name(name, list(coords.values()))
             measured = columns[~np.isnan(columns[:, j]), j]
             unit = str(units[j])
-            pairs.append(Comparable(label, measured, samples[..., j], unit, str(name), coords))
+            pairs.append(Comparable(label, measured, samples[..., j], unit, name, coords))
     return pairs
 
 
@@ -523,7 +512,7 @@ class Predictive:
 def between(lower: Floats, upper: Floats, rng: np.random.Generator | None) -> Floats:
     """Return the middle of both bounds, or with a generator uniform numbers between them."""
     fraction = 0.5 if rng is None else rng.random(lower.shape)
-    return np.asarray(lower + fraction * (upper - lower))
+    return lower + fraction * (upper - lower)
 
 
 def area(u: Floats) -> Floats:

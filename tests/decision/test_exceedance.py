@@ -386,7 +386,7 @@ def test_the_error_sees_a_region_that_the_last_proposals_miss(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def on_one_side(parts: Any, wide: Any) -> Any:
-        return [max(parts, key=lambda part: part.center[0]).proposal]
+        return [max(parts, key=lambda part: part.proposal.mean[0]).proposal]
 
     monkeypatch.setattr(sys.modules[rare_event.__module__], "_mixture", on_one_side)
     by_draw, errors, _ = rare_events(1, unequal_sides, 4.5)

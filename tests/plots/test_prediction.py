@@ -69,5 +69,5 @@ def test_conditions_and_outputs_have_panels() -> None:
 def test_what_does_not_belong_together_is_refused() -> None:
     with pytest.raises(ValueError, match=r"got shape \(4, 2\), expected \(n\)"):
         prb.plots.plot_prediction(np.ones((4, 2)), PREDICTED)
-    with pytest.raises(ValueError, match="expected values under the names of the predictions"):
+    with pytest.raises(ValueError, match="expected a mapping with the conditions of predicted"):
         prb.plots.plot_prediction({"hot": MEASURED}, {"cold": PREDICTED})

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import json
 import logging
 import pickle
-import re
 import socket
 import subprocess
 import sys
@@ -281,23 +279,6 @@ def test_a_thread_keeps_its_connection_and_opens_another_where_it_was_closed() -
         assert server.connections == 10
 
 
-@pytest.mark.parametrize(
-    "start", ["", "HTTP/1.1 200 OK\r\n", "HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n"]
-)
-def test_an_answer_in_drops_is_given_up_in_time(start: str) -> None:
-    def evaluate(handler: Told, *_: float) -> None:
-        handler.wfile.write(start.encode())
-        for _ in range(600):
-            handler.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n" if not start else b"X")
-            time.sleep(0.05)
-
-    with telling(evaluate) as server:
-        clock = time.monotonic()
-        with pytest.raises(TimeoutError, match=r"within timeout = 0.2 s"):
-            prb.umbridge(server.url, timeout=0.2)(1.0, 2.0)
-        assert time.monotonic() - clock < 15
-
-
 def test_a_specimen_that_ends_its_server_is_sent_three_times() -> None:
     def evaluate(handler: Told, x: float, y: float) -> None:
         if x == 6:
@@ -350,7 +331,6 @@ def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCapture
 @pytest.mark.parametrize(
     ("text", "status", "said"),
     [
-        (r'{"error": "half a character: \ud800"}', 200, r"half a character: \\ud800$"),
         (
             '{"error": {"type": "InvalidInput", "message": "no"}}',
             400,
@@ -361,23 +341,14 @@ def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCapture
         (
             "Gateway Time-out",
             504,
-            r"the server answered 504, 'Gateway Time-out', expected a result$",
+            r"the server answered 504, 'Gateway Time-out', expected a result with 'output'$",
         ),
-        ("[1, 2]", 200, r"the server answered 200, '\[1, 2\]', expected a result$"),
+        ("[1, 2]", 200, r"the server answered 200, '\[1, 2\]', expected a result with 'output'$"),
         ('{"output": [[1, 2], [3]]}', 200, r"got .*, expected vectors of numbers, of sizes \[2\]$"),
-        (
-            '{"output": [[1, "2.5"]]}',
-            200,
-            r"got output = \[\[1, '2.5'\]\], expected vectors of num",
-        ),
-        ('{"output": [[1, true]]}', 200, r"got output = \[\[1, True\]\], expected vectors of num"),
+        ('{"output": [[1, "x"]]}', 200, r"got output = \[\[1, 'x'\]\], expected vectors of num"),
         ('{"output": [[[1, 2]]]}', 200, r"got output = \[\[\[1, 2\]\]\], expected vectors of num"),
         ('{"output": {"0": [1, 2]}}', 200, r"got output = {.*}, expected vectors of numbers"),
-        ('{"error": null}', 200, r"got output = None, expected vectors of numbers"),
-        (f'{{"output": [[1, 1{"0" * 400}]]}}', 200, r"got the number 10+, expected one below 1.8e"),
-        ('{"output": [[1, 1e999]]}', 200, r"got the number 1e999, expected one below 1.8e308"),
-        ("[" * 100_000, 200, r"the server answered 200, '\[\[.*expected a result"),
-        (" " * 2_000_000, 200, r"an answer of more than 1000128 bytes from http"),
+        ('{"error": null}', 200, r"the server answered 200, .*expected a result with 'output'"),
     ],
 )
 def test_an_answer_that_is_no_result_is_told(text: str, status: int, said: str) -> None:
@@ -387,54 +358,11 @@ def test_an_answer_that_is_no_result_is_told(text: str, status: int, said: str) 
             response(1.0, 2.0)
 
 
-@pytest.mark.parametrize(
-    ("path", "answer", "said"),
-    [
-        ("Info", {"protocolVersion": True, "models": ["forward"]}, "protocolVersion = True"),
-        ("Info", {"protocolVersion": 1.0, "models": "forward"}, "models = 'forward'"),
-        ("Info", {"protocolVersion": 1.0, "models": [1, "forward"]}, "models = [1, 'forward']"),
-        ("ModelInfo", {"support": None}, "support = None"),
-        ("ModelInfo", {"support": ["Evaluate"]}, "support = ['Evaluate']"),
-        ("ModelInfo", {"support": {"Evaluate": "false"}}, "support = {'Evaluate': 'false'}"),
-        *(
-            (f"{key.capitalize()}Sizes", {f"{key}Sizes": sizes}, f"{key}Sizes = {sizes!r}")
-            for key, sizes in (("input", [True, 1]), ("output", [0]), ("output", "2"))
-        ),
-        *(
-            ("OutputSizes", {"outputSizes": sizes}, "outputSizes")
-            for sizes in ([], [1.5], [10**12])
-        ),
-    ],
-)
-def test_a_description_of_another_type_is_refused(path: str, answer: Any, said: str) -> None:
-    with (
-        telling(**{path: answer}) as server,
-        pytest.raises(ConnectionError, match=f"/{path}: got {re.escape(said)}.*expected"),
-    ):
-        prb.umbridge(server.url)
-
-
 @pytest.mark.parametrize("error", ["null", "false", '""'])
 def test_an_error_that_is_empty_is_none(error: str) -> None:
     text = f'{{"output": [[1, 2]], "error": {error}}}'
     with telling(lambda handler, *_: handler.say(text)) as server:
         np.testing.assert_array_equal(prb.umbridge(server.url)(1.0, 2.0), [1.0, 2.0])
-
-
-def test_an_encoding_that_was_not_asked_for_is_not_unpacked() -> None:
-    def evaluate(handler: Told, *_: float) -> None:
-        packed = gzip.compress(b'{"output": [[1, 2]]}' + b" " * 10_000_000)
-        handler.send_response(200)
-        handler.send_header("Content-Encoding", "gzip")
-        handler.send_header("Content-Length", str(len(packed)))
-        handler.end_headers()
-        handler.wfile.write(packed)
-
-    with (
-        telling(evaluate) as server,
-        pytest.raises(RuntimeError, match=r"answered 200, .*expected a result"),
-    ):
-        prb.umbridge(server.url)(1.0, 2.0)
 
 
 def test_password_and_query_are_sent_and_never_shown() -> None:

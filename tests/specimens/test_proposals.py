@@ -20,6 +20,9 @@ from prbayes.specimens.proposals import (
     Proposals,
     Residuals,
     find_modes,
+    mixing_weights,
+    with_covered_fibres,
+    without_covered,
 )
 
 
@@ -196,7 +199,7 @@ def test_modes_in_the_bulk_of_others_are_not_needed(name: str) -> None:
     # Two proposals at each mode: the copies go.
     all_modes = p.proposals()
     twice = Modes.joined([all_modes.modes] * 2)
-    proposals = Proposals.at_modes(all_modes.residuals, twice).without_covered()
+    proposals = without_covered(Proposals.at_modes(all_modes.residuals, twice))
     assert len(proposals.modes.a) <= len(all_modes.modes.a)
     if name == "cubic":
         assert np.bincount(proposals.modes.specimen).tolist() == [3] * 12
@@ -218,7 +221,7 @@ def test_mixing_weights_change_the_points_and_not_the_integral() -> None:
     p = curved_problem("parabola")
     proposals = p.proposals()
     mass = np.arange(len(proposals.share)) % 2 * 1.0  # none of every other mode
-    uneven = proposals.with_shares(mass)
+    uneven = replace(proposals, share=mixing_weights(proposals.modes, mass))
     totals = np.bincount(uneven.modes.specimen, uneven.share)
     np.testing.assert_allclose(totals, 1)
     assert (uneven.share * np.bincount(uneven.modes.specimen)[uneven.modes.specimen] > 0.099).all()
@@ -407,7 +410,7 @@ def test_modes_for_other_errors_are_the_same_if_they_are_the_nearest() -> None:
     response = differentiated(lambda z: z**2)
     residuals = residuals_of(response, np.full((3, 1), 4.0), 0.05, independent([0.1], [1.0]))
     proposals = proposals_of(residuals, (0.5, 1.0, 4.0))
-    modes, is_same = proposals.modes, proposals._is_same_mode
+    modes, is_same = proposals.modes, proposals.is_same_mode
     assert len(modes.a) == 18
     for row in range(len(modes.a)):
         others = modes.table[modes.specimen[row]]
@@ -424,7 +427,8 @@ def test_an_inaccurate_reading_at_a_turning_point(mean: float) -> None:
     residuals = residuals_of(differentiated(lambda z: z**2), y, sd, reference)
     starts = np.tile(1.5 * ndtri(sobol(16, 1, 0)), (len(y), 1, 1))
     modes = find_modes(residuals, starts)
-    proposals = Proposals.at_modes(residuals, modes).without_covered().covering(starts, 1.0)
+    proposals = without_covered(Proposals.at_modes(residuals, modes))
+    proposals = with_covered_fibres(proposals, starts, 1.0)
     grid = np.linspace(-4, 4, 20_001)
     density = norm(mean, 0.4).pdf(grid) * norm(0, sd).pdf(y - grid**2)
     exact = np.log(density.sum(axis=1) * (grid[1] - grid[0]))
