@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.numerics.derivatives import central_derivatives
 from prbayes.numerics.points import farthest_rows
 
@@ -79,3 +79,49 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
         if all(distance.max() > 0.5 for distance in distances):
             distinct.append(mode)
     return distinct
+
+
+def rows_by_mode(points: Floats) -> list[Indices]:
+    """Return the rows of each mode of points, (n, d): one array unless a valley separates them.
+
+    The points are split at the valley of the density of an element, or of a principal component,
+    that lies a quarter, and five standard errors of the estimate, below its maxima on both sides. A
+    mode has at least a fiftieth of the points.
+    """
+    fewest = max(len(points) // 50, 2 * points.shape[1])
+
+    def split(rows: Indices) -> list[Indices]:
+        if len(rows) < 2 * fewest:
+            return [rows]
+        standard = points[rows] - points[rows].mean(axis=0)
+        standard /= np.maximum(standard.std(axis=0), 1e-300)
+        _, _, axes = np.linalg.svd(standard, full_matrices=False)
+        valleys = [_valley(x, fewest) for x in np.hstack([standard, standard @ axes.T]).T]
+        depth, is_low = max(valleys, key=lambda valley: valley[0])
+        if depth < 5:
+            return [rows]
+        return [*split(rows[is_low]), *split(rows[~is_low])]
+
+    return split(np.arange(len(points)))
+
+
+def _valley(x: Floats, fewest: int) -> tuple[float, Bools]:
+    """Return the depth of the deepest valley of a density, and which points, (n,), are below it.
+
+    The depth is the distance to the lower maximum beside the valley, in standard errors.
+    """
+    from scipy.stats import gaussian_kde
+
+    ordered = np.sort(x)
+    grid = np.linspace(ordered[fewest], ordered[-1 - fewest], 200)
+    if grid[0] == grid[-1]:
+        return 0.0, x < grid[0]
+    kernel = gaussian_kde(x, "silverman")
+    density = kernel(grid)
+    rising, falling = np.maximum.accumulate([density, density[::-1]], axis=1)
+    peaks = np.minimum(rising, falling[::-1])
+    # The square of a normal kernel has the integral 1 / sqrt(4 pi).
+    bandwidth = kernel.factor * x.std(ddof=1)
+    error = np.sqrt(np.maximum(density, 1 / len(x)) / (len(x) * bandwidth * np.sqrt(4 * np.pi)))
+    depth = np.where(density < 0.75 * peaks, (peaks - density) / error, 0.0)
+    return float(depth.max()), x < grid[depth.argmax()]
