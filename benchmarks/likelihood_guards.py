@@ -94,7 +94,7 @@ def of_draws(evaluator: Evaluator, populations: SpecimenPopulations) -> dict[str
         optimum = prb.minimize(evaluator.model)
         checked += check_population(optimum) + check_conflict(optimum, draws)
     return {
-        "codes": [finding.code for finding in checked.findings],
+        "codes": [finding.code for finding in checked.findings + checked.remarks],
         "untested": [name for name in TESTS if any(name in text for text in checked.untested)],
     }
 
