@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,6 +79,42 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
         if all(distance.max() > 0.5 for distance in distances):
             distinct.append(mode)
     return distinct
+
+
+def ridges(log_density: LogDensity, modes: Sequence[Laplace]) -> list[Laplace]:
+    """Return the ridges halfway between the first mode and the others.
+
+    Those with less than e^-10 of the largest mass of a mode are left out.
+    """
+    result = []
+    for mode in modes[1:]:
+        try:
+            ridge = _halfway(log_density, modes[0], mode)
+        except (ValueError, np.linalg.LinAlgError):
+            continue  # because the density is zero near the ridge
+        if ridge.log_mass > max(mode.log_mass for mode in modes) - 10:
+            result.append(ridge)
+    return result
+
+
+def _halfway(log_density: LogDensity, first: Laplace, second: Laplace) -> Laplace:
+    """Return a normal approximation around the maximum on the plane halfway between two modes.
+
+    Along the line through the modes the density counts as uniform.
+    """
+    difference = second.mode - first.mode
+    middle = (first.mode + second.mode) / 2
+    scale = np.sqrt(np.diag(first.covariance + second.covariance) / 2)
+    # (d, d - 1): basis of the plane, orthogonal in units of the modes' standard deviations
+    plane = np.linalg.svd((difference / scale)[None])[2][1:].T * scale[:, None]
+    size = plane.shape[1]
+    (top,) = laplace(
+        lambda u: log_density(middle + u @ plane.T), np.zeros((1, size)), np.ones(size)
+    )
+    height = top.log_mass - np.linalg.slogdet(2 * np.pi * top.covariance)[1] / 2
+    covariance = plane @ top.covariance @ plane.T + np.outer(difference, difference) / 12
+    log_mass = float(height + np.linalg.slogdet(2 * np.pi * covariance)[1] / 2)
+    return Laplace(middle + plane @ top.mode, covariance, log_mass, top.converged)
 
 
 def rows_by_mode(points: Floats) -> list[Indices]:
