@@ -89,7 +89,7 @@ def ridges(log_density: LogDensity, modes: Sequence[Laplace]) -> list[Laplace]:
     result = []
     for mode in modes[1:]:
         try:
-            ridge = _halfway(log_density, modes[0], mode)
+            ridge = ridge_between(log_density, modes[0], mode)
         except (ValueError, np.linalg.LinAlgError):
             continue  # because the density is zero near the ridge
         if ridge.log_mass > max(mode.log_mass for mode in modes) - 10:
@@ -97,7 +97,7 @@ def ridges(log_density: LogDensity, modes: Sequence[Laplace]) -> list[Laplace]:
     return result
 
 
-def _halfway(log_density: LogDensity, first: Laplace, second: Laplace) -> Laplace:
+def ridge_between(log_density: LogDensity, first: Laplace, second: Laplace) -> Laplace:
     """Return a normal approximation around the maximum on the plane halfway between two modes.
 
     Along the line through the modes the density counts as uniform.
@@ -132,7 +132,7 @@ def rows_by_mode(points: Floats) -> list[Indices]:
         standard = points[rows] - points[rows].mean(axis=0)
         standard /= np.maximum(standard.std(axis=0), 1e-300)
         _, _, axes = np.linalg.svd(standard, full_matrices=False)
-        valleys = [_valley(x, fewest) for x in np.hstack([standard, standard @ axes.T]).T]
+        valleys = [deepest_valley(x, fewest) for x in np.hstack([standard, standard @ axes.T]).T]
         depth, is_low = max(valleys, key=lambda valley: valley[0])
         if depth < 5:
             return [rows]
@@ -141,7 +141,7 @@ def rows_by_mode(points: Floats) -> list[Indices]:
     return split(np.arange(len(points)))
 
 
-def _valley(x: Floats, fewest: int) -> tuple[float, Bools]:
+def deepest_valley(x: Floats, fewest: int) -> tuple[float, Bools]:
     """Return the depth of the deepest valley of a density, and which points, (n,), are below it.
 
     The depth is the distance to the lower maximum beside the valley, in standard errors.

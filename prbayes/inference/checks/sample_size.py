@@ -77,7 +77,7 @@ def interval_ratios(n: float) -> tuple[float, float]:
     return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
 
 
-def _specimen_counts(evaluator: Evaluator) -> tuple[Bools, Indices, list[float]]:
+def specimen_counts(evaluator: Evaluator) -> tuple[Bools, Indices, list[float]]:
     """Return the elements above each simulator, its group, and the specimens of each group.
 
     Simulators of a group have an element of theta in common.
@@ -104,7 +104,7 @@ def few_for_bootstrap(evaluator: Evaluator, *, parametric: bool) -> list[Finding
     standard deviation, by 8, 20 and 50 specimens; between these they are interpolated in log n.
     """
     enough = 50
-    n = min(_specimen_counts(evaluator)[2], default=enough)
+    n = min(specimen_counts(evaluator)[2], default=enough)
     if not n < enough:
         return []
     shares = (0.79, 0.87, 0.88), (0.57, 0.74, 0.81)
@@ -125,7 +125,7 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
     Specimens of simulators with a common element of theta are added.
     """
     enough = 8
-    enters, groups, counts = _specimen_counts(evaluator)
+    enters, groups, counts = specimen_counts(evaluator)
     findings = unlabelled_specimens(all_simulators(evaluator.model))
     n = min(counts, default=enough)
     if not n < enough:
