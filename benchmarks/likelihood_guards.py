@@ -93,8 +93,10 @@ def of_draws(evaluator: Evaluator, populations: SpecimenPopulations) -> dict[str
     if not simulation_obstacle(evaluator):
         optimum = prb.minimize(evaluator.model)
         checked += check_population(optimum) + check_conflict(optimum, draws)
+    # A weak misfit of the population is a remark.
+    weak = [remark for remark in checked.remarks if remark.code in TESTS.values()]
     return {
-        "codes": [finding.code for finding in checked.findings],
+        "codes": [finding.code for finding in (*checked.findings, *weak)],
         "untested": [name for name in TESTS if any(name in text for text in checked.untested)],
     }
 

@@ -18,6 +18,7 @@ import xarray as xr
 from scipy.stats import norm, t
 
 import prbayes as prb
+from prbayes.inference.checks.population import PopulationTest
 from prbayes.model.evaluator import specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.convergence import Result
@@ -25,6 +26,7 @@ from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, 
 from prbayes.response.distributions import compiled_log_density
 from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
+    CheckOptions,
     check_conflict,
     check_population,
     influence,
@@ -555,6 +557,20 @@ def test_tests_without_standard_errors_name_what_to_fix(optimum: prb.Optimum) ->
     search = replace(optimum.search, result=Result.FAILED)
     (reason,) = check_population(replace(optimum, search=search)).untested
     assert "did not converge; pass another start=" in reason
+
+
+@pytest.mark.parametrize(("p", "kind"), [(0.02, "findings"), (0.04, "remarks"), (0.06, "")])
+def test_a_misfit_is_a_finding_up_to_half_the_level(
+    optimum: prb.Optimum, p: float, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = "prbayes.results.likelihood_checks"
+    result = PopulationTest(p, np.array([p]), np.array([0.5]), N)
+    monkeypatch.setattr(f"{module}.population_test", lambda *_: result)
+    monkeypatch.setattr(f"{module}._OPTIONS", CheckOptions(replicates=4))
+    checked = check_population(replace(optimum))  # a copy, because results are kept by optimum
+    codes = {key: [f.code for f in getattr(checked, key)] for key in ("findings", "remarks")}
+    expected = {"findings": [], "remarks": []} | ({kind: ["population-misfit"]} if kind else {})
+    assert codes == (expected if kind else expected | {"remarks": ["population-tested"]})
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, counted, sentences_of
+from prbayes._finding import Finding, as_json, counted, report, sentences_of
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
@@ -31,6 +31,7 @@ from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements, table_elements, variables_at
 from prbayes.numerics.derivatives import cross, slopes
+from prbayes.numerics.modes import rows_by_mode
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
 from prbayes.results.predict import call_settings
@@ -97,7 +98,8 @@ def plan(
     adds the metric's (Godambe) information :math:`a = H J^{-1} H`, with the Hessian H of its
     discrepancy at the centre and the covariance J of its gradient, both by the weights of stored
     responses. It is at most the Fisher information of the response. After k specimens the expected
-    covariance of the draws is :math:`(\Lambda + k a)^{-1}`.
+    covariance of the draws is :math:`(\Lambda + k a)^{-1}`. If the draws have several modes, this
+    applies within each mode, and the modes keep their masses.
 
     Parameters
     ----------
@@ -188,18 +190,27 @@ def plan(
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
         findings, error = quantity_sample.checked_quantity(quantity)
-    draws = Draws.of(populations.thetas, evaluator.hyperparameters.prior_sd)
+    unit = evaluator.hyperparameters.prior_sd
+    modes = [populations.thetas[rows] for rows in rows_by_mode(populations.thetas / unit)]
+    findings += report(*_several_modes(populations, modes))
+    draws = [Draws.of(thetas, unit) for thetas in modes]
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
-    now = forecast.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
+    now = forecast.sd([np.zeros((unit.size, unit.size))] * len(modes))
     _refuse_target(target, list(now))
+    centers = [populations.center]
+    if len(modes) > 1:
+        centers = [np.median(thetas, axis=0) for thetas in modes]
     samples = {
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()
     }
     sd, specimens = [], []
     for name, condition in candidates.items():
-        information = specimen_information(samples[name], condition.metric)
-        rows = [forecast.sd(number * information) for number in numbers]
+        information = [
+            specimen_information(samples[name].around(center), condition.metric)
+            for center in centers
+        ]
+        rows = [forecast.sd([number * a for a in information]) for number in numbers]
         sd.append([[row[element] for element in now] for row in rows])
         specimens.append(
             [forecast.needed(information, element, (target or {}).get(element)) for element in now]
@@ -222,6 +233,22 @@ def plan(
             **populations.provenance(),
         },
     )
+
+
+def _several_modes(populations: Populations, modes: Sequence[Floats]) -> tuple[Finding, ...]:
+    """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
+    page = "likelihood.md#several-modes"
+    if isinstance(populations.result, Optimum):
+        return tuple(f for f in populations.result.findings if f.code == "second-mode")
+    if len(modes) == 1:
+        return ()
+    masses = ", ".join(f"{len(thetas) / len(populations.thetas):.0%}" for thetas in modes)
+    text = (
+        f"The posterior has {len(modes)} modes with {masses} of the draws: the expected standard "
+        "deviations are those within the modes and between them. Specimens whose responses differ "
+        "between the modes, such as those of another output, exclude modes and give smaller ones."
+    )
+    return (Finding("second-mode", text, page),)
 
 
 class PlanTable(Table):
@@ -291,13 +318,18 @@ class _Forecast:
     """Standard deviations after more information."""
 
     populations: Populations
-    draws: Draws
+    draws: Sequence[Draws]  # draws of each mode
     quantity: Quantity | None
     sample: ResponseSample | None  # responses that the quantity is computed from
 
-    def sd(self, information: Floats) -> dict[str, float]:
-        """Return standard deviations by name after information, (d, d)."""
-        thetas = self.draws.with_information(information)
+    def _thetas(self, information: Sequence[Floats]) -> Floats:
+        """Return the draws of all modes after information, (d, d) of each mode."""
+        pairs = zip(self.draws, information, strict=True)
+        return np.concatenate([draws.with_information(a) for draws, a in pairs])
+
+    def sd(self, information: Sequence[Floats]) -> dict[str, float]:
+        """Return standard deviations by name after information, (d, d) of each mode."""
+        thetas = self._thetas(information)
         evaluator = self.populations.evaluator
         variables = evaluator.hyperparameters.constrained(thetas)
         values = labelled(evaluator, variables, {"draw": len(thetas)}).data_vars
@@ -313,15 +345,16 @@ class _Forecast:
         assert self.sample is not None
         return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
-    def needed(self, information: Floats, name: str, target: float | None) -> float:
+    def needed(self, information: Sequence[Floats], name: str, target: float | None) -> float:
         """Return the smallest number of specimens for a target: inf if none, NaN without one."""
         if target is None:
             return np.nan
 
         def exceeds(n: int) -> bool:
+            increase = [n * a for a in information]
             if name == "quantity":
-                return self._quantity_sd(self.draws.with_information(n * information)) > target
-            return replace(self, quantity=None).sd(n * information)[name] > target
+                return self._quantity_sd(self._thetas(increase)) > target
+            return replace(self, quantity=None).sd(increase)[name] > target
 
         if not exceeds(0):
             return 0.0

@@ -182,6 +182,10 @@ class ResponseSample:
     outputs: Floats  # (n,) or (n, m): outputs at the design's points
     column: int | None  # column of the output; None for a response with one number
 
+    def around(self, center: Floats) -> ResponseSample:
+        """Return the sample with another centre of the populations, (d,)."""
+        return replace(self, populations=replace(self.populations, center=center))
+
     def select(self, outputs: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""
         return outputs if self.column is None else outputs[..., self.column]

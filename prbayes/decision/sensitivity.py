@@ -6,8 +6,9 @@ Sobol points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 
@@ -100,8 +101,8 @@ def sensitivity(
     xarray.Dataset
         Dimension ``factor``, the elements of theta and the aleatory inputs, with ``kind``,
         "hyperparameter" or "input". Variables ``first``, ``total`` and ``derivative``, with their
-        standard errors ``first_error``, ``total_error`` and ``derivative_error``: shares without a
-        unit; NaN where they are not known, as derivatives of an indicator.
+        standard errors ``first_error``, ``total_error`` and ``derivative_error``, by points and
+        draws: shares without a unit; NaN where they are not known, as derivatives of an indicator.
         Attributes: ``quantity``; ``of_inputs``, the number of a specimen whose variance is
         attributed to the inputs; in the quantity's units ``value``, that at the centre,
         ``value_error``, its standard error from points and emulator, and ``sd``, its standard
@@ -261,16 +262,23 @@ def _hyperparameter_indices(
     sample: ResponseSample, quantity: Quantity, n_points: int, seed: int
 ) -> Indices:
     """Return the indices of the elements of theta in the variance of the quantity."""
-    copula = Copula.of(sample.populations.thetas)
+    draws = sample.populations.thetas
     d = sample.populations.evaluator.hyperparameters.size
-    first, second = _paired_points(n_points // REPLICATES, d, seed)
-    z = first @ copula.root.T
-    independent = second @ copula.root.T
+    # Blocks of the draws have replicates of their own, whose scatter contains the error of draws.
+    n_blocks = REPLICATES // 2 if len(draws) >= 1000 else 1
+    copulas = [Copula.of(block) for block in np.array_split(draws, n_blocks)]
+    points = _paired_points(n_points // REPLICATES, d, seed)
+    first, second = (np.split(normal, n_blocks) for normal in points)
+    z = [normal @ copula.root.T for copula, normal in zip(copulas, first, strict=True)]
+    independent = [normal @ copula.root.T for copula, normal in zip(copulas, second, strict=True)]
+    blocks = list(zip(copulas, z, independent, second, strict=True))
 
-    def evaluate(z: Floats) -> Floats:
-        return sample.evaluate(quantity.of, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
+    def evaluate(vectors: Sequence[Floats]) -> Floats:
+        pairs = zip(copulas, vectors, strict=True)
+        thetas = np.concatenate([copula.thetas(z) for copula, z in pairs])
+        return sample.evaluate(quantity.of, thetas.reshape(-1, d)).reshape(thetas.shape[:-1])
 
-    values = evaluate(z)
+    values, unrelated = evaluate(z), evaluate(independent)
     infinite = 1 - np.isfinite(values).mean()
     if infinite > 0.01:  # because shares have an error of a hundredth anyway
         raise ValueError(
@@ -280,18 +288,24 @@ def _hyperparameter_indices(
         )
     values = np.where(np.isfinite(values), values, np.nan)
     indices = []
-    for i, (sd, step) in enumerate(zip(copula.conditional_sd, np.eye(d) * _STEP / 2, strict=True)):
-        same_element = evaluate(copula.rest_given_element(z, independent, i))
-        same_rest = evaluate(copula.element_given_rest(z, second, i))
-        slopes = (evaluate(z + step) - evaluate(z - step)) / _STEP
+    sds = np.repeat([c.conditional_sd for c in copulas], REPLICATES // n_blocks, axis=0)
+    for i, step in enumerate(np.eye(d) * _STEP / 2):
+        same_element = evaluate([c.rest_given_element(x, w, i) for c, x, w, _ in blocks])
+        same_rest = evaluate([c.element_given_rest(x, normal, i) for c, x, _, normal in blocks])
+        slopes = (evaluate([x + step for x in z]) - evaluate([x - step for x in z])) / _STEP
         indices.append(
             [
-                first_order(values, same_element),
+                first_order(values, same_element, unrelated),
                 total_order(values, same_rest),
-                derivative_bound((sd * slopes) ** 2, values),
+                derivative_bound((sds[:, i, None] * slopes) ** 2, values),
             ]
         )
-    return Indices.of_replicates(np.array(indices))
+    by_block = np.array(indices)
+    if n_blocks > 1:
+        by_block = by_block.reshape(d, 3, n_blocks, -1).mean(axis=-1)
+    result = Indices.of_replicates(by_block)
+    # The square of a correlation of m independent draws has the mean 1 / m.
+    return replace(result, errors=np.hypot(result.errors, n_blocks / len(draws)))
 
 
 def input_indices(
@@ -413,19 +427,29 @@ def _aleatory_share(sample: ResponseSample, quantity: Quantity) -> float:
     return float(within / total) if total > 0 else np.nan
 
 
-def first_order(values: Floats, same: Floats) -> Floats:
+def first_order(values: Floats, same: Floats, independent: Floats | None = None) -> Floats:
     r"""Return the first-order index of a factor by replicate, (r,).
 
     :math:`S_i = Var(E[Y | X_i]) / Var(Y) = Corr(Y, Y')`, equation 6 of Janon et al. (2014),
     Asymptotic normality and efficiency of two Sobol index estimators, doi:10.1051/ps/2013040.
     ``same`` are values at other points with the same X_i, (r, n); pairs with NaN are left out.
+    ``independent`` are values at these points with another X_i. Their correlation with Y is zero,
+    and removes the noise of the points (a control variate): all of it for a factor without effect.
     """
-    values, same = _complete_pairs(values, same)
-    mean = np.nanmean(values + same, axis=1, keepdims=True) / 2
-    a = values - mean
-    b = same - mean
-    covariance = np.nanmean(a * b, axis=1)
-    variance = np.nanmean(a**2 + b**2, axis=1) / 2
+    result = _correlation(values, same)
+    if independent is not None:
+        # One coefficient of all replicates, because its noise times that of the other is a bias.
+        coefficient = np.mean(_correlation(same, independent))
+        result = result - coefficient * _correlation(values, independent)
+    return result
+
+
+def _correlation(a: Floats, b: Floats) -> Floats:
+    """Return the correlation of two variables with the same distribution, (r, n) -> (r,)."""
+    a, b = _complete_pairs(a, b)
+    mean = np.nanmean(a + b, axis=1, keepdims=True) / 2
+    covariance = np.nanmean((a - mean) * (b - mean), axis=1)
+    variance = np.nanmean((a - mean) ** 2 + (b - mean) ** 2, axis=1) / 2
     return _ratio(covariance, variance)
 
 

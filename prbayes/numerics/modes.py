@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.numerics.derivatives import central_derivatives
 from prbayes.numerics.points import farthest_rows
 
@@ -79,3 +79,85 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
         if all(distance.max() > 0.5 for distance in distances):
             distinct.append(mode)
     return distinct
+
+
+def ridges(log_density: LogDensity, modes: Sequence[Laplace]) -> list[Laplace]:
+    """Return the ridges halfway between the first mode and the others.
+
+    Those with less than e^-10 of the largest mass of a mode are left out.
+    """
+    result = []
+    for mode in modes[1:]:
+        try:
+            ridge = ridge_between(log_density, modes[0], mode)
+        except (ValueError, np.linalg.LinAlgError):
+            continue  # because the density is zero near the ridge
+        if ridge.log_mass > max(mode.log_mass for mode in modes) - 10:
+            result.append(ridge)
+    return result
+
+
+def ridge_between(log_density: LogDensity, first: Laplace, second: Laplace) -> Laplace:
+    """Return a normal approximation around the maximum on the plane halfway between two modes.
+
+    Along the line through the modes the density counts as uniform.
+    """
+    difference = second.mode - first.mode
+    middle = (first.mode + second.mode) / 2
+    scale = np.sqrt(np.diag(first.covariance + second.covariance) / 2)
+    # (d, d - 1): basis of the plane, orthogonal in units of the modes' standard deviations
+    plane = np.linalg.svd((difference / scale)[None])[2][1:].T * scale[:, None]
+    size = plane.shape[1]
+    (top,) = laplace(
+        lambda u: log_density(middle + u @ plane.T), np.zeros((1, size)), np.ones(size)
+    )
+    height = top.log_mass - np.linalg.slogdet(2 * np.pi * top.covariance)[1] / 2
+    covariance = plane @ top.covariance @ plane.T + np.outer(difference, difference) / 12
+    log_mass = float(height + np.linalg.slogdet(2 * np.pi * covariance)[1] / 2)
+    return Laplace(middle + plane @ top.mode, covariance, log_mass, top.converged)
+
+
+def rows_by_mode(points: Floats) -> list[Indices]:
+    """Return the rows of each mode of points, (n, d): one array unless a valley separates them.
+
+    The points are split at the valley of the density of an element, or of a principal component,
+    that lies a quarter, and five standard errors of the estimate, below its maxima on both sides. A
+    mode has at least a fiftieth of the points.
+    """
+    fewest = max(len(points) // 50, 2 * points.shape[1])
+
+    def split(rows: Indices) -> list[Indices]:
+        if len(rows) < 2 * fewest:
+            return [rows]
+        standard = points[rows] - points[rows].mean(axis=0)
+        standard /= np.maximum(standard.std(axis=0), 1e-300)
+        _, _, axes = np.linalg.svd(standard, full_matrices=False)
+        valleys = [deepest_valley(x, fewest) for x in np.hstack([standard, standard @ axes.T]).T]
+        depth, is_low = max(valleys, key=lambda valley: valley[0])
+        if depth < 5:
+            return [rows]
+        return [*split(rows[is_low]), *split(rows[~is_low])]
+
+    return split(np.arange(len(points)))
+
+
+def deepest_valley(x: Floats, fewest: int) -> tuple[float, Bools]:
+    """Return the depth of the deepest valley of a density, and which points, (n,), are below it.
+
+    The depth is the distance to the lower maximum beside the valley, in standard errors.
+    """
+    from scipy.stats import gaussian_kde
+
+    ordered = np.sort(x)
+    grid = np.linspace(ordered[fewest], ordered[-1 - fewest], 200)
+    if grid[0] == grid[-1]:
+        return 0.0, x < grid[0]
+    kernel = gaussian_kde(x, "silverman")
+    density = kernel(grid)
+    rising, falling = np.maximum.accumulate([density, density[::-1]], axis=1)
+    peaks = np.minimum(rising, falling[::-1])
+    # The square of a normal kernel has the integral 1 / sqrt(4 pi).
+    bandwidth = kernel.factor * x.std(ddof=1)
+    error = np.sqrt(np.maximum(density, 1 / len(x)) / (len(x) * bandwidth * np.sqrt(4 * np.pi)))
+    depth = np.where(density < 0.75 * peaks, (peaks - density) / error, 0.0)
+    return float(depth.max()), x < grid[depth.argmax()]

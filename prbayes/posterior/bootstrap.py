@@ -8,9 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import as_json, report
 from prbayes._progress import shown
 from prbayes._validate import Bools, Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.asymptotics import unidentified_directions
+from prbayes.inference.checks.sample_size import few_for_bootstrap
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.description import observed_dataset, versions
@@ -36,6 +38,10 @@ def bootstrap(
     model at the optimum; its minimisers have the sampling distribution of the optimum. Observations
     with one specimen label are weighted, or drawn, together.
 
+    Intervals assume many specimens. Of a normal population with 8, 20 and 50 specimens, 89 %
+    intervals contain the standard deviation in .57, .74 and .81 of data sets (``parametric``: .69,
+    .80 and .85), and the mean in .79, .87 and .88: below 50, report those of `sample`.
+
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
     of first order. A metric of several outputs is prepared for each data set. With the
     log-likelihood by specimen the minimisers are maximum-likelihood estimates, and nothing is run.
@@ -57,7 +63,7 @@ def bootstrap(
     xarray.DataTree
         Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and
         `compare`; and ``observed_data``. The attribute ``converged`` is the share of minimisations
-        that did.
+        that did, and ``findings`` (JSON) reports fewer than 50 specimens.
 
     Raises
     ------
@@ -91,12 +97,14 @@ def bootstrap(
     with shown(progressbar):
         thetas, converged = refitted(optimum, draws, seed, parametric=parametric)
     evaluator = optimum.evaluator
+    findings = report(*few_for_bootstrap(evaluator, parametric=parametric))
     attrs = {
         "sampler": "parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         "converged": float(converged.mean()),
         "n_responses": optimum.n_responses,
         "seconds": time.perf_counter() - clock,
         "random_seed": str(seed),
+        "findings": as_json(findings),
         **versions(),
     }
     groups = {

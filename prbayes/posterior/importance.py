@@ -1,10 +1,11 @@
 """Importance sampling of a density from Laplace approximations of its modes.
 
 The first proposal is a mixture of multivariate t distributions with five degrees of freedom, one
-for each mode. If it does not suffice, further rounds fit mixtures to all weighted points. Draws of
-the prior cover regions without points. The weights are those of the mixture of all proposals
-(adaptive multiple importance sampling: Cornuet et al. 2012, Scand. J. Stat. 39(4)).
-Pareto-smoothed importance sampling judges them (Vehtari et al. 2024, J. Mach. Learn. Res. 25(72)).
+for each mode, and for the ridge between the first mode and each of the others. If it does not
+suffice, further rounds fit mixtures to all weighted points. Draws of the prior cover regions
+without points. The weights are those of the mixture of all proposals (adaptive multiple importance
+sampling: Cornuet et al. 2012, Scand. J. Stat. 39(4)). Pareto-smoothed importance sampling judges
+them (Vehtari et al. 2024, J. Mach. Learn. Res. 25(72)).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy.special import logsumexp
 from prbayes._stats import reached
 from prbayes._validate import Floats
 from prbayes.numerics.mixtures import StudentMixture, effective_sample_size
-from prbayes.numerics.modes import Laplace, LogDensity
+from prbayes.numerics.modes import Laplace, LogDensity, ridges
 
 # prior as a proposal: function of size and seed that returns draws, (size, d), and log-density
 Prior = tuple[Callable[[int, int], Floats], LogDensity]
@@ -62,6 +63,7 @@ def importance_sample(
     prior: Prior | None = None,
 ) -> ImportanceSample:
     """Return ``size`` draws by importance sampling around modes and from the prior."""
+    modes = [*modes, *ridges(log_density, modes)]
     masses = np.array([mode.log_mass for mode in modes])
     # Bound the mixing weights from below, because the approximation may underestimate a mode's
     # mass.

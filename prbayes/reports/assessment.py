@@ -52,13 +52,17 @@ def verdict(m: Material) -> list[Section]:
         pronoun = "it" if len(m.problems) == 1 else "them"
         text = [f"The calculation has {problems} (see Diagnostics). Solve {pronoun} before use."]
     elif m.tests:
-        title, mark = "Passed", "good"
-        text = [f"Measurements of {_tested(m)} agree with the model. Small errors can remain."]
+        title, mark, text = "Passed", "good", []
     elif m.results:
         title = "Not tested"
         text = [f"The model was fitted to {_data(m)}, and compared with no other specimens."]
     elif not m.description["variables"]:
         return []
+    if m.tests and not m.rejected:
+        tests = m.tests.values()
+        p = enumerated([f"{t.p_value:.{p_digits(t.p_value, t.alpha)}g}" for t in tests])
+        text.append(f"Measurements of {_tested(m)} agree with the model (p = {p}).")
+        text.append("Small errors can remain.")
     if m.results and mark != "bad" and None in m.diagnoses.values():
         text.append("Not all results were diagnosed: that needs the model.")
     questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}

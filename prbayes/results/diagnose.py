@@ -160,9 +160,10 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     name the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
     Responses are computed for the test under `Resimulated`, if they take less than half a minute.
 
-    With the log-likelihood by specimen, the family of the population of the inputs is tested. For
-    draws it reports chains in different modes, conflicts of prior and data, and specimens on which
-    the posterior depends (Pareto k). The optimum that these need is computed.
+    With the log-likelihood by specimen, the family of the population of the inputs is tested
+    (p <= .025; up to .05 a misfit is a remark). For draws it reports chains in different modes,
+    conflicts of prior and data, and specimens on which the posterior depends (Pareto k). The
+    optimum that these need is computed.
 
     Parameters
     ----------

@@ -58,6 +58,9 @@ class CheckOptions:
     # means of chains in one mode, with ten independent draws each, differ by one
     separation: float = 2.0
     pull: float = 0.5  # shift by the prior, in standard errors, from which a conflict matters
+    # p-value up to which a misfit of the population is a finding, and no remark: half of .05,
+    # because a diagnosis has two tests, and at most one right model in twenty shall be no "ok"
+    misfit: float = 0.025
 
 
 _OPTIONS = CheckOptions()
@@ -180,9 +183,12 @@ def check_population(optimum: Optimum) -> Checked:
             reason = f"rounded readings fit no family; pass rounded= to {likelihood.name} first"
             checked += _not_tested(_FAMILY, reason)
             continue
+        if test.p_value <= _OPTIONS.misfit / len(samples):
+            checked += Checked(misfit)
+            continue
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
-        checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
+        checked += Checked(remarks=misfit or (Finding("population-tested", text),))
     _CACHE[optimum] = checked
     return checked
 

@@ -178,3 +178,26 @@ def test_errors_of_readings_are_part_of_the_information() -> None:
     # Censored at the mean: half of the readings are equal.
     censored = information(same, prb.LogLikelihood(censored=(None, populations.center[0])))
     assert censored[0, 0] == pytest.approx((0.5 + 1 / np.pi) / sigma**2, rel=0.05)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.2])
+def test_modes_keep_their_masses(share: float) -> None:
+    """Squares do not identify the sign of the mean, however many are measured."""
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", np.square, x, observed=rng.normal(2.0, 0.3, 20) ** 2)
+    sign = np.where(np.arange(2000) < 2000 * share, -1.0, 1.0)
+    draws = {"mu": sign * rng.normal(2.0, 0.1, 2000)}
+    draws["sigma"] = 0.3 * np.exp(rng.normal(0, 0.1, 2000))
+    group = xr.Dataset({name: (("chain", "draw"), v[None]) for name, v in draws.items()})
+    result = xr.DataTree.from_dict({"posterior": group})
+    same = {"same": prb.decision.Condition(np.square, x)}
+    table = prb.plan(result, same, k=[30, 3000], model=model, target={"mu": 0.5})
+    sd = table.sd.sel(candidate="same")
+    np.testing.assert_allclose(sd.sel(name="mu"), 4 * np.sqrt(share * (1 - share)), rtol=0.01)
+    # Within a mode the squares have all information about the inputs.
+    expected = 0.3 / np.sqrt(1 / 0.1**2 + 2 * 30)
+    assert float(sd.sel(name="sigma", k=30)) == pytest.approx(expected, rel=0.1)
+    assert float(table.specimens.sel(candidate="same", name="mu")) == np.inf
+    assert "second-mode" in table.attrs["findings"]

@@ -43,11 +43,30 @@ def test_a_quantile_of_a_normal_population() -> None:
     assert table.kind.values.tolist() == ["hyperparameter", "hyperparameter", "input"]
 
 
-def correlated(rho: float, draws: int = 4000) -> xr.DataTree:
-    z = np.random.default_rng(0).multivariate_normal([0, 0], [[1, rho], [rho, 1]], (1, draws))
+def correlated(rho: float, draws: int = 4000, seed: int = 0) -> xr.DataTree:
+    z = np.random.default_rng(seed).multivariate_normal([0, 0], [[1, rho], [rho, 1]], (1, draws))
     columns = {"mu": 1 + 0.05 * z[..., 0], "sigma": 0.5 * np.exp(0.05 * z[..., 1])}
     group = xr.Dataset({name: (("chain", "draw"), value) for name, value in columns.items()})
     return xr.DataTree.from_dict({"posterior": group.assign_coords(chain=[0], draw=range(draws))})
+
+
+def test_errors_contain_the_noise_of_points_and_of_draws() -> None:
+    model, x = normal()
+    quantile = prb.decision.Quantile(same, x, probability=0.9)
+    mean = prb.decision.Mean(same, x)
+    variances = np.array([0.05, 1.2816 * 0.5 * 0.05]) ** 2
+    expected = variances / variances.sum()
+    scores = []
+    for seed in range(4):
+        draws = correlated(0.0, seed=seed)
+        table = prb.sensitivity(draws, quantile, model=model, n_points=4096, random_seed=seed)
+        table = table.sel(factor=["mu", "sigma"])
+        scores += list((table["first"] - expected) / table.first_error)
+        # All noise of the points is removed, and the squared correlation of 500 draws stays.
+        none = prb.sensitivity(draws, mean, model=model, random_seed=seed).sel(factor="sigma")
+        assert abs(float(none["first"])) < 5 * float(none.first_error) < 0.05
+    # Errors of eight blocks have a t distribution, with a root mean square of 1.2.
+    assert np.sqrt(np.mean(np.square(scores))) < 2.5
 
 
 def test_hyperparameters_that_depend_on_each_other() -> None:

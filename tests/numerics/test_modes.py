@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from prbayes._validate import Floats
-from prbayes.numerics.modes import Laplace, distinct_modes, far_apart, laplace
+from prbayes.numerics.modes import Laplace, distinct_modes, far_apart, laplace, rows_by_mode
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -52,3 +52,30 @@ def test_modes_half_a_standard_deviation_apart_are_distinct() -> None:
         for place, log_mass, converged in [(0.0, 1.0, True), (0.4, 2.0, True), (3.0, 3.0, False)]
     ]
     assert [mode.log_mass for mode in distinct_modes(modes)] == [2.0, 3.0]
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_draws_of_one_mode_stay_together(shift: float) -> None:
+    """Of normal, heavy-tailed, skewed and bent densities, and of normals a deviation apart."""
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((2000, 4))
+    x[:, 1] = rng.standard_t(3, 2000)
+    x[:, 2] = np.exp(x[:, 2])
+    x[:, 3] = 0.3 * x[:, 3] + x[:, 0] ** 2
+    x[:700] += shift
+    (rows,) = rows_by_mode(x)
+    np.testing.assert_array_equal(rows, np.arange(2000))
+
+
+def test_draws_are_split_into_their_modes() -> None:
+    """Three modes that only an oblique direction separates, with their masses."""
+    rng = np.random.default_rng(1)
+    place = rng.choice(3, 2000, p=[0.1, 0.3, 0.6])
+    x = rng.standard_normal((2000, 2)) * [3.0, 0.5] + np.array([0.0, 5.0])[None] * place[:, None]
+    turned = x @ np.array([[1.0, -1.0], [1.0, 1.0]])
+    modes = rows_by_mode(turned)
+    assert len(modes) == 3
+    assert sorted(np.concatenate(modes).tolist()) == list(range(2000))
+    for rows in modes:
+        # A normal exceeds the middle, five standard deviations away, in no draw.
+        assert len(np.unique(place[rows])) == 1

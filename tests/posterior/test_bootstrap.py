@@ -52,6 +52,16 @@ def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> No
     np.testing.assert_array_equal(result.observed_data["y"], OBSERVED)
 
 
+def test_few_specimens_are_a_finding_of_the_draws() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED[:20], propagation=R256)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    findings = prb.diagnose(prb.bootstrap(optimum, 100, progressbar=False), model=model).findings
+    assert [finding.code for finding in findings] == ["few-for-bootstrap"]
+    assert prb.bootstrap(fit("kl"), 10).posterior.attrs["findings"] == "[]"
+
+
 @pytest.mark.parametrize("name", ["pr", "area"])
 def test_the_parametric_bootstrap_agrees_with_the_standard_error(name: str) -> None:
     # One by refitting, one to first order: 2.2% and 5% of sampling error, and curvature.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import multivariate_normal, multivariate_t
+import pytest
+from scipy.stats import multivariate_normal, multivariate_t, norm
 
 from prbayes._validate import Floats
 from prbayes.numerics.modes import laplace
@@ -111,3 +112,45 @@ def test_further_rounds_follow_a_bent_ridge_into_the_prior() -> None:
     sd = np.sqrt(weights @ (grid[:, 0] - mean) ** 2 / weights.sum())
     # Five standard errors of the smallest effective size.
     assert (np.abs(sample.draws.mean(axis=0) - mean) < 5 * sd / np.sqrt(2000)).all()
+
+
+@pytest.mark.parametrize("nuisance", [0, 2])
+def test_a_ridge_between_two_modes_has_its_mass(nuisance: int) -> None:
+    """Squares of normal specimens: either sign of the mean, or one near zero with a large spread.
+
+    A prior of the nuisance elements, twenty times as wide as their posterior, reaches no point of
+    the ridge.
+    """
+    specimens = np.random.default_rng(34).normal(1.0, 0.5, 20)
+    sd = np.concatenate([[2.0, 1.0], np.full(nuisance, 20.0)])
+
+    def prior(thetas: Floats) -> Floats:
+        return np.asarray(norm.logpdf(thetas, 0.0, sd).sum(axis=1))
+
+    def folded(thetas: Floats) -> Floats:
+        mean, spread = thetas[:, :1], np.exp(thetas[:, 1:2])
+        signs = [norm.logpdf(sign * specimens, mean, spread) for sign in (1, -1)]
+        nuisances = norm.logpdf(thetas[:, 2:]).sum(axis=1)
+        return np.asarray(prior(thetas) + np.logaddexp(*signs).sum(axis=1) + nuisances)
+
+    def draws(size: int, seed: int) -> Floats:
+        return sd * np.random.default_rng(seed).standard_normal((size, len(sd)))
+
+    grid = np.stack(
+        [a.ravel() for a in np.meshgrid(np.linspace(-3, 3, 301), np.linspace(-2, 2, 201))]
+    )
+    weights = np.exp(folded(np.hstack([grid.T, np.zeros((grid.shape[1], nuisance))])))
+    right = weights[np.abs(grid[0]) < 0.4].sum() / weights.sum()
+    assert 0.005 < right < 0.05
+    starts = np.zeros((2, len(sd)))
+    starts[:, :2] = [[1.0, -0.7], [-1.0, -0.7]]
+    modes = laplace(folded, starts, sd)
+    shares = []
+    for seed in range(8):
+        sample = importance_sample(folded, modes, 4000, seed, prior=(draws, prior))
+        assert sample.is_reliable
+        shares.append(float(np.mean(np.abs(sample.draws[:, 0]) < 0.4)))
+    # The standard error of 4000 independent draws.
+    error = np.sqrt(right / 4000)
+    assert np.abs(np.array(shares) - right).max() < 4 * error
+    assert abs(np.mean(shares) - right) < 4 * error / np.sqrt(8)

@@ -75,7 +75,8 @@ def test_results_without_a_problem(tmp_path: Path) -> None:
     idata.to_netcdf(tmp_path / "tree.nc")
     with xr.open_datatree(tmp_path / "tree.nc") as loaded:
         assert prb.diagnose(loaded).ok
-    assert prb.diagnose(prb.bootstrap(optimum(), draws=100), model=model).ok
+    # The bootstrap of 40 specimens has narrow intervals, and no other problem.
+    assert codes(prb.bootstrap(optimum(), draws=100), model) == ["few-for-bootstrap"]
 
 
 def test_chains_that_disagree() -> None:

@@ -1,5 +1,6 @@
 """Few specimens: of all simulators together, and of each."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from four_metrics import same
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.checks.sample_size import few_specimens, interval_ratios
+from prbayes.inference.checks.sample_size import few_for_bootstrap, few_specimens, interval_ratios
 from prbayes.model.evaluator import Evaluator
 
 LOG_LIKELIHOOD = prb.LogLikelihood(density=prb.GaussianKDE())
@@ -47,6 +48,44 @@ def test_fewer_than_eight_specimens_are_reported_with_the_price(metric: prb.Metr
     assert "its spread 3.4 times" in warned(model(INPUTS[:3]))
     assert "y: got 7 specimens" in warned(model(INPUTS[:7]))
     assert not warned(model(INPUTS[:8]))
+
+
+def bootstrap_estimates(y: Any, parametric: bool, rng: np.random.Generator) -> tuple[Any, Any]:
+    """Return means and standard deviations of bootstrap samples of normal specimens."""
+    if parametric:
+        sets = y.mean() + y.std() * rng.standard_normal((300, len(y)))
+        return sets.mean(axis=1), sets.std(axis=1)
+    weights = rng.dirichlet(np.ones(len(y)), 300)
+    mean = weights @ y
+    return mean, np.sqrt(weights @ y**2 - mean**2)
+
+
+@pytest.mark.parametrize("parametric", [False, True])
+@pytest.mark.parametrize("n", [8, 12, 20])
+def test_the_coverage_of_the_bootstrap_is_as_stated(n: int, parametric: bool) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sd", 1))
+        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=INPUTS[:n])
+    (finding,) = few_for_bootstrap(Evaluator.of(model), parametric=parametric)
+    match = re.search(r"in about (\d+)% of data sets, and the mean in (\d+)%", finding.text)
+    assert match is not None
+    rng = np.random.default_rng([n, parametric])
+    within = []
+    for _ in range(1000):
+        estimates = bootstrap_estimates(rng.standard_normal(n), parametric, rng)
+        for values, truth in zip(estimates, (0.0, 1.0), strict=True):
+            low, high = np.quantile(values, [0.055, 0.945])
+            within.append(low < truth < high)
+    mean, spread = np.reshape(within, (-1, 2)).mean(axis=0)
+    # Standard errors: .016 here, .009 of the study's 3000, and figures of two digits.
+    np.testing.assert_allclose(np.array(match.groups(), float) / 100, [spread, mean], atol=0.07)
+
+
+def test_fifty_specimens_are_enough_for_the_bootstrap() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sd", 1))
+        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=np.arange(50.0))
+    assert few_for_bootstrap(Evaluator.of(model), parametric=False) == []
 
 
 def test_specimens_count_where_simulators_share_hyperparameters() -> None:
