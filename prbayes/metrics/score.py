@@ -43,7 +43,7 @@ class WeightSlopes:
     responses: Floats  # stored responses, (M,) or (M, m)
     weights: Floats  # weights at theta, (M,)
     slopes: Floats  # derivatives of the weights with respect to the elements of theta, (d, M)
-    # Weights at other optima, (J, M). The discrepancy there, less that at theta, is a further score.
+    # weights at other optima, (J, M); the discrepancy there, less that at theta, is a further score
     others: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @property

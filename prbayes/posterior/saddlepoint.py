@@ -32,8 +32,10 @@ from prbayes.metrics.score import (
     tabulated_scores,
 )
 from prbayes.model.evaluator import Evaluator, coarser_evaluator, with_targets
+from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
+from prbayes.numerics.modes import distinct_modes, far_apart, laplace
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
 from prbayes.optimize.optimum import Optimum, element_order, optima_of
@@ -78,9 +80,10 @@ class EstimateLikelihoodOptions:
     # elements
     distance: float = 3.0
     smallest_spread: float = 1e-4
-    # Largest difference of the log-density of the score between the estimate and another optimum
-    # that has part of the posterior.
+    # Largest difference of the log mass between the best mode and another that has part of the
+    # posterior, and the largest number of others
     rival: float = 10.0
+    most_rivals: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +91,7 @@ class EstimateLikelihood:
     """The likelihood given the estimate."""
 
     evaluator: Evaluator
-    # (M, d): point of the score, then optima that are as good. The point is the estimate, or a
+    # (M, d): point of the score, then other modes. The point is the estimate, or a
     # point inside if the estimate is at an edge.
     starts: Floats
     # scores of each group of simulators that share specimens
@@ -209,14 +212,44 @@ def estimate_likelihood(
         options=options.saddlepoint,
     )
     likelihood = _with_scores(likelihood, point[None], scales, options)
-    # Populations at another optimum may have a score of zero at the estimate as well. Which of them
+    # Populations at another mode may have a score of zero at the estimate as well. Which of them
     # fits better is then a further statistic.
-    log_likelihoods = likelihood.log_likelihood(likelihood.starts)
-    is_rival = log_likelihoods > log_likelihoods[0] - options.rival
-    is_rival[0] = True
-    if not is_rival[1:].any():
+    rivals = _rival_modes(likelihood, options)
+    if not len(rivals):
         return likelihood
-    return _with_scores(likelihood, likelihood.starts[is_rival], scales, options)
+    minima = [_minimiser(evaluator, mode, scales) for mode in rivals]
+    likelihood = _with_scores(likelihood, np.vstack([point, *minima]), scales, options)
+    starts = np.vstack([point, rivals])
+    is_start = np.isfinite(likelihood.log_likelihood(starts))
+    return replace(likelihood, starts=starts[is_start])
+
+
+def _rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
+    """Return modes of the posterior given the score, other than the estimate's own, (J, d)."""
+    evaluator, starts = likelihood.evaluator, likelihood.starts
+    hyperparameters = evaluator.hyperparameters
+
+    def log_density(thetas: Floats) -> Floats:
+        return log_posterior(hyperparameters, thetas, likelihood.log_likelihood)
+
+    if not evaluator.responses_per_theta:
+        thetas = hyperparameters.prior_points(THETAS, 0)
+        order = np.argsort(-log_density(thetas), kind="stable")
+        few = far_apart(thetas[order[: THETAS // 4]], 8, hyperparameters.prior_sd)
+        starts = np.vstack([starts, few])
+    is_start = np.isfinite(log_density(starts))
+    if not is_start[0] or is_start.sum() < 2:
+        return starts[:0]
+    try:
+        modes = laplace(log_density, starts[is_start], likelihood.scale)
+    except (ValueError, np.linalg.LinAlgError):  # because the density jumps near a start
+        return starts[1 : len(likelihood.starts)]
+    lowest = max(mode.log_mass for mode in modes if mode.converged or mode is modes[0])
+    lowest -= options.rival
+    own, *others = modes
+    far = [m for m in others if m.converged and m.log_mass > lowest and own.is_apart(m)]
+    rivals = [mode.mode for mode in distinct_modes(far)[: options.most_rivals]]
+    return np.array(rivals).reshape(-1, starts.shape[1])
 
 
 def _with_scores(
@@ -251,8 +284,6 @@ def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
     """Return metrics that are prepared on the population, with scales and minimiser."""
-    from scipy.optimize import minimize as scipy_minimize
-
     targets = []
     for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)
@@ -261,21 +292,28 @@ def _minimised_on_population(
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
+    minimiser = move_inside(prepared, _minimiser(prepared, point, scales), options)
+    sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
+    is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
+    return prepared, scales, minimiser if is_supported else point
+
+
+def _minimiser(evaluator: Evaluator, point: Floats, scales: Floats) -> Floats:
+    """Return the minimiser of the objective near a point, (d,)."""
+    from scipy.optimize import minimize as scipy_minimize
+
     prior_sd = evaluator.hyperparameters.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
         center = point + shift * prior_sd
         thetas = cross(center, 1e-4 * prior_sd)
-        totals = prepared.total(thetas, scales)
+        totals = evaluator.total(thetas, scales)
         d = len(shift)
         up, down = totals[1 : 1 + d], totals[1 + d :]
         return float(totals[0]), (up - down) / 2e-4
 
     minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
-    minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)
-    sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
-    is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
-    return prepared, scales, minimiser if is_supported else point
+    return np.asarray(point + minimum.x * prior_sd)
 
 
 def _group_scores(
@@ -330,7 +368,7 @@ def _derivatives(
     k: int,
     theta: Floats,
     options: EstimateLikelihoodOptions,
-    others: Floats = np.empty((0, 0)),
+    others: Floats | None = None,
 ) -> WeightSlopes | ShiftedResponses:
     """Return the k-th simulator's stored responses with slopes of weights, or shifted responses.
 
@@ -342,7 +380,9 @@ def _derivatives(
         step if bound.stored else options.resimulated_step
     ) * evaluator.hyperparameters.prior_sd
     d = len(theta)
-    thetas = np.vstack([cross(theta, steps), others.reshape(-1, d)])
+    thetas = cross(theta, steps)
+    if others is not None:
+        thetas = np.vstack([thetas, others])
     responses, weights = evaluator.populations(thetas, k)
     ends = [1, 1 + d, 1 + 2 * d]
     if not bound.stored:
@@ -470,9 +510,9 @@ def saddlepoint_density(
 ) -> Floats:
     """Return the log-density of a mean of zero, up to a constant, (S,), from cumulant functions.
 
-    The S convex functions of r tilts are minimised by Newton steps no longer than 1 + |a|, which are
-    shortened where a function would rise. ``size`` is the number of observed specimens. The density is -inf without a saddlepoint: then zero is
-    outside of the convex hull of the scores.
+    The S convex functions of r tilts are minimised by Newton steps no longer than 1 + |a|, which
+    are shortened where a function would rise. ``size`` is the number of observed specimens. The
+    density is -inf without a saddlepoint: then zero is outside of the convex hull of the scores.
     """
     count, r = shape
     ridge = 1e-8 * size * np.eye(r)

@@ -59,6 +59,11 @@ from prbayes.posterior.saddlepoint import (
     score_obstacle,
 )
 
+# what works where the density of an estimate is not known
+_REMEDY = (
+    "use prb.LogLikelihood(), or draw from the discrepancy with prb.sample_smc(adjustment=None)"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Target:
@@ -273,7 +278,7 @@ def extended_log_density(
 ) -> Floats:
     """Return the log-density of an estimate of zero, (S,), given log weights (S, R) of estimates.
 
-    The weights are known up to a factor. Estimates, (R, r), have further statistics as last columns.
+    The weights are known up to a factor. The last columns of estimates may be further statistics.
 
     The cumulant function is that of the weighted estimates, mixed with that of a normal
     distribution with their moments. A few data sets with a scatter of one standard error are added
@@ -388,7 +393,8 @@ def refit_likelihood(
         is_near = np.isfinite(of_sets).all(axis=1)
         standardised = np.concatenate(differences)[is_near]
         spread = standardised.std(axis=0)
-        varies = spread > 1e-6 * sampling.noise
+        # A difference below a tenth of the noise comes from the stored responses.
+        varies = spread > 0.1 * sampling.noise
         standardised = standardised[:, varies] / spread[varies]
         likelihood = replace(
             likelihood,
@@ -433,8 +439,9 @@ def _draw(
 ) -> tuple[Floats, list[csr_array], Floats, Floats]:
     """Draw and refit data sets at coordinates, (R, r).
 
-    Returns these, counts, estimates, which are NaN where they are far, and how much more the discrepancy is at each other center than
-    for the observed responses, (R, C - 1).
+    Returns these, counts, and estimates, which are NaN where they are far. The last array,
+    (R, C - 1), has the discrepancy at the other centers less that at the first one, less the same
+    for the observed responses.
     """
     sampling = centers[0]
     evaluator = sampling.evaluator
@@ -446,7 +453,7 @@ def _draw(
     if is_supported.mean() < 0.5:
         raise ValueError(
             f"got stored responses that support {is_supported.mean():.0%} of the populations "
-            "around the estimate, expected at least half; widen the prior, or use prb.sample_smc"
+            f"around the estimate, expected at least half; widen the prior, or {_REMEDY}"
         )
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
@@ -468,7 +475,7 @@ def _draw(
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
-            f"least {options.converged:.0%}; use another metric, or prb.sample_smc"
+            f"least {options.converged:.0%}; {_REMEDY}"
         )
     differences = np.empty((len(x), 0))
     if len(centers) > 1:
@@ -516,7 +523,7 @@ def _at_minimiser(
             return moved
     raise ValueError(
         "got an estimate that still moves by half a standard error when it is minimised again, "
-        "expected a minimum; use another metric, or prb.sample_smc"
+        f"expected a minimum; {_REMEDY}"
     )
 
 
@@ -561,5 +568,5 @@ def _moved_inside(
 def _at_edge(subject: str) -> str:
     return (
         f"got {subject} at an edge, such as a standard deviation of zero, where estimates have no "
-        "density; use prb.LogLikelihood(), or prb.sample_smc"
+        f"density; {_REMEDY}"
     )
