@@ -156,7 +156,7 @@ def refit(
     descent = None
     results = []
     with progress("refits", n_sets) as advance:
-        for rows, objective in _batches(sampling, sets):
+        for rows, objective in objectives_of_batches(sampling, sets):
             if descent is None:  # the curvature of the first batch serves all batches
                 descent = descent_of(sampling, objective, is_rough=is_rough)
             results.append(minimise_sets(sampling, objective, descent, start[rows]))
@@ -167,10 +167,12 @@ def refit(
 
 def objectives(sampling: SamplingDistribution, sets: DataSets, thetas: Floats) -> Floats:
     """Return the objective of each data set at thetas, (T, d) -> (n_sets, T)."""
-    return np.concatenate([f(thetas[None], slice(None)) for _, f in _batches(sampling, sets)])
+    return np.concatenate(
+        [f(thetas[None], slice(None)) for _, f in objectives_of_batches(sampling, sets)]
+    )
 
 
-def _batches(
+def objectives_of_batches(
     sampling: SamplingDistribution, sets: DataSets
 ) -> Iterator[tuple[slice, BatchObjective]]:
     """Yield the rows and the objective of as many data sets as fit into memory."""

@@ -44,7 +44,7 @@ class WeightSlopes:
     weights: Floats  # weights at theta, (M,)
     slopes: Floats  # derivatives of the weights with respect to the elements of theta, (d, M)
     # weights at other optima, (J, M); the discrepancy there, less that at theta, is a further score
-    others: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    optima: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def spread(self) -> Floats:
@@ -69,10 +69,10 @@ class WeightSlopes:
             shift = steps[:, None] * slope
             upper.append(feature + shift)
             lower.append(feature - shift)
-        count = len(self.others)
+        count = len(self.optima)
         if not count:
             return upper, lower, steps
-        rivals = basis.features(self.others)
+        rivals = basis.features(self.optima)
         upper = [np.concatenate(pair) for pair in zip(upper, rivals, strict=True)]
         lower = [
             np.concatenate([rows, np.repeat(feature, count, axis=0)])

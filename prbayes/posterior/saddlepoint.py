@@ -81,7 +81,7 @@ class EstimateLikelihoodOptions:
     distance: float = 3.0
     smallest_spread: float = 1e-4
     # Largest difference of the log mass between the best mode and another that has part of the
-    # posterior, and the largest number of others
+    # posterior, and the largest number of optima
     rival: float = 10.0
     most_rivals: int = 4
 
@@ -214,17 +214,17 @@ def estimate_likelihood(
     likelihood = _with_scores(likelihood, point[None], scales, options)
     # Populations at another mode may have a score of zero at the estimate as well. Which of them
     # fits better is then a further statistic.
-    rivals = _rival_modes(likelihood, options)
+    rivals = rival_modes(likelihood, options)
     if not len(rivals):
         return likelihood
-    minima = [_minimiser(evaluator, mode, scales) for mode in rivals]
+    minima = [minimiser_near(evaluator, mode, scales) for mode in rivals]
     likelihood = _with_scores(likelihood, np.vstack([point, *minima]), scales, options)
     starts = np.vstack([point, rivals])
     is_start = np.isfinite(likelihood.log_likelihood(starts))
     return replace(likelihood, starts=starts[is_start])
 
 
-def _rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
+def rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
     """Return modes of the posterior given the score, other than the estimate's own, (J, d)."""
     evaluator, starts = likelihood.evaluator, likelihood.starts
     hyperparameters = evaluator.hyperparameters
@@ -246,8 +246,8 @@ def _rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOpti
         return starts[1 : len(likelihood.starts)]
     lowest = max(mode.log_mass for mode in modes if mode.converged or mode is modes[0])
     lowest -= options.rival
-    own, *others = modes
-    far = [m for m in others if m.converged and m.log_mass > lowest and own.is_apart(m)]
+    center, *candidates = modes
+    far = [m for m in candidates if m.converged and m.log_mass > lowest and center.is_apart(m)]
     rivals = [mode.mode for mode in distinct_modes(far)[: options.most_rivals]]
     return np.array(rivals).reshape(-1, starts.shape[1])
 
@@ -292,13 +292,13 @@ def _minimised_on_population(
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
-    minimiser = move_inside(prepared, _minimiser(prepared, point, scales), options)
+    minimiser = move_inside(prepared, minimiser_near(prepared, point, scales), options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
     return prepared, scales, minimiser if is_supported else point
 
 
-def _minimiser(evaluator: Evaluator, point: Floats, scales: Floats) -> Floats:
+def minimiser_near(evaluator: Evaluator, point: Floats, scales: Floats) -> Floats:
     """Return the minimiser of the objective near a point, (d,)."""
     from scipy.optimize import minimize as scipy_minimize
 
@@ -325,7 +325,7 @@ def _group_scores(
 ) -> StoredScores | ResimulatedScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies.
 
-    They are those at the first of the points, (M, d), and differences between the others and it.
+    They are those at the first of the points, (M, d), and differences between the optima and it.
     """
     numbers, total = number_specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
@@ -368,7 +368,7 @@ def _derivatives(
     k: int,
     theta: Floats,
     options: EstimateLikelihoodOptions,
-    others: Floats | None = None,
+    optima: Floats | None = None,
 ) -> WeightSlopes | ShiftedResponses:
     """Return the k-th simulator's stored responses with slopes of weights, or shifted responses.
 
@@ -381,8 +381,8 @@ def _derivatives(
     ) * evaluator.hyperparameters.prior_sd
     d = len(theta)
     thetas = cross(theta, steps)
-    if others is not None:
-        thetas = np.vstack([thetas, others])
+    if optima is not None:
+        thetas = np.vstack([thetas, optima])
     responses, weights = evaluator.populations(thetas, k)
     ends = [1, 1 + d, 1 + 2 * d]
     if not bound.stored:
@@ -572,7 +572,7 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
 
     A hyperparameter without influence has a score of zero, and two that only act together have
     proportional scores. Neither enters the density, so that their posterior is their prior given
-    the others.
+    the optima.
     """
     tolerance = options.smallest_eigenvalue
     spread = np.sqrt(np.diag(covariance))

@@ -63,6 +63,9 @@ def sample(
     a saddlepoint approximation [2]_. It is that of the score if the gradient is a mean over
     specimens (PR, the Kullback-Leibler divergence), else of refits of synthetic data sets.
 
+    If the posterior has several modes, the difference of the discrepancy between their optima is
+    part of the estimate, and the finding ``second-mode`` has the share of the draws near each.
+
     Parameters
     ----------
     draws : int

@@ -384,26 +384,33 @@ def refit_likelihood(
         if i:
             x = _posterior_points(likelihood, number)
         drawn.append(_draw(centers, x, options, seed=i, is_linear=is_linear))
-        populations, counts, estimates, differences = zip(*drawn, strict=True)
+        populations, counts, estimates = zip(*drawn, strict=True)
         joined = tuple(vstack(parts, format="csr") for parts in zip(*counts, strict=True))
         logs = _log_likelihoods(sampling, joined, np.concatenate(populations))
-        # Which center fits a data set better is a further statistic. Without it populations at
-        # another optimum would count like those at the best, however much worse they fit.
-        of_sets = np.concatenate(estimates)
-        is_near = np.isfinite(of_sets).all(axis=1)
-        standardised = np.concatenate(differences)[is_near]
-        spread = standardised.std(axis=0)
-        # A difference below a tenth of the noise comes from the stored responses.
-        varies = spread > 0.1 * sampling.noise
-        standardised = standardised[:, varies] / spread[varies]
+        near, is_near = near_statistics(np.concatenate(estimates), r, sampling.noise)
         likelihood = replace(
             likelihood,
             counts=joined,
-            estimates=np.column_stack([of_sets[is_near], standardised]),
+            estimates=near,
             is_near=is_near,
             log_mixture=log_sum_exp(logs.T),
         )
     return likelihood
+
+
+def near_statistics(statistics: Floats, r: int, noise: float) -> tuple[Floats, Bools]:
+    """Return the statistics of data sets whose estimate is near the observed one, and which are.
+
+    Which center fits a data set better is a statistic beside the r coordinates of the estimate.
+    Without it populations at another optimum would count like those at the best, however much worse
+    they fit.
+    """
+    is_near = np.isfinite(statistics).all(axis=1)
+    estimates, differences = np.split(statistics[is_near], [r], axis=1)
+    spread = differences.std(axis=0)
+    # A difference below a tenth of the noise comes from the stored responses.
+    varies = spread > 0.1 * noise
+    return np.hstack([estimates, differences[:, varies] / spread[varies]]), is_near
 
 
 def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
@@ -436,12 +443,12 @@ def _draw(
     seed: int,
     *,
     is_linear: bool,
-) -> tuple[Floats, list[csr_array], Floats, Floats]:
+) -> tuple[Floats, list[csr_array], Floats]:
     """Draw and refit data sets at coordinates, (R, r).
 
-    Returns these, counts, and estimates, which are NaN where they are far. The last array,
-    (R, C - 1), has the discrepancy at the other centers less that at the first one, less the same
-    for the observed responses.
+    Returns these, counts, and statistics, (R, r + C - 1): estimates, which are NaN where they are
+    far, and the discrepancy at the other centers less that at the first one, less the same for the
+    observed responses.
     """
     sampling = centers[0]
     evaluator = sampling.evaluator
@@ -477,13 +484,11 @@ def _draw(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
             f"least {options.converged:.0%}; {_REMEDY}"
         )
-    differences = np.empty((len(x), 0))
     if len(centers) > 1:
         at = np.array([center.theta for center in centers])
         totals = objectives(sampling, data, at) - objectives(sampling, observed_set(evaluator), at)
-        differences = totals[:, 1:] - totals[:, :1]
-    counts = [count[converged] for count in counts]
-    return x[converged], counts, estimates[converged], differences[converged]
+        estimates = np.hstack([estimates, totals[:, 1:] - totals[:, :1]])
+    return x[converged], [count[converged] for count in counts], estimates[converged]
 
 
 def _log_likelihoods(
