@@ -81,7 +81,7 @@ class EstimateLikelihoodOptions:
     distance: float = 3.0
     smallest_spread: float = 1e-4
     # Largest difference of the log mass between the best mode and another that has part of the
-    # posterior, and the largest number of optima
+    # posterior, and the largest number of such modes
     rival: float = 10.0
     most_rivals: int = 4
 
@@ -325,7 +325,8 @@ def _group_scores(
 ) -> StoredScores | ResimulatedScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies.
 
-    They are those at the first of the points, (M, d), and differences between the optima and it.
+    They are those at the first of the points, (M, d). The discrepancies at the others, less that at
+    the first one, follow.
     """
     numbers, total = number_specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
