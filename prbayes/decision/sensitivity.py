@@ -237,14 +237,14 @@ class SensitivityTable(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Indices:
+class SensitivityIndices:
     """First-order, total-order and derivative-based indices of d factors."""
 
     values: Floats  # (3, d): indices
     errors: Floats  # (3, d): standard errors of the indices
 
     @classmethod
-    def of_replicates(cls, indices: Floats) -> Indices:
+    def of_replicates(cls, indices: Floats) -> SensitivityIndices:
         """Return means and standard errors over r replicates, (d, 3, r)."""
         errors = np.std(indices, axis=-1, ddof=1) / np.sqrt(indices.shape[-1])
         return cls(np.mean(indices, axis=-1).T, errors.T)
@@ -260,7 +260,7 @@ def _paired_points(n: int, d: int, seed: int) -> tuple[Floats, Floats]:
 
 def _hyperparameter_indices(
     sample: ResponseSample, quantity: Quantity, n_points: int, seed: int
-) -> Indices:
+) -> SensitivityIndices:
     """Return the indices of the elements of theta in the variance of the quantity."""
     draws = sample.populations.thetas
     d = sample.populations.evaluator.hyperparameters.size
@@ -303,21 +303,21 @@ def _hyperparameter_indices(
     by_block = np.array(indices)
     if n_blocks > 1:
         by_block = by_block.reshape(d, 3, n_blocks, -1).mean(axis=-1)
-    result = Indices.of_replicates(by_block)
+    result = SensitivityIndices.of_replicates(by_block)
     # The square of a correlation of m independent draws has the mean 1 / m.
     return replace(result, errors=np.hypot(result.errors, n_blocks / len(draws)))
 
 
 def input_indices(
     sample: ResponseSample, quantity: Quantity, n_points: int, seed: int, *, computed: bool
-) -> tuple[Indices, str]:
+) -> tuple[SensitivityIndices, str]:
     """Return the indices of the inputs at the central population, and why they are not known.
 
     Inputs are independent. The errors include that of the emulator, from emulators without a block
     of runs.
     """
     center = sample.populations.center[None]
-    unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
+    unknown = SensitivityIndices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
     try:
         transform = InverseTransform(
             sample.responses.name, sample.design.inputs, sample.parents(center)
@@ -345,7 +345,7 @@ def input_indices(
     for values in outputs:
         numbers = quantity.of_specimen(values, at).reshape(z.shape[:-1])
         replicates.append(_indices_of_matched(numbers, transform.columns))
-    best, *resampled = (Indices.of_replicates(indices) for indices in replicates)
+    best, *resampled = (SensitivityIndices.of_replicates(indices) for indices in replicates)
     emulator_error = np.sum([(indices.values - best.values) ** 2 for indices in resampled], axis=0)
     is_known = np.array([[True], [True], [quantity.differentiable]])
     values = np.where(is_known, best.values, np.nan)
@@ -357,10 +357,10 @@ def input_indices(
             "so that there is no variance to share; ask for a less rare quantity, or pass a "
             "larger n_points"
         )
-    return Indices(values, errors), reason
+    return SensitivityIndices(values, errors), reason
 
 
-def _constant_findings(indices: Indices, quantity: Quantity) -> tuple[Finding, ...]:
+def _constant_findings(indices: SensitivityIndices, quantity: Quantity) -> tuple[Finding, ...]:
     """Return a finding if a quantity has no variance over the hyperparameters."""
     if not np.isnan(indices.values).any():
         return ()
@@ -436,15 +436,15 @@ def first_order(values: Floats, same: Floats, independent: Floats | None = None)
     ``independent`` are values at these points with another X_i. Their correlation with Y is zero,
     and removes the noise of the points (a control variate): all of it for a factor without effect.
     """
-    result = _correlation(values, same)
+    result = _row_correlation(values, same)
     if independent is not None:
         # One coefficient of all replicates, because its noise times that of the other is a bias.
-        coefficient = np.mean(_correlation(same, independent))
-        result = result - coefficient * _correlation(values, independent)
+        coefficient = np.mean(_row_correlation(same, independent))
+        result = result - coefficient * _row_correlation(values, independent)
     return result
 
 
-def _correlation(a: Floats, b: Floats) -> Floats:
+def _row_correlation(a: Floats, b: Floats) -> Floats:
     """Return the correlation of two variables with the same distribution, (r, n) -> (r,)."""
     a, b = _complete_pairs(a, b)
     mean = np.nanmean(a + b, axis=1, keepdims=True) / 2

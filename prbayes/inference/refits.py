@@ -6,7 +6,7 @@ sentence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -153,24 +153,38 @@ def refit(
     n_sets = len(sets.weights[0])
     if start is None:
         start = np.zeros((n_sets, sampling.stderr.size))
-    points = max(
-        len(node.target.parts) * max(node.bound.n_points, len(values))
-        for node, values in zip(sampling.evaluator.nodes, sets.values, strict=True)
-    )
-    at_once = max(1, 2 * AT_ONCE // points)  # number of data sets that fit into memory
     descent = None
     results = []
     with progress("refits", n_sets) as advance:
-        for i in range(0, n_sets, at_once):
-            rows = slice(i, i + at_once)
-            batch = DataSets(sets.values, [w[rows] for w in sets.weights])
-            objective = BatchObjective.of(sampling.evaluator, sampling.scales, batch)
+        for rows, objective in objectives_of_batches(sampling, sets):
             if descent is None:  # the curvature of the first batch serves all batches
                 descent = descent_of(sampling, objective, is_rough=is_rough)
             results.append(minimise_sets(sampling, objective, descent, start[rows]))
             advance(len(results[-1][1]), "")
     minimisers, converged = zip(*results, strict=True)
     return np.concatenate(minimisers), np.concatenate(converged)
+
+
+def objectives(sampling: SamplingDistribution, sets: DataSets, thetas: Floats) -> Floats:
+    """Return the objective of each data set at thetas, (T, d) -> (n_sets, T)."""
+    return np.concatenate(
+        [f(thetas[None], slice(None)) for _, f in objectives_of_batches(sampling, sets)]
+    )
+
+
+def objectives_of_batches(
+    sampling: SamplingDistribution, sets: DataSets
+) -> Iterator[tuple[slice, BatchObjective]]:
+    """Yield the rows and the objective of as many data sets as fit into memory."""
+    points = max(
+        len(node.target.parts) * max(node.bound.n_points, len(values))
+        for node, values in zip(sampling.evaluator.nodes, sets.values, strict=True)
+    )
+    at_once = max(1, 2 * AT_ONCE // points)
+    for i in range(0, len(sets.weights[0]), at_once):
+        rows = slice(i, i + at_once)
+        batch = DataSets(sets.values, [w[rows] for w in sets.weights])
+        yield rows, BatchObjective.of(sampling.evaluator, sampling.scales, batch)
 
 
 def is_prepared_by_data(evaluator: Evaluator) -> bool:

@@ -7,7 +7,7 @@ A metric with ``additive`` has a gradient that is a mean over the observed speci
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -43,6 +43,8 @@ class WeightSlopes:
     responses: Floats  # stored responses, (M,) or (M, m)
     weights: Floats  # weights at theta, (M,)
     slopes: Floats  # derivatives of the weights with respect to the elements of theta, (d, M)
+    # weights at other optima, (J, M); the discrepancy there, less that at theta, is a further score
+    optima: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def spread(self) -> Floats:
@@ -54,7 +56,10 @@ class WeightSlopes:
     def neighbours(
         self, part: Part, options: ScoreOptions
     ) -> tuple[list[Floats], list[Floats], Floats]:
-        """Return features of a part at theta plus and minus a step, (d, ...), and steps, (d,)."""
+        """Return features of a part at theta plus and minus a step, (d, ...), and steps, (d,).
+
+        J other optima are further rows: their features, those at theta, and half as step.
+        """
         steps = np.asarray(options.step / np.maximum(self.spread, np.finfo(float).tiny))
         basis = part.target.basis(part.of(self.responses))
         features = basis.features(self.weights[None])
@@ -64,7 +69,16 @@ class WeightSlopes:
             shift = steps[:, None] * slope
             upper.append(feature + shift)
             lower.append(feature - shift)
-        return upper, lower, steps
+        count = len(self.optima)
+        if not count:
+            return upper, lower, steps
+        rivals = basis.features(self.optima)
+        upper = [np.concatenate(pair) for pair in zip(upper, rivals, strict=True)]
+        lower = [
+            np.concatenate([rows, np.repeat(feature, count, axis=0)])
+            for rows, feature in zip(lower, features, strict=True)
+        ]
+        return upper, lower, np.append(steps, np.full(count, 0.5))
 
 
 @dataclass(frozen=True, eq=False)

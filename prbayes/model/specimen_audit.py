@@ -24,13 +24,13 @@ from prbayes.specimens.design import farthest, most_runs
 from prbayes.specimens.emulation import Emulation, fit_surface
 
 
-def audited(evaluator: Evaluator, thetas: Floats, *, is_last: bool = False) -> Evaluator:
+def audited_evaluator(evaluator: Evaluator, thetas: Floats, *, is_last: bool = False) -> Evaluator:
     """Return the evaluator with emulators that are right at likely inputs of draws, (S, p).
 
     It is the same object if no emulator has changed. Raise DesignError if one would change in the
     last round, or has its largest number of runs.
     """
-    records = {old: _audited(old, thetas, is_last) for old in evaluator.likelihoods}
+    records = {old: _audited_likelihood(old, thetas, is_last) for old in evaluator.likelihoods}
     if all(new is old for old, new in records.items()):
         return evaluator
     for rv, old in specimen_likelihoods(evaluator.model).items():
@@ -38,7 +38,7 @@ def audited(evaluator: Evaluator, thetas: Floats, *, is_last: bool = False) -> E
     return Evaluator.of(evaluator.model)
 
 
-def _audited(
+def _audited_likelihood(
     likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool, least_share: float = 0.005
 ) -> SpecimenLikelihood:
     """Return a likelihood with runs where its emulator is wrong, the same if it is right.

@@ -30,6 +30,11 @@ class Laplace:
     log_mass: float  # logarithm of the mass by Laplace's approximation
     converged: bool
 
+    def is_apart(self, other: Laplace) -> bool:
+        """Return whether another mode is more than half a standard deviation away."""
+        distance = np.abs(other.mode - self.mode) / np.sqrt(np.diag(self.covariance))
+        return bool(distance.max() > 0.5)
+
 
 def laplace(
     log_density: LogDensity, starts: Floats, scale: Floats, steps: int = 20
@@ -72,11 +77,7 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
     """Return the modes, best ones first, that are half a standard deviation from better ones."""
     distinct: list[Laplace] = []
     for mode in sorted(modes, key=lambda mode: (not mode.converged, -mode.log_mass)):
-        distances = [
-            np.abs(mode.mode - better.mode) / np.sqrt(np.diag(better.covariance))
-            for better in distinct
-        ]
-        if all(distance.max() > 0.5 for distance in distances):
+        if all(better.is_apart(mode) for better in distinct):
             distinct.append(mode)
     return distinct
 

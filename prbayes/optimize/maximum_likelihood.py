@@ -37,7 +37,7 @@ from prbayes.model.evaluator import (
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, variables_at
-from prbayes.model.specimen_audit import audited
+from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
@@ -102,7 +102,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
             optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
         modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
         thetas = np.stack([mode.theta for mode in modes])
-        latest = audited(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+        latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
         if latest is evaluator:
             break
         evaluator = latest

@@ -577,13 +577,14 @@ def element_order(optimum: Optimum, evaluator: Evaluator) -> list[int]:
     return [names.index(name) for name in evaluator.hyperparameters.names]
 
 
-def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
-    """Return the optimum and comparable local optima, (M, d), in the evaluator's order of elements.
+def optima_of(optimum: Optimum, evaluator: Evaluator, *, comparable: bool = True) -> Floats:
+    """Return the optimum and local optima, (M, d), in the evaluator's order of elements.
 
-    The order may differ in a clone of the optimum's model.
+    By default these are the comparable ones. The order may differ in a clone of the optimum's
+    model.
     """
     order = element_order(optimum, evaluator)
-    modes = [mode["theta"] for mode in optimum.local_optima if mode["comparable"]]
+    modes = [m["theta"] for m in optimum.local_optima if m["comparable"] or not comparable]
     return np.array([optimum.theta, *modes])[:, order]
 
 

@@ -32,8 +32,10 @@ from prbayes.metrics.score import (
     tabulated_scores,
 )
 from prbayes.model.evaluator import Evaluator, coarser_evaluator, with_targets
+from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
+from prbayes.numerics.modes import distinct_modes, far_apart, laplace
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
 from prbayes.optimize.optimum import Optimum, element_order, optima_of
@@ -78,6 +80,10 @@ class EstimateLikelihoodOptions:
     # elements
     distance: float = 3.0
     smallest_spread: float = 1e-4
+    # Largest difference of the log mass between the best mode and another that has part of the
+    # posterior, and the largest number of such modes
+    rival: float = 10.0
+    most_rivals: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +91,7 @@ class EstimateLikelihood:
     """The likelihood given the estimate."""
 
     evaluator: Evaluator
-    # (M, d): point of the score, then optima that are as good. The point is the estimate, or a
+    # (M, d): point of the score, then other modes. The point is the estimate, or a
     # point inside if the estimate is at an edge.
     starts: Floats
     # scores of each group of simulators that share specimens
@@ -174,7 +180,7 @@ def estimate_likelihood(
     obstacle = score_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
-    optima = optima_of(optimum, evaluator)
+    optima = optima_of(optimum, evaluator, comparable=False)
     point = move_inside(evaluator, optima[0], options)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     # Minimise again with whitening and bandwidths of the population. Those of few observed
@@ -187,16 +193,6 @@ def estimate_likelihood(
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
     evaluator = coarser_evaluator(evaluator, point)
-    # Find the combinations of the scores that vary in the populations at the point.
-    score_groups = [
-        _group_scores(evaluator, members, point, scales, options)
-        for members in groups(evaluator.nodes)
-    ]
-    pairs = [group.population(evaluator, point[None]) for group in score_groups]
-    log_weights, scores = zip(*pairs, strict=True)
-    untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
-    size = sum(score.size for score in scores)
-    combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
     # The unit of an element is a hundred standard errors, or the prior's spread if it is less.
     hyperparameters = evaluator.hyperparameters
     is_stored = [node.bound.stored for node in nodes]
@@ -207,13 +203,80 @@ def estimate_likelihood(
     else:
         errors = np.sqrt(np.diag(optimum.covariance))[element_order(optimum, evaluator)]
         scale = np.minimum(100 * errors, hyperparameters.prior_sd)
-    return EstimateLikelihood(
+    likelihood = EstimateLikelihood(
         evaluator=evaluator,
         starts=np.vstack([point, optima[1:]]),
-        groups=[replace(group, combinations=combinations) for group in score_groups],
-        combinations=combinations,
+        groups=[],
+        combinations=np.empty((0, 0)),
         scale=scale,
         options=options.saddlepoint,
+    )
+    likelihood = _with_scores(likelihood, point[None], scales, options)
+    # Populations at another mode may have a score of zero at the estimate as well. Which of them
+    # fits better is then a further statistic.
+    rivals = rival_modes(likelihood, options)
+    if not len(rivals):
+        return likelihood
+    minima = [minimiser_near(evaluator, mode, scales) for mode in rivals]
+    likelihood = _with_scores(likelihood, np.vstack([point, *minima]), scales, options)
+    starts = np.vstack([point, rivals])
+    is_start = np.isfinite(likelihood.log_likelihood(starts))
+    return replace(likelihood, starts=starts[is_start])
+
+
+def rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
+    """Return modes of the posterior given the score, other than the estimate's own, (J, d)."""
+    evaluator, starts = likelihood.evaluator, likelihood.starts
+    hyperparameters = evaluator.hyperparameters
+
+    def log_density(thetas: Floats) -> Floats:
+        return log_posterior(hyperparameters, thetas, likelihood.log_likelihood)
+
+    if not evaluator.responses_per_theta:
+        thetas = hyperparameters.prior_points(THETAS, 0)
+        order = np.argsort(-log_density(thetas), kind="stable")
+        few = far_apart(thetas[order[: THETAS // 4]], 8, hyperparameters.prior_sd)
+        starts = np.vstack([starts, few])
+    is_start = np.isfinite(log_density(starts))
+    if not is_start[0] or is_start.sum() < 2:
+        return starts[:0]
+    try:
+        modes = laplace(log_density, starts[is_start], likelihood.scale)
+    except (ValueError, np.linalg.LinAlgError):  # because the density jumps near a start
+        return starts[1 : len(likelihood.starts)]
+    lowest = max(mode.log_mass for mode in modes if mode.converged or mode is modes[0])
+    lowest -= options.rival
+    center, *candidates = modes
+    far = [m for m in candidates if m.converged and m.log_mass > lowest and center.is_apart(m)]
+    rivals = [mode.mode for mode in distinct_modes(far)[: options.most_rivals]]
+    return np.array(rivals).reshape(-1, starts.shape[1])
+
+
+def _with_scores(
+    likelihood: EstimateLikelihood,
+    points: Floats,
+    scales: Floats,
+    options: EstimateLikelihoodOptions,
+) -> EstimateLikelihood:
+    """Return the likelihood given the score at the first of points, (M, d).
+
+    Further statistics are the differences of the discrepancy between the other points and it.
+    """
+    evaluator = likelihood.evaluator
+    score_groups = [
+        _group_scores(evaluator, members, points, scales, options)
+        for members in groups(evaluator.nodes)
+    ]
+    # Find the combinations of the scores that vary in the populations at the point.
+    pairs = [group.population(evaluator, points[:1]) for group in score_groups]
+    log_weights, scores = zip(*pairs, strict=True)
+    untilted = cumulants(log_weights, scores, np.zeros((1, scores[0].values.shape[1])))
+    size = sum(score.size for score in scores)
+    combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
+    return replace(
+        likelihood,
+        groups=[replace(group, combinations=combinations) for group in score_groups],
+        combinations=combinations,
     )
 
 
@@ -221,8 +284,6 @@ def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
     """Return metrics that are prepared on the population, with scales and minimiser."""
-    from scipy.optimize import minimize as scipy_minimize
-
     targets = []
     for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)
@@ -231,48 +292,60 @@ def _minimised_on_population(
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
-    prior_sd = evaluator.hyperparameters.prior_sd
-
-    def objective(shift: Floats) -> tuple[float, Floats]:
-        center = point + shift * prior_sd
-        thetas = cross(center, 1e-4 * prior_sd)
-        totals = prepared.total(thetas, scales)
-        d = len(shift)
-        up, down = totals[1 : 1 + d], totals[1 + d :]
-        return float(totals[0]), (up - down) / 2e-4
-
-    minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
-    minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)
+    minimiser = move_inside(prepared, minimiser_near(prepared, point, scales), options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
     return prepared, scales, minimiser if is_supported else point
 
 
+def minimiser_near(evaluator: Evaluator, point: Floats, scales: Floats) -> Floats:
+    """Return the minimiser of the objective near a point, (d,)."""
+    from scipy.optimize import minimize as scipy_minimize
+
+    prior_sd = evaluator.hyperparameters.prior_sd
+
+    def objective(shift: Floats) -> tuple[float, Floats]:
+        center = point + shift * prior_sd
+        thetas = cross(center, 1e-4 * prior_sd)
+        totals = evaluator.total(thetas, scales)
+        d = len(shift)
+        up, down = totals[1 : 1 + d], totals[1 + d :]
+        return float(totals[0]), (up - down) / 2e-4
+
+    minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
+    return np.asarray(point + minimum.x * prior_sd)
+
+
 def _group_scores(
     evaluator: Evaluator,
     members: Sequence[int],
-    point: Floats,
+    points: Floats,
     scales: Floats,
     options: EstimateLikelihoodOptions,
 ) -> StoredScores | ResimulatedScores:
-    """Return the scores of specimens in the sum of their simulators' discrepancies."""
+    """Return the scores of specimens in the sum of their simulators' discrepancies.
+
+    They are those at the first of the points, (M, d). The discrepancies at the others, less that at
+    the first one, follow.
+    """
     numbers, total = number_specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
-    populations = [_derivatives(evaluator, k, point, options) for k in members]
+    populations = [_derivatives(evaluator, k, points[0], options, points[1:]) for k in members]
     functions = [
         partial(specimen_scores, node.target, population, options=options.score, total=total)
         for node, population in zip(nodes, populations, strict=True)
     ]
     # The gradient of the objective, in units of the prior, is the sum of these scores over
     # specimens.
-    factors = [evaluator.hyperparameters.prior_sd / (n * scales[k]) for k in members]
+    units = np.append(evaluator.hyperparameters.prior_sd, np.ones(len(points) - 1))
+    factors = [units / (n * scales[k]) for k in members]
     parts = zip(members, nodes, factors, functions, strict=True)
     observed = sum(
         factor * score(node.observed[np.argsort(numbers[k])]) for k, node, factor, score in parts
     )
     mean = np.mean(observed, axis=0)
-    identity = np.eye(len(point))
+    identity = np.eye(len(units))
     if not all(node.bound.stored for node in nodes):
         tables = []
         for k, node, factor, population in zip(members, nodes, factors, populations, strict=True):
@@ -292,26 +365,40 @@ def _group_scores(
 
 
 def _derivatives(
-    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
+    evaluator: Evaluator,
+    k: int,
+    theta: Floats,
+    options: EstimateLikelihoodOptions,
+    optima: Floats | None = None,
 ) -> WeightSlopes | ShiftedResponses:
-    """Return the k-th simulator's stored responses with slopes of weights, or shifted responses."""
+    """Return the k-th simulator's stored responses with slopes of weights, or shifted responses.
+
+    Other optima, (J, d), add their weights, or their responses as shifts of one.
+    """
     bound = evaluator.nodes[k].bound
     step = options.wide_step if bound.support_moves else options.step
     steps = (
         step if bound.stored else options.resimulated_step
     ) * evaluator.hyperparameters.prior_sd
-    responses, weights = evaluator.populations(cross(theta, steps), k)
-    ends = [1, 1 + len(theta)]
+    d = len(theta)
+    thetas = cross(theta, steps)
+    if optima is not None:
+        thetas = np.vstack([thetas, optima])
+    responses, weights = evaluator.populations(thetas, k)
+    ends = [1, 1 + d, 1 + 2 * d]
     if not bound.stored:
-        center, upper, lower = np.split(responses, ends)
-        return ShiftedResponses(center[0], upper, lower, steps)
-    center, up, down = np.split(weights, ends)
+        center, upper, lower, rivals = np.split(responses, ends)
+        count = len(rivals)
+        upper = np.concatenate([upper, rivals])
+        lower = np.concatenate([lower, np.repeat(center, count, axis=0)])
+        return ShiftedResponses(center[0], upper, lower, np.append(steps, np.full(count, 0.5)))
+    center, up, down, rivals = np.split(weights, ends)
     # Difference the log weights, which are nearly parabolas, so that central differences are
     # accurate at any step. Difference the weights themselves where one vanishes within the step.
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = center * (np.log(up) - np.log(down))
     differences = np.where(np.isfinite(relative), relative, up - down)
-    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None])
+    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None], rivals)
 
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
@@ -424,13 +511,14 @@ def saddlepoint_density(
 ) -> Floats:
     """Return the log-density of a mean of zero, up to a constant, (S,), from cumulant functions.
 
-    The S convex functions of r tilts are minimised by Newton steps no longer than 1 + |a|. ``size``
-    is the number of observed specimens. The density is -inf without a saddlepoint: then zero is
-    outside of the convex hull of the scores.
+    The S convex functions of r tilts are minimised by Newton steps no longer than 1 + |a|, which
+    are shortened where a function would rise. ``size`` is the number of observed specimens. The
+    density is -inf without a saddlepoint: then zero is outside of the convex hull of the scores.
     """
     count, r = shape
     ridge = 1e-8 * size * np.eye(r)
     tilts = np.zeros(shape)
+    damping = np.ones(count)
     state = function(tilts, np.arange(count))
     limit = options.tolerance * size
     converged = np.linalg.norm(state.gradients, axis=1) < limit
@@ -443,12 +531,17 @@ def saddlepoint_density(
         steps = steps[:, :, 0]
         lengths = np.linalg.norm(steps, axis=1)
         longest = 1 + np.linalg.norm(tilts[rows], axis=1)
-        tilts[rows] -= steps * (longest / np.maximum(lengths, longest))[:, None]
-        new = function(tilts[rows], rows)
-        state.values[rows] = new.values
-        state.gradients[rows] = new.gradients
-        state.hessians[rows] = new.hessians
-        converged[rows] = np.linalg.norm(new.gradients, axis=1) < limit
+        factors = damping[rows] * longest / np.maximum(lengths, longest)
+        trials = tilts[rows] - steps * factors[:, None]
+        new = function(trials, rows)
+        falls = new.values <= state.values[rows] + 1e-9 * size
+        damping[rows] = np.where(falls, np.minimum(2 * damping[rows], 1), damping[rows] / 4)
+        rows = rows[falls]
+        tilts[rows] = trials[falls]
+        state.values[rows] = new.values[falls]
+        state.gradients[rows] = new.gradients[falls]
+        state.hessians[rows] = new.hessians[falls]
+        converged[rows] = np.linalg.norm(new.gradients[falls], axis=1) < limit
     signs, log_dets = np.linalg.slogdet(state.hessians / size)
     is_usable = converged & (signs > 0) & (log_dets > r * np.log(options.smallest_variance))
     return np.where(is_usable, state.values - log_dets / 2, -np.inf)
@@ -480,7 +573,7 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
 
     A hyperparameter without influence has a score of zero, and two that only act together have
     proportional scores. Neither enters the density, so that their posterior is their prior given
-    the others.
+    the optima.
     """
     tolerance = options.smallest_eigenvalue
     spread = np.sqrt(np.diag(covariance))

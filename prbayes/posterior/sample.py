@@ -12,16 +12,17 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
-from prbayes._validate import Seed, positive_integer, seed_number
+from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
-from prbayes.model.specimen_audit import audited
+from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.numerics.modes import Laplace, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.optimum import Optimum, point_text
 from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
 from prbayes.posterior.results import Chains, require_selection, selected
@@ -62,6 +63,9 @@ def sample(
     With a metric, the posterior is prior times density of the metric's own estimate. The density is
     a saddlepoint approximation [2]_. It is that of the score if the gradient is a mean over
     specimens (PR, the Kullback-Leibler divergence), else of refits of synthetic data sets.
+
+    If the posterior has several modes, the difference of the discrepancy between their optima is
+    part of the estimate, and the finding ``second-mode`` has the share of the draws near each.
 
     Parameters
     ----------
@@ -164,13 +168,52 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             if chains is None:
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
-            latest = audited(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+            latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
             if not refine_at(latest, thetas[:THETAS]) and latest is evaluator:
                 break
             evaluator = latest
         if chains is None:
             return smc.sample(evaluator, settings)
+        if modes is not None:
+            modal = mode_findings(target, modes, chains.thetas)
+            chains = replace(chains, findings=report(*modal))
         return result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
+
+
+def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[Finding]:
+    """Report the share of draws, (..., d), around each mode, if two or more have 1 % of them.
+
+    A draw belongs to the mode that is nearest in standard deviations.
+    """
+    thetas = draws.reshape(-1, draws.shape[-1])
+    separate: list[Laplace] = []
+    for mode in sorted(modes, key=lambda mode: -mode.log_mass):
+        if all(_has_valley(target, mode.mode, better.mode) for better in separate):
+            separate.append(mode)
+    factors = [np.linalg.inv(np.linalg.cholesky(mode.covariance)) for mode in separate]
+    pairs = zip(separate, factors, strict=True)
+    distances = [np.linalg.norm((thetas - mode.mode) @ root.T, axis=1) for mode, root in pairs]
+    shares = np.bincount(np.argmin(distances, axis=0), minlength=len(separate)) / len(thetas)
+    parts = [
+        f"{share:.0%} near {point_text(target.evaluator, mode.mode)}"
+        for mode, share in zip(separate, shares, strict=True)
+        if share >= 0.01
+    ]
+    if len(parts) < 2:
+        return []
+    text = (
+        f"The posterior has {len(parts)} modes, with shares of the draws: {'; '.join(parts)}. "
+        "Means and standard deviations over all draws describe none of them; report each, or state "
+        "a prior that excludes the others."
+    )
+    return [Finding("second-mode", text, "optimum_or_abc.md#two-answers")]
+
+
+def _has_valley(target: Target, a: Floats, b: Floats) -> bool:
+    """Return whether the log-density falls by one below both modes on the line between them."""
+    line = a + np.linspace(0, 1, 21)[:, None] * (b - a)
+    heights = target.log_posterior(line)
+    return bool(heights.min() < min(heights[0], heights[-1]) - 1)
 
 
 def modes_of(target: Target) -> list[Laplace] | None:

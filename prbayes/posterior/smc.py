@@ -348,7 +348,7 @@ def result_of(
     """Return the DataTree of chains, with discrepancies if these cost no response."""
     kind = settings.kind(evaluator)
     is_estimate = kind is Likelihood.ESTIMATE
-    findings: list[Finding] = []
+    findings = [*chains.findings]
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
         text = (
@@ -373,8 +373,10 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            # Leave out few-specimens, because draws are as wide as few specimens make them.
-            findings += [f for f in optimum.findings if f.code != "few-specimens"]
+            # Leave out few-specimens, because draws are as wide as few specimens make them. Shares
+            # of modes take the place of the optimum's finding.
+            left_out = {"few-specimens", *(finding.code for finding in chains.findings)}
+            findings += [f for f in optimum.findings if f.code not in left_out]
             if is_estimate:
                 findings += prior_conflicts(optimum, evaluator, thetas)
         else:

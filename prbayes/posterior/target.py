@@ -23,12 +23,13 @@ from scipy.special import ndtri
 
 from prbayes._finding import Finding
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats, Indices
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import (
     SamplingDistribution,
     needs_refits,
+    objectives,
     refit,
     summary_obstacle,
 )
@@ -56,6 +57,11 @@ from prbayes.posterior.saddlepoint import (
     estimate_likelihood,
     saddlepoint_density,
     score_obstacle,
+)
+
+# what works where the density of an estimate is not known
+_REMEDY = (
+    "use prb.LogLikelihood(), or draw from the discrepancy with prb.sample_smc(adjustment=None)"
 )
 
 
@@ -198,7 +204,8 @@ class RefitLikelihoodOptions:
     # weighs in the moments
     prior_sets: float = 1.0
     reach: float = 10.0  # largest distance of an estimate from the observed one, in standard errors
-    far: float = 0.1  # largest share of estimates beyond the reach
+    # Largest share of estimates beyond the reach. The rest, 256 by default, decides on the density.
+    far: float = 0.75
     converged: float = 0.9  # smallest share of refits that converge
     # Number of repeated minimisations of metrics of several outputs, whitened by the population at
     # the previous estimate
@@ -220,10 +227,13 @@ class RefitLikelihood:
     scale: Floats  # (d,): unit of each element for `laplace`
     options: RefitLikelihoodOptions
     # Synthetic data sets, none if the data identify nothing: numbers of specimens at the stored
-    # responses, (R, M_j) by group; estimates in coordinates of the first center, (R, r); and log-
-    # densities in the mixture of all populations, (R,)
+    # responses, (R, M_j) by group; estimates in coordinates of the first center, and the
+    # standardised differences of the discrepancy between the other centers and it, (R', r), of the
+    # data sets with an estimate near the observed one; which these are, (R,); and log-densities in
+    # the mixture of all populations, (R,)
     counts: tuple[csr_array, ...] = ()
     estimates: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    is_near: Bools = field(default_factory=lambda: np.empty(0, dtype=bool))
     log_mixture: Floats = field(default_factory=lambda: np.empty(0))
 
     @one_thread()
@@ -240,13 +250,18 @@ class RefitLikelihood:
             block = x[first : first + rows]
             # logs: log weights of the data sets, up to a constant of each row
             logs = _log_likelihoods(sampling, self.counts, block) - self.log_mixture
-            is_supported = np.isfinite(logs).any(axis=1)
+            near = logs[:, self.is_near]
+            is_supported = np.isfinite(near).any(axis=1)
             values = np.full(len(block), -np.inf)
             if is_supported.any():
+                logs, near = logs[is_supported], near[is_supported]
                 shifts = nearest(self.centers, sampling.thetas(block[is_supported]))[1]
                 values[is_supported] = extended_log_density(
-                    logs[is_supported], self.estimates, shifts, self.options
+                    near, self.estimates, shifts, self.options
                 )
+                # The density near the observed estimate is that of the estimates there times their
+                # probability. Others are at an edge or another optimum.
+                values[is_supported] += log_sum_exp(near) - log_sum_exp(logs)
             result[first : first + rows] = values
         return result
 
@@ -263,16 +278,16 @@ def extended_log_density(
 ) -> Floats:
     """Return the log-density of an estimate of zero, (S,), given log weights (S, R) of estimates.
 
-    The weights are known up to a factor.
+    The weights are known up to a factor. The last columns of estimates may be further statistics.
 
-    The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
+    The cumulant function is that of the weighted estimates, mixed with that of a normal
     distribution with their moments. A few data sets with a scatter of one standard error are added
     to the moments, in case few of the synthetic ones have weights. ``shifts``, (S, r), are the
-    populations relative to the observed estimate.
+    populations relative to the observed estimate, without further statistics.
     """
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
-    untilted = cumulants([log_weights], scores, np.zeros_like(shifts))
+    untilted = cumulants([log_weights], scores, np.zeros((len(shifts), r)))
     log_weights = log_weights - untilted.values[:, None]  # so that the weights sum to one
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
     part = effective / (effective + options.prior_sets * (r + 1))
@@ -298,7 +313,7 @@ def extended_log_density(
             mixed.append(weight * of_sets + (1 - weight) * of_normal)
         return Cumulants(*mixed)
 
-    logs = saddlepoint_density(function, shifts.shape, 1, options.saddlepoint)
+    logs = saddlepoint_density(function, (len(shifts), r), 1, options.saddlepoint)
     normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
     return np.where(np.isfinite(logs), logs, normal)
 
@@ -372,13 +387,30 @@ def refit_likelihood(
         populations, counts, estimates = zip(*drawn, strict=True)
         joined = tuple(vstack(parts, format="csr") for parts in zip(*counts, strict=True))
         logs = _log_likelihoods(sampling, joined, np.concatenate(populations))
+        near, is_near = near_statistics(np.concatenate(estimates), r, sampling.noise)
         likelihood = replace(
             likelihood,
             counts=joined,
-            estimates=np.concatenate(estimates),
+            estimates=near,
+            is_near=is_near,
             log_mixture=log_sum_exp(logs.T),
         )
     return likelihood
+
+
+def near_statistics(statistics: Floats, r: int, noise: float) -> tuple[Floats, Bools]:
+    """Return the statistics of data sets whose estimate is near the observed one, and which are.
+
+    Which center fits a data set better is a statistic beside the r coordinates of the estimate.
+    Without it populations at another optimum would count like those at the best, however much worse
+    they fit.
+    """
+    is_near = np.isfinite(statistics).all(axis=1)
+    estimates, differences = np.split(statistics[is_near], [r], axis=1)
+    spread = differences.std(axis=0)
+    # A difference below a tenth of the noise comes from the stored responses.
+    varies = spread > 0.1 * noise
+    return np.hstack([estimates, differences[:, varies] / spread[varies]]), is_near
 
 
 def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
@@ -412,7 +444,12 @@ def _draw(
     *,
     is_linear: bool,
 ) -> tuple[Floats, list[csr_array], Floats]:
-    """Draw and refit data sets at coordinates, (R, r); return these, counts and estimates."""
+    """Draw and refit data sets at coordinates, (R, r).
+
+    Returns these, counts, and statistics, (R, r + C - 1): estimates, which are NaN where they are
+    far, and the discrepancy at the other centers less that at the first one, less the same for the
+    observed responses.
+    """
     sampling = centers[0]
     evaluator = sampling.evaluator
     thetas = sampling.thetas(x)
@@ -423,7 +460,7 @@ def _draw(
     if is_supported.mean() < 0.5:
         raise ValueError(
             f"got stored responses that support {is_supported.mean():.0%} of the populations "
-            "around the estimate, expected at least half; widen the prior, or use prb.sample_smc"
+            f"around the estimate, expected at least half; widen the prior, or {_REMEDY}"
         )
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
@@ -437,15 +474,20 @@ def _draw(
         converged = np.ones(len(estimates), dtype=bool)
     else:
         estimates, converged = refit(sampling, data, starts, is_rough=True)
-    if converged.mean() < options.converged:
-        raise ValueError(
-            f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
-            f"least {options.converged:.0%}; use another metric, or prb.sample_smc"
-        )
     is_far = np.abs(estimates).max(axis=1) > options.reach
     if is_far.mean() > options.far:
         raise ValueError(_at_edge(f"{is_far.mean():.0%} of the estimates of synthetic data sets"))
-    estimates = np.clip(estimates, -options.reach, options.reach)
+    estimates[is_far] = np.nan
+    converged |= is_far
+    if converged.mean() < options.converged:
+        raise ValueError(
+            f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
+            f"least {options.converged:.0%}; {_REMEDY}"
+        )
+    if len(centers) > 1:
+        at = np.array([center.theta for center in centers])
+        totals = objectives(sampling, data, at) - objectives(sampling, observed_set(evaluator), at)
+        estimates = np.hstack([estimates, totals[:, 1:] - totals[:, :1]])
     return x[converged], [count[converged] for count in counts], estimates[converged]
 
 
@@ -486,7 +528,7 @@ def _at_minimiser(
             return moved
     raise ValueError(
         "got an estimate that still moves by half a standard error when it is minimised again, "
-        "expected a minimum; use another metric, or prb.sample_smc"
+        f"expected a minimum; {_REMEDY}"
     )
 
 
@@ -531,5 +573,5 @@ def _moved_inside(
 def _at_edge(subject: str) -> str:
     return (
         f"got {subject} at an edge, such as a standard deviation of zero, where estimates have no "
-        "density; use prb.LogLikelihood(), or prb.sample_smc"
+        f"density; {_REMEDY}"
     )

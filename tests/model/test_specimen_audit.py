@@ -9,7 +9,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_audit import audited
+from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.propagation.base import DesignError
 
 # Beside a pole, or a period away, the emulator without runs has inputs that do not exist.
@@ -73,7 +73,7 @@ def test_a_smooth_response_needs_no_further_run() -> None:
     thetas = evaluator.hyperparameters.prior_thetas(100, 0)
     evaluator.log_other(thetas)
     n_runs = evaluator.n_responses
-    assert audited(evaluator, thetas, is_last=True) is evaluator
+    assert audited_evaluator(evaluator, thetas, is_last=True) is evaluator
     assert evaluator.n_responses == n_runs
 
 
@@ -83,4 +83,4 @@ def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
     thetas = np.stack([np.full(32, -0.7), np.full(32, np.log(0.2))], axis=1)
     evaluator.log_other(thetas)
     with pytest.raises(DesignError, match=r"not smooth enough.*an emulator of \d+ runs that would"):
-        audited(evaluator, thetas, is_last=True)
+        audited_evaluator(evaluator, thetas, is_last=True)

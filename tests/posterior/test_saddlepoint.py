@@ -21,6 +21,7 @@ from normal_posterior import (
     require_close,
 )
 from scipy import stats
+from scipy.optimize import brentq
 
 import prbayes as prb
 from prbayes._finding import from_json
@@ -140,6 +141,14 @@ def test_the_mean_score_is_the_gradient(metric: Metric) -> None:
     steps = 1e-5 * population.slopes
     up, down = (target(population.responses, population.weights + s * steps) for s in (1, -1))
     np.testing.assert_allclose(found, (up - down) / 2e-5, rtol=1e-4)
+    # At other optima the score is the difference of the discrepancy.
+    others = np.random.default_rng(4).dirichlet(np.ones(3000), 2)
+    pair = replace(population, optima=others)
+    further = specimen_scores(target, pair, observed).mean(axis=0)[-2:]
+    base = target(population.responses, population.weights)
+    expected = np.array([target(population.responses, w) - base for w in others])
+    # The score of a log-density is limited beyond the data.
+    np.testing.assert_allclose(further, expected, rtol=1e-6)
 
 
 def test_the_score_of_the_divergence_is_constant_beyond_the_data() -> None:
@@ -169,6 +178,22 @@ def test_weights_are_those_of_responses_that_can_be_observed() -> None:
     expected = weights[:, is_observable] / weights[:, is_observable].sum(axis=1, keepdims=True)
     np.testing.assert_allclose(np.exp(log_weights), expected)
     np.testing.assert_allclose(scores.values[:, 0], 2 * values[:, 0] - values[:, 1])
+
+
+def test_newton_steps_that_would_cycle_are_shortened() -> None:
+    """A remote atom has 1e-4 of the mass; the tilted mean of one lies between it and the rest."""
+    scores = np.append(stats.norm.ppf((np.arange(1000) + 0.5) / 1000), 30.0) - 1.0
+    logs = np.log(np.append(np.full(1000, 0.9999 / 1000), 1e-4))[None]
+    log_l = log_density([logs], [Scores(scores[:, None], 1)])
+
+    def slope(tilt: float) -> float:
+        weights = np.exp(logs[0] + tilt * scores)
+        return float(weights @ scores / weights.sum())
+
+    tilt = brentq(slope, 0, 1)
+    weights = np.exp(logs[0] + tilt * scores)
+    variance = weights @ scores**2 / weights.sum()
+    assert log_l[0] == pytest.approx(np.log(weights.sum()) - np.log(variance) / 2, abs=1e-6)
 
 
 # -- posteriors --

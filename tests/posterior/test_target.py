@@ -278,13 +278,52 @@ def test_outputs_with_gaps() -> None:
         assert 0.9 < draws[name].std() / error < 1.5
 
 
-def test_an_estimate_at_an_edge_is_refused() -> None:
+def test_an_estimate_at_an_edge_is_refused_with_a_remedy_that_works() -> None:
     optimum = mean_optimum()
     edge = replace(optimum, search=replace(optimum.search, at_edge=("mu",)))
-    with pytest.raises(ValueError, match="got mu at an edge"):
+    with pytest.raises(ValueError, match=r"got mu at an edge.*sample_smc\(adjustment=None\)"):
         refit_likelihood(optimum.evaluator, edge)
     with pytest.raises(ValueError, match="estimates of synthetic data sets at an edge"):
-        mean_likelihood(reach=0.5)
+        mean_likelihood(reach=0.2)
+    tree = prb.sample_smc(50, chains=1, model=optimum.model, adjustment=None, progressbar=False)
+    assert np.isfinite(tree.posterior["mu"]).all()
+
+
+def test_estimates_that_are_far_away_leave_the_density_near_the_observed_one() -> None:
+    """Half of the data sets have an estimate that is far; the posterior is the exact one."""
+    likelihood = mean_likelihood(reach=1.5, n_sets=1024)
+    assert 0.25 < likelihood.is_near.mean() < 0.75
+    precision = 1 / 0.2**2 + 12 / SD**2
+    mean = (1.3 / 0.2**2 + Y12.sum() / SD**2) / precision
+    require_normal(posterior(likelihood)["mu"], mean, precision**-0.5)
+
+
+def cubic(x: Any) -> Any:
+    """Return a response with two roots, at which its slopes differ."""
+    return (x - 1) ** 2 + 0.2 * (x - 1) ** 3
+
+
+# Shares of the mode below one by the exact likelihood; without the difference of the discrepancy
+# all are about a half.
+@pytest.mark.parametrize(
+    ("metric", "seed", "share", "error"),
+    [(KLD, 0, 0.13, 0.06), (KLD, 1, 0.988, 0.05), (KLD, 2, 0.005, 0.05), (AREA, 2, 0.005, 0.05)],
+)
+def test_modes_that_fit_worse_have_less_of_the_posterior(
+    metric: Metric, seed: int, share: float, error: float
+) -> None:
+    y = cubic(np.random.default_rng(seed).normal(2, 0.3, 20))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        simulate(x, response=cubic, observed=y, metric=metric, propagation=prb.Reweighted(1024))
+    tree = prb.sample(500, model=model, **QUIET)
+    below = float((tree.posterior["mu"] < 1).mean())
+    assert below == pytest.approx(share, abs=error)
+    codes = [finding.code for finding in prb.diagnose(tree, model=model).findings]
+    if seed == 0:  # the printed result has the shares
+        assert "second-mode" in codes
+        text = repr(prb.diagnose(tree, model=model))
+        assert f"2 modes, with shares of the draws: {1 - below:.0%} near mu = " in text
 
 
 def test_the_extended_density_of_normal_estimates() -> None:
