@@ -17,7 +17,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
@@ -467,13 +467,18 @@ class SpecimenPopulations:
         d = names.size
 
         def log_likelihood(thetas: Floats) -> Floats:
+            # Populations are evaluated in blocks, so that memory stays bounded with many specimens.
+            blocks = np.array_split(thetas, 1 + len(thetas) * len(z) // (4 * AT_ONCE))
+            total = np.concatenate([of_block(block) for block in blocks])
+            return total if share is None else total - self.log_share(thetas, share)
+
+        def of_block(thetas: Floats) -> Floats:
             logs = self.log_likelihoods(thetas, z, log_a, smoothing)
             if self.likelihood.measurements[0].gross_errors is not False:
                 # With a share of 10 % gross errors, outliers have no influence on the population.
                 log_gross = np.log(0.1) + self.likelihood.stacked.log_gross
                 logs = np.logaddexp(np.log(0.9) + logs, log_gross)
-            total = logs.sum(axis=1)
-            return total if share is None else total - self.log_share(thetas, share)
+            return np.asarray(logs.sum(axis=1))
 
         thetas = names.prior_points(2048, seed)
         log_weights = log_posterior(names, thetas, log_likelihood) - names.log_prior(thetas)

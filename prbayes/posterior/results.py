@@ -144,15 +144,10 @@ def _calibration(
             records[k]["required_ess"] = node.reweighted.required_ess
     if evaluator.measurements:
         failing = failing_share(evaluator, rows.mean(axis=0))
-        if log_likelihoods is None:
-            log_likelihoods = _log_likelihood_by_specimen(evaluator, chains)
+        totals = _log_likelihood_totals(evaluator, rows, log_likelihoods)
     for k, measurement in enumerate(evaluator.measurements, start=n_nodes):
         name = measurement.name
-        # Of simulators that share specimens the last one has their log-likelihood.
-        if log_likelihoods is not None and name in log_likelihoods:
-            discrepancies[:, :, k] = -log_likelihoods[name].sum(axis=-1)
-        else:
-            discrepancies[:, :, k] = 0.0
+        discrepancies[:, :, k] = -totals[name].reshape(n_chains, n_draws)
         records[k] |= unknown | {
             "epsilon": 1.0,
             "failing_share": failing.get(name, np.nan),
@@ -202,7 +197,7 @@ def arviz_groups(evaluator: Evaluator, chains: Chains, seed: int | None) -> dict
     groups = {
         "prior": _variables(evaluator, prior),
         "log_prior": xr.Dataset(variables, coords=coords),
-        "log_likelihood": log_likelihood(evaluator, chains).assign_coords(coords),
+        "log_likelihood": log_likelihood(evaluator, chains),
     }
     posterior_predictive = predictive(evaluator, thetas, rng)
     prior_predictive = predictive(evaluator, prior, rng)
@@ -243,16 +238,21 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
             ),
             "other_terms": (dims, other_terms.reshape(shape)),
         },
+        coords={"chain": np.arange(n_chains), "draw": np.arange(n_draws)},
         attrs={"note": note},
     )
 
 
 def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
-    """Return the log-likelihood of each specimen, by draw."""
+    """Return the log-likelihood of each specimen, by draw; of thousands of specimens thinned."""
     n_chains, n_draws, d = chains.thetas.shape
-    values = specimen_log_likelihoods(evaluator, chains.thetas.reshape(-1, d))
+    specimens = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+    # Diagnostics of a specimen need more draws than a predictive distribution.
+    thinned = _thinned(n_draws, n_chains * specimens / 4)
+    thetas = chains.thetas[:, thinned]
+    values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)
-    coords = {}
+    coords: dict[str, Any] = {"chain": np.arange(n_chains), "draw": thinned}
     variables = {}
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name
@@ -261,8 +261,30 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
         if labels is not None:  # the numbers are those of specimens, not of readings
             dim = f"{name}_specimen"
             coords[dim] = labels
-        variables[name] = (["chain", "draw", dim], values[name].reshape(n_chains, n_draws, -1))
+        variables[name] = (["chain", "draw", dim], values[name].reshape(*thetas.shape[:2], -1))
     return xr.Dataset(variables, coords=coords)
+
+
+def _log_likelihood_totals(
+    evaluator: Evaluator, rows: Floats, by_specimen: xr.Dataset | None
+) -> dict[str, Floats]:
+    """Return the log-likelihood of all specimens by simulator at thetas, (S, d) -> (S,).
+
+    Those ``by_specimen`` are summed if they have all draws. Of simulators that share specimens the
+    last one has their log-likelihood, and the others have zeros.
+    """
+    totals = {m.name: np.zeros(len(rows)) for m in evaluator.measurements}
+    if by_specimen is not None and by_specimen.sizes["chain"] * by_specimen.sizes["draw"] == len(
+        rows
+    ):
+        sums = {name: logs.sum(str(logs.dims[-1])) for name, logs in by_specimen.data_vars.items()}
+        return totals | {str(name): total.values.ravel() for name, total in sums.items()}
+    step = max(1, AT_ONCE // sum(len(likelihood.readings) for likelihood in evaluator.likelihoods))
+    for first in range(0, len(rows), step):
+        block = slice(first, first + step)
+        for name, logs in specimen_log_likelihoods(evaluator, rows[block]).items():
+            totals[name][block] = logs.sum(axis=1)
+    return totals
 
 
 def _emulated_responses(
@@ -282,7 +304,7 @@ def _emulated_responses(
     return labelled_responses(evaluator, responses, leading).assign_coords(draw=thinned)
 
 
-def _thinned(draws: int, size: int) -> Indices:
+def _thinned(draws: int, size: float) -> Indices:
     """Return the draws for which ``size`` numbers each fit into memory."""
     return np.arange(draws)[:: max(1, math.ceil(draws * size / AT_ONCE))]
 

@@ -69,16 +69,18 @@ class WeightedPoints:
         terms = np.vstack([form.statistics, np.maximum(base, -1e300)]).T
         parameters = np.vstack([natural.T, np.ones(len(natural))])
         result = np.empty((n, len(natural)))
+        # Blocks of specimens and populations whose exponents stay in the cache of the processor.
         step = max(64, IN_CACHE // 4 // log_a.size)
-        rows = max(1, IN_CACHE // 4 // (step * n))
-        for first in range(0, len(natural), step):
-            block = parameters[:, first : first + step]
-            total: Any = -np.inf
-            for k in range(0, count, rows):
-                exponents = terms[k * n : (k + rows) * n] @ block
-                part = _log_sum_exp_first(exponents.reshape(-1, n, block.shape[1]))
-                total = np.logaddexp(total, part) if k else part
-            result[:, first : first + step] = total
+        size = max(1, IN_CACHE // 4 // (step * count))
+        by_specimen = terms.reshape(count, n, -1)
+        for start in range(0, n, size):
+            rows = slice(start, start + size)
+            of_rows = by_specimen[:, rows].reshape(-1, terms.shape[1])
+            for first in range(0, len(natural), step):
+                columns = slice(first, first + step)
+                exponents = of_rows @ parameters[:, columns]
+                by_point = exponents.reshape(count, -1, exponents.shape[1])
+                result[rows, columns] = _log_sum_exp_first(by_point)
         if is_rounded.any():
             narrow = [parent[is_rounded] for parent in parents]
             result[:, is_rounded] = self._by_graph(narrow).T

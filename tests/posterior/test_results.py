@@ -263,6 +263,27 @@ def test_many_predictive_draws_are_thinned(monkeypatch: pytest.MonkeyPatch) -> N
     assert responses.coords["draw"].values[:3].tolist() == [0, 4, 8]
 
 
+def test_log_likelihoods_of_many_specimens_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = np.random.default_rng(1).normal(1.0, 0.5, 20)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", lambda x: 2 * x, x, observed=2 * data)
+    whole = prb.sample(1000, chains=2, model=model, **QUIET)
+    monkeypatch.setattr(results, "AT_ONCE", 2 * 1000 * 20 // 16)
+    thinned = prb.sample(1000, chains=2, model=model, **QUIET)
+    assert thinned.log_likelihood.coords["draw"].values[:3].tolist() == [0, 4, 8]
+    np.testing.assert_array_equal(
+        thinned.log_likelihood["y"], whole.log_likelihood["y"].sel(draw=slice(None, None, 4))
+    )
+    # The sum over all specimens is that of every draw.
+    sums = -whole.log_likelihood["y"].sum("y_dim_0").values
+    for tree in (whole, thinned):
+        values = tree.calibration["discrepancy"].values[..., 0]
+        np.testing.assert_allclose(values, sums, rtol=1e-12)
+    assert prb.diagnose(thinned, model=model).findings == ()
+    assert az.loo(thinned).elpd == pytest.approx(az.loo(whole).elpd, abs=0.5)
+
+
 def test_points_without_a_response_are_never_drawn() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
