@@ -3,7 +3,8 @@
 Each measurement is a process of its own. ``n`` is the size of one population, evaluated at eight
 thetas; the design of `Reweighted` is set up once, with a mixture density of 512 components.
 ``particles`` are evaluated in one call, as the sampler does, and sampled. Peak memory is that of the
-whole process, of which importing takes the part that is stated. Times are CPU seconds. ``tasks``
+whole process, of which importing takes the part that is stated. ``specimens`` has the posterior of so
+many by `prb.sample`, with the log-likelihood by specimen. Times are CPU seconds. ``tasks``
 sends responses that cost nothing, each a task of its own, to a Dask cluster of two processes on the
 loopback interface: what a task costs the client, the scheduler and a worker together.
 
@@ -86,6 +87,23 @@ def measure(kind: str, metric: str, size: int) -> dict[str, float]:
     return row | {"MiB": peak(), "responses": evaluator.n_responses}
 
 
+def measure_specimens(size: int) -> dict[str, float]:
+    """Measure the posterior by the log-likelihood by specimen in this process."""
+    import pymc as pm
+
+    import prbayes as prb
+
+    before = peak()
+    data = np.random.default_rng(1).normal(1.0, 0.5, size)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", lambda x: 2 * x, x, observed=2 * data)
+    clock = time.process_time()
+    mean = float(prb.sample(model=model, random_seed=1, progressbar=False).posterior["mu"].mean())
+    row = {"import MiB": before, "s": time.process_time() - clock, "MiB": peak()}
+    return row | {"standard errors off": (mean - data.mean()) / data.std() * np.sqrt(size)}
+
+
 class _Unsized:
     """An executor without a size, which gets as many tasks at a time as a large cluster would."""
 
@@ -129,11 +147,14 @@ def row(cell: str, number: int) -> dict[str, float]:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         if kind == "tasks":
             return pool.submit(measure_tasks, int(case[0])).result()
+        if kind == "specimens":
+            return pool.submit(measure_specimens, int(case[0])).result()
         return pool.submit(measure, kind, case[0], int(case[1])).result()
 
 
 CELLS = [f"{kind}/{metric}/{n}" for kind, metric in product(SIZES, METRICS) for n in SIZES[kind]]
-STUDY = Study("scale", __doc__, [*CELLS, "tasks/10000"], row, 1)
+SPECIMENS = ["specimens/10000", "specimens/100000"]
+STUDY = Study("scale", __doc__, [*CELLS, *SPECIMENS, "tasks/10000"], row, 1)
 
 if __name__ == "__main__":
     STUDY.main()

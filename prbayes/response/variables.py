@@ -155,7 +155,7 @@ def _opened_function(function: FunctionType) -> Opened:
     for variable, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         with suppress(ValueError):  # the variable has no value yet
             closure[variable] = cell.cell_contents
-    parts = [*vars(function).items()]
+    parts = [(k, v) for k, v in vars(function).items() if k != "__signature__"]
     parts += [("defaults", x) for x in (function.__defaults__, function.__kwdefaults__)]
     name = f"function {function.__module__}.{function.__qualname__}"
     if not _is_own(str(function.__module__)):
@@ -215,7 +215,8 @@ def _attributes(value: object) -> dict[str, Any]:
     for slot in _slots(kind):
         with suppress(AttributeError):  # the attribute has no value yet
             attributes.setdefault(slot.__name__, slot.__get__(value))
-    return attributes
+    # A signature is kept at its first look, and the dictionary has the attributes above.
+    return {k: v for k, v in attributes.items() if k not in ("__signature__", "__dict__")}
 
 
 # -- changes ---------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from prbayes.decision import sensitivity as module
 from prbayes.decision.populations import Populations
 from prbayes.decision.sensitivity import (
     Copula,
-    Indices,
+    SensitivityIndices,
     derivative_bound,
     first_order,
     input_indices,
@@ -139,17 +139,17 @@ def matched(seed: int = 0) -> tuple[Floats, list[Floats], list[Floats]]:
 
 
 @pytest.fixture(scope="module")
-def indices() -> Indices:
+def indices() -> SensitivityIndices:
     here, same, other = matched()
     y = ishigami(here)
     rows = [
         [first_order(y, ishigami(a)), total_order(y, ishigami(b)), np.zeros(R)]
         for a, b in zip(same, other, strict=True)
     ]
-    return Indices.of_replicates(np.array(rows))
+    return SensitivityIndices.of_replicates(np.array(rows))
 
 
-def test_ishigami_beside_closed_forms_and_salib(indices: Indices) -> None:
+def test_ishigami_beside_closed_forms_and_salib(indices: SensitivityIndices) -> None:
     off = np.abs(indices.values[:2] - [FIRST, TOTAL])
     assert (off < 5 * indices.errors[:2]).all()
     assert (indices.errors < 0.01).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import json
 import logging
 import os
@@ -26,6 +27,7 @@ import pytensor
 import pytensor.tensor as pt
 import pytest
 import scipy.interpolate
+from scipy.special import zetac
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
@@ -535,6 +537,18 @@ def test_a_look_at_a_table_and_other_variables_are_no_change() -> None:
     assert not stored.may_differ
     names["np"] = types.SimpleNamespace(sin=np.cos)
     assert stored.may_differ
+
+
+@pytest.mark.parametrize("function", [np.float_power, np.heaviside, zetac, np.vectorize(abs)])
+def test_a_look_at_a_signature_is_no_change(function: Any) -> None:
+    def response(x: Any) -> Any:
+        return function(x)
+
+    digests = digests_of(response)
+    # Functions of arrays keep their signature as an attribute, and their dictionary begins.
+    inspect.signature(function)
+    repr(function)
+    assert not changed_names(digests, digests_of(response))
 
 
 @pytest.mark.parametrize("kind", ["counter", "generator", "last"])
