@@ -416,7 +416,7 @@ def scale() -> Iterator[Row]:
     }
     for cell, row in single("scale").items():
         kind, metric, *size = cell.split("/")
-        if kind == "tasks":
+        if kind in ("tasks", "specimens"):
             continue
         n = int(size[0])
         name = f"`{names[kind].format(n)}`"
