@@ -45,8 +45,11 @@ def _audited_likelihood(
 
     A smaller share of the inputs than ``least_share`` may have an uncertain emulator.
     """
-    emulation, readings = prepared(likelihood).emulation, likelihood.readings
-    if likelihood.calls_response or emulation.offsets is not None:
+    preparation, readings = prepared(likelihood), likelihood.readings
+    emulation = preparation.emulation
+    # Spurious inputs form a narrow population only if readings determine the inputs.
+    is_open = preparation.proposals.is_open()
+    if likelihood.calls_response or emulation.offsets is not None or is_open:
         return likelihood
 
     def uncertainty(z: Floats) -> Floats:
@@ -54,7 +57,7 @@ def _audited_likelihood(
         return (np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1)
 
     runs = likelihood.options.sampled
-    points = prepared(likelihood).points.z[:, ::4]  # a mode has at least eight points
+    points = preparation.points.z[:, ::4]  # a mode has at least eight points
     if (uncertainty(points.reshape(-1, points.shape[2])) <= 1.0).all():
         return likelihood
     z = _likely_inputs(likelihood, thetas)

@@ -107,8 +107,9 @@ def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     assert at <= len(before) < len(expected)
     assert finished(tmp_path / "b") == once
     calls = (tmp_path / "b" / "calls").read_text().splitlines()
-    assert len(expected) - len(set(expected)) <= 3  # runs that are computed again
+    # A state is sought at random places of the batch: three of 32 runs, four of 100.
+    assert len(expected) - len(set(expected)) <= 4
     # Three stored ones are computed again at each start, as no version says that the response is the
     # same. A kill may fall between the end of a response and its record: then that one is, too.
-    assert len(calls) - len(set(calls)) <= 3 + 3 + 1
+    assert len(calls) - len(set(calls)) <= 4 + 3 + 1
     assert set(calls) == set(expected)
