@@ -72,8 +72,8 @@ class WeightSlopes:
         count = len(self.optima)
         if not count:
             return upper, lower, steps
-        rivals = basis.features(self.optima)
-        upper = [np.concatenate(pair) for pair in zip(upper, rivals, strict=True)]
+        at_optima = basis.features(self.optima)
+        upper = [np.concatenate(pair) for pair in zip(upper, at_optima, strict=True)]
         lower = [
             np.concatenate([rows, np.repeat(feature, count, axis=0)])
             for rows, feature in zip(lower, features, strict=True)

@@ -105,6 +105,8 @@ def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:
     count = int(np.clip(2**15 // len(likelihood.readings), 16, 256))
     rows = np.unique(np.linspace(0, len(thetas) - 1, count).round().astype(int))
     values = variables_at(likelihood.hyperparameters, thetas[rows])
-    inputs, _ = draw_inputs(likelihood, np.random.default_rng(0), values)
+    inputs, is_gross = draw_inputs(likelihood, np.random.default_rng(0), values, as_read=True)
     z = likelihood.coordinates.of([x.reshape(-1, *x.shape[2:]) for x in inputs], 1)
-    return z[np.isfinite(z).all(axis=1)]
+    # Readings with gross errors do not determine the population.
+    is_regular = np.isfinite(z).all(axis=1) & (True if is_gross is None else is_gross.ravel() < 0.5)
+    return z[is_regular]

@@ -114,7 +114,8 @@ def _with_gross_errors(
         return logs
     share = np.reshape(share, (-1, 1))
     gross = np.log(share) + likelihood.stacked.log_gross[rows]
-    return np.asarray(np.logaddexp(np.log1p(-share) + logs, gross))
+    with np.errstate(divide="ignore"):  # a share of one leaves no other specimen
+        return np.asarray(np.logaddexp(np.log1p(-share) + logs, gross))
 
 
 def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
@@ -293,13 +294,17 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
 
 
 def draw_inputs(
-    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats]
+    likelihood: SpecimenLikelihood,
+    rng: np.random.Generator,
+    values: Mapping[str, Floats],
+    *,
+    as_read: bool = False,
 ) -> tuple[list[Floats], Floats | None]:
     """Draw the inputs of each specimen given its readings, (P, S, *event) by input.
 
     Also return the probability that the readings have a gross error, (P, S), None where the model
-    has no gross errors: the inputs are then those of any specimen. Values are those of the model's
-    variables by name, (P, *shape).
+    has no gross errors: the inputs are then those of any specimen, unless the readings count
+    ``as_read``. Values are those of the model's variables by name, (P, *shape).
     """
     all_points, log_a = _array_values(likelihood)
     errors = _errors(likelihood, values)
@@ -328,7 +333,7 @@ def draw_inputs(
             places = (totals < limits).sum(axis=1)
             for drawn, points in zip(inputs, x, strict=True):
                 drawn[k, rows] = points[np.arange(len(rows)), places]
-        if probability is not None:
+        if probability is not None and not as_read:
             is_gross = rng.random((size, len(rows))) < probability[:, rows]
             population, _ = likelihood.density.sampler(parents, len(rows), rng)
             for drawn, unknown in zip(inputs, population, strict=True):

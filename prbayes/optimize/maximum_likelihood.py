@@ -104,8 +104,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         thetas = np.stack([mode.theta for mode in modes])
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
-        is_audited = [mode.value - modes[0].value < (0.0 if is_last else 6.0) for mode in modes]
-        is_audited[0] = True
+        is_audited = [mode.value - modes[0].value <= (0.0 if is_last else 6.0) for mode in modes]
         latest = audited_evaluator(evaluator, thetas[is_audited], is_last=is_last)
         if latest is evaluator:
             break

@@ -57,7 +57,7 @@ class Chains:
     # numbers `AT_BEST` by simulator.
     at_best: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
-    findings: tuple[Finding, ...] = ()  # modes, which are logged already
+    findings: tuple[Finding, ...] = ()  # findings about modes, which are logged already
 
 
 def posterior_tree(
@@ -244,7 +244,7 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
 
 
 def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
-    """Return the log-likelihood of each specimen, by draw; of thousands of specimens thinned."""
+    """Return the log-likelihood of each specimen, for all draws, or for evenly spaced ones."""
     n_chains, n_draws, d = chains.thetas.shape
     specimens = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     # Diagnostics of a specimen need more draws than a predictive distribution.
@@ -270,13 +270,12 @@ def _log_likelihood_totals(
 ) -> dict[str, Floats]:
     """Return the log-likelihood of all specimens by simulator at thetas, (S, d) -> (S,).
 
-    Those ``by_specimen`` are summed if they have all draws. Of simulators that share specimens the
-    last one has their log-likelihood, and the others have zeros.
+    The log-likelihoods ``by_specimen`` are summed if they have all draws. Of simulators that share
+    specimens the last one has their log-likelihood, and the others have zeros.
     """
     totals = {m.name: np.zeros(len(rows)) for m in evaluator.measurements}
-    if by_specimen is not None and by_specimen.sizes["chain"] * by_specimen.sizes["draw"] == len(
-        rows
-    ):
+    sizes = {} if by_specimen is None else by_specimen.sizes
+    if by_specimen is not None and sizes["chain"] * sizes["draw"] == len(rows):
         sums = {name: logs.sum(str(logs.dims[-1])) for name, logs in by_specimen.data_vars.items()}
         return totals | {str(name): total.values.ravel() for name, total in sums.items()}
     step = max(1, AT_ONCE // sum(len(likelihood.readings) for likelihood in evaluator.likelihoods))

@@ -82,8 +82,8 @@ class EstimateLikelihoodOptions:
     smallest_spread: float = 1e-4
     # Largest difference of the log mass between the best mode and another that has part of the
     # posterior, and the largest number of such modes
-    rival: float = 10.0
-    most_rivals: int = 4
+    gap: float = 10.0
+    most_modes: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,17 +214,17 @@ def estimate_likelihood(
     likelihood = _with_scores(likelihood, point[None], scales, options)
     # Populations at another mode may have a score of zero at the estimate as well. Which of them
     # fits better is then a further statistic.
-    rivals = rival_modes(likelihood, options)
-    if not len(rivals):
+    modes = further_modes(likelihood, options)
+    if not len(modes):
         return likelihood
-    minima = [minimiser_near(evaluator, mode, scales) for mode in rivals]
+    minima = [minimiser_near(evaluator, mode, scales) for mode in modes]
     likelihood = _with_scores(likelihood, np.vstack([point, *minima]), scales, options)
-    starts = np.vstack([point, rivals])
+    starts = np.vstack([point, modes])
     is_start = np.isfinite(likelihood.log_likelihood(starts))
     return replace(likelihood, starts=starts[is_start])
 
 
-def rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
+def further_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptions) -> Floats:
     """Return modes of the posterior given the score, other than the estimate's own, (J, d)."""
     evaluator, starts = likelihood.evaluator, likelihood.starts
     hyperparameters = evaluator.hyperparameters
@@ -245,11 +245,11 @@ def rival_modes(likelihood: EstimateLikelihood, options: EstimateLikelihoodOptio
     except (ValueError, np.linalg.LinAlgError):  # because the density jumps near a start
         return starts[1 : len(likelihood.starts)]
     lowest = max(mode.log_mass for mode in modes if mode.converged or mode is modes[0])
-    lowest -= options.rival
+    lowest -= options.gap
     center, *candidates = modes
     far = [m for m in candidates if m.converged and m.log_mass > lowest and center.is_apart(m)]
-    rivals = [mode.mode for mode in distinct_modes(far)[: options.most_rivals]]
-    return np.array(rivals).reshape(-1, starts.shape[1])
+    further = [mode.mode for mode in distinct_modes(far)[: options.most_modes]]
+    return np.array(further).reshape(-1, starts.shape[1])
 
 
 def _with_scores(
@@ -387,18 +387,18 @@ def _derivatives(
     responses, weights = evaluator.populations(thetas, k)
     ends = [1, 1 + d, 1 + 2 * d]
     if not bound.stored:
-        center, upper, lower, rivals = np.split(responses, ends)
-        count = len(rivals)
-        upper = np.concatenate([upper, rivals])
+        center, upper, lower, at_optima = np.split(responses, ends)
+        count = len(at_optima)
+        upper = np.concatenate([upper, at_optima])
         lower = np.concatenate([lower, np.repeat(center, count, axis=0)])
         return ShiftedResponses(center[0], upper, lower, np.append(steps, np.full(count, 0.5)))
-    center, up, down, rivals = np.split(weights, ends)
+    center, up, down, at_optima = np.split(weights, ends)
     # Difference the log weights, which are nearly parabolas, so that central differences are
     # accurate at any step. Difference the weights themselves where one vanishes within the step.
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = center * (np.log(up) - np.log(down))
     differences = np.where(np.isfinite(relative), relative, up - down)
-    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None], rivals)
+    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None], at_optima)
 
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:

@@ -141,11 +141,17 @@ def sample(
         limited(max_seconds, max_runs),
     ):
         evaluator = evaluator_of(model, optimum, "sample")
-        return selected(draw_posterior(evaluator, settings), names, keywords)
+        return selected(draw_posterior(evaluator, settings, is_audited=True), names, keywords)
 
 
-def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
-    """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed."""
+def draw_posterior(
+    evaluator: Evaluator, settings: SamplingSettings, *, is_audited: bool = False
+) -> xr.DataTree:
+    """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed.
+
+    An audit of emulators needs the data of the evaluator's model, not those of a product or
+    synthetic ones.
+    """
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
     optimum = required_optimum(evaluator, settings, "sample")
@@ -168,7 +174,9 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             if chains is None:
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
-            latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+            latest = evaluator
+            if is_audited:
+                latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
             if not refine_at(latest, thetas[:THETAS]) and latest is evaluator:
                 break
             evaluator = latest

@@ -477,12 +477,12 @@ def respond(
     store = settings.store
     if store is None or store.verified:
         return _respond(settings, points, tally, on_start)
-    _verify_store(settings, points, tally)
+    _verify_store(settings, store, points, tally)
     record = watched(settings.function)
     with record.calls():
         values = _respond(settings, points, tally, on_start)
         record.called()
-    # Variables that calls change, which a later process may find as calls have left them.
+    # Note the variables that calls change, because a later use may find them as calls left them.
     digests = record.digests()
     if None in digests.values() and digests not in stored_digests(store):
         add_digests(store, digests)
@@ -540,13 +540,11 @@ def _respond(
     return _apply_policy(settings, points, values, failed | raised, tally)
 
 
-def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
+def _verify_store(settings: CallSettings, store: Store, points: Points, tally: Tally) -> None:
     """Compute a few stored runs again, once: the function or its variables may have changed.
 
     More are computed if the store has no run of the function as it is now.
     """
-    store = settings.store
-    assert store is not None
     keys, values = store.known()
     stored_points, is_comparable = points.read_keys(keys)
     is_comparable[list(store.failed(keys))] = False

@@ -10,6 +10,7 @@ import pytest
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_audit import audited_evaluator
+from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 
 # Beside a pole, or a period away, the emulator without runs has inputs that do not exist.
@@ -84,3 +85,34 @@ def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
     evaluator.log_other(thetas)
     with pytest.raises(DesignError, match=r"not smooth enough.*an emulator of \d+ runs that would"):
         audited_evaluator(evaluator, thetas, is_last=True)
+
+
+def test_synthetic_data_of_the_emulator_are_not_audited() -> None:
+    calls: list[int] = []
+    response, *priors, x = PROBLEMS["period"]
+
+    def counted(x: Any) -> Any:
+        calls.append(np.size(x))
+        return response(x)
+
+    model = build(counted, *priors, x)
+    prepared(Evaluator.of(model).likelihoods[0])
+    n_runs = sum(calls)
+    prb.simulation_based_calibration(4, model=model, draws=50, progressbar=False)
+    assert sum(calls) <= n_runs + 4  # a few repeated runs show that the response is the same
+
+
+def test_gross_errors_need_no_runs() -> None:
+    x = np.random.default_rng(0).normal(1, 0.5, 20)
+    y = np.exp(x)
+    y[0] += 60
+    metric = prb.LogLikelihood(error=0.1, gross_errors=True)
+    with pm.Model() as model:
+        of_specimens = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", np.exp, of_specimens, observed=y, metric=metric)
+    evaluator = Evaluator.of(model)
+    prepared(evaluator.likelihoods[0])
+    n_runs = evaluator.n_responses
+    posterior = prb.sample(model=model, random_seed=1).posterior
+    assert evaluator.n_responses <= n_runs + 8  # the runs of one audit
+    assert abs(float(posterior["mu"].mean()) - x[1:].mean()) < 0.15

@@ -101,15 +101,16 @@ def few_for_bootstrap(evaluator: Evaluator, *, parametric: bool) -> list[Finding
     """Report too few specimens for intervals of the bootstrap.
 
     Shares of 3000 data sets of a normal population whose 89 % intervals contain its mean and its
-    standard deviation, by 8, 20 and 50 specimens; between these they are interpolated in log n.
+    standard deviation, by 8, 20 and 50 specimens (benchmarks/bootstrap.py); between these they
+    are interpolated in log n.
     """
     enough = 50
     n = min(specimen_counts(evaluator)[2], default=enough)
     if not n < enough:
         return []
-    shares = (0.79, 0.87, 0.88), (0.57, 0.74, 0.81)
+    shares = (0.79, 0.85, 0.87), (0.58, 0.76, 0.82)
     if parametric:
-        shares = (0.81, 0.88, 0.88), (0.69, 0.80, 0.85)
+        shares = (0.82, 0.86, 0.88), (0.70, 0.82, 0.85)
     mean, spread = (np.interp(np.log(n), np.log([8, 20, 50]), row) for row in shares)
     text = (
         f"The bootstrap: got {n:.3g} specimens, expected at least {enough}: of a normal population "
