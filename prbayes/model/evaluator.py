@@ -138,10 +138,15 @@ class Evaluator:
             counts[runs] = max(node.responses.count, counts.get(runs, 0))
         return sum(counts.values()) + sum(m.responses.count for m in self.measurements)
 
-    def log_other(self, thetas: Floats) -> Floats:
-        """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
+    def log_other(
+        self, thetas: Floats, likelihoods: Sequence[SpecimenLikelihood] | None = None
+    ) -> Floats:
+        """Return log-likelihoods by specimen, of other observed variables, and potentials, (P,).
+
+        The log-likelihoods by specimen are those of the model unless others are given.
+        """
         total = np.zeros(len(thetas))
-        for likelihood in self.likelihoods:
+        for likelihood in self.likelihoods if likelihoods is None else likelihoods:
             values = variables_at(self.hyperparameters, thetas)
             # Populations are evaluated in blocks, so that memory stays bounded with many specimens.
             step = max(1, 4 * AT_ONCE // len(likelihood.readings))

@@ -115,7 +115,10 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
         numbers = {
             "thetas": _tuples(thetas[:, order]),
             "log_prior": _tuples(hyperparameters.log_prior(thetas)),
-            "log_other": _tuples(problem.log_other(thetas)),
+            # An audit changes the emulator of a likelihood, and not the problem.
+            "log_other": _tuples(
+                problem.log_other(thetas, [x.cache.get("first", x) for x in problem.likelihoods])
+            ),
         }
     else:
         model = problem

@@ -97,7 +97,11 @@ def _audited_likelihood(
         )
     z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
     surface, *_ = fit_surface(z, y, readings, likelihood.name, emulation.surface)
-    return replace(likelihood, shared_emulation=Emulation(z, y, surface, emulation.error, np.inf))
+    extended = Emulation(z, y, surface, emulation.error, np.inf)
+    result = replace(likelihood, shared_emulation=extended)
+    # The first record identifies the problem, because every use of the model has it at first.
+    result.cache["first"] = likelihood.cache.get("first", likelihood)
+    return result
 
 
 def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:

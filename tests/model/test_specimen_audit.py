@@ -116,3 +116,14 @@ def test_gross_errors_need_no_runs() -> None:
     posterior = prb.sample(model=model, random_seed=1).posterior
     assert evaluator.n_responses <= n_runs + 8  # the runs of one audit
     assert abs(float(posterior["mu"].mean()) - x[1:].mean()) < 0.15
+
+
+def test_an_audit_makes_no_other_problem() -> None:
+    model = build(*PROBLEMS["pole"])
+    optimum = prb.minimize(model)
+    (first,) = Evaluator.of(model).likelihoods
+    posterior = prb.sample(200, model=model, random_seed=1)
+    assert Evaluator.of(model).likelihoods != (first,)  # the posterior needed more runs
+    assert prb.compare({"optimum": optimum, "posterior": posterior}) is not None
+    again = prb.sample(200, model=model, optimum=optimum, random_seed=1)
+    assert prb.compare({"posterior": again}, model=build(*PROBLEMS["pole"])) is not None
