@@ -87,7 +87,9 @@ def _audited_likelihood(
     bias = float(np.sqrt(len(readings)) * (weights @ shift))
     if bias <= likelihood.options.bias:
         return likelihood
-    if is_last or len(emulation.z) >= most_runs(z.shape[1]) + (first_run_count(likelihood) or 0):
+    most = most_runs(z.shape[1]) + (first_run_count(likelihood) or 0)
+    # The next emulation needs a batch of runs, and an audit of its own.
+    if is_last or len(emulation.z) + 3 * runs > most:
         advice = any_of("narrow the priors", *remedies_of(likelihood))
         raise DesignError(
             f"{likelihood.name}: the response is not smooth enough for prb.LogLikelihood(): got an "
