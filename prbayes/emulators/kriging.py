@@ -124,9 +124,8 @@ class Kriging:
             polynomials = self.polynomials
             slopes = legval(polynomials.scaled(z)[0], legder(series)) / polynomials.half_width
             return self.values(z), (self._on_line[0](z[:, 0], 1) + slopes)[:, None]
-        kernel, runs = KERNELS[self.kernel], self._scaled_runs
+        kernel, factors = KERNELS[self.kernel], self._slope_factors
         values, jacobian = np.empty(len(z)), np.empty(z.shape)
-        factors = np.concatenate([self.weights[None], self.weights * runs.T])
         for rows, points, square in self._distances(z):
             value, slope = kernel(square)
             steepness, *by_axis = factors @ slope
@@ -190,9 +189,22 @@ class Kriging:
         return Polynomials.of(self.z, self.degree)
 
     @cached_property
-    def _scaled_runs(self) -> Floats:
-        """The runs relative to the center, in units of lengths, (n, d)."""
-        return (self.z - self.polynomials.center) / self.lengths
+    def _slope_factors(self) -> Floats:
+        """The weights of the runs, and their products with the scaled runs, (1 + d, n)."""
+        runs = (self.z - self.polynomials.center) / self.lengths
+        return np.concatenate([self.weights[None], self.weights * runs.T])
+
+    @cached_property
+    def _run_factors(self) -> Floats:
+        """Factors of the runs in squared distances |a|^2 + |b|^2 - 2 a'b, (n, d + 2)."""
+        runs = (self.z - self.polynomials.center) / self.lengths
+        of_runs = (runs**2).sum(axis=1, keepdims=True)
+        return np.concatenate([-2 * runs, of_runs, np.ones((len(runs), 1))], axis=1)
+
+    @cached_property
+    def _quadratic_form(self) -> tuple[float, Floats, Floats]:
+        """Constant, slopes, (d,), and second derivatives, (d, d), of polynomials of degree two."""
+        return self.polynomials.quadratic_form(self.coefficients)
 
     @cached_property
     def _on_line(self) -> tuple[Any, Floats] | None:
@@ -218,7 +230,7 @@ class Kriging:
         polynomials = self.polynomials
         if self.degree <= 2:
             # A quadratic form takes less time than products of polynomials.
-            constant, linear, hessian = polynomials.quadratic_form(self.coefficients)
+            constant, linear, hessian = self._quadratic_form
             u = polynomials.scaled(z).T
             slopes = u @ hessian + linear
             values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
@@ -238,19 +250,16 @@ class Kriging:
 
         All blocks use the same array of distances, which stays in the processor's cache.
         """
-        runs, n = self._scaled_runs, len(self.z)
+        n = len(self.z)
         step = max(1, min(IN_CACHE // 2 // n, len(z)))
         array = np.empty(n * step)
-        # A matrix product computes |a - b|^2 = |a|^2 + |b|^2 - 2 a'b. Small distances lose digits
-        # by the cancellation, which does not matter for predictions.
-        ones, of_runs = np.ones((n, 1)), (runs**2).sum(axis=1, keepdims=True)
-        run_factors = np.concatenate([-2 * runs, of_runs, ones], axis=1)
+        # Small distances lose digits by cancellation, which does not matter for predictions.
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
             points = ((z[rows] - self.polynomials.center) / self.lengths).T
             point_factors = np.stack([*points, np.ones(points.shape[1]), (points**2).sum(axis=0)])
             square = array[: n * points.shape[1]].reshape(n, -1)
-            np.matmul(run_factors, point_factors, out=square)
+            np.matmul(self._run_factors, point_factors, out=square)
             yield rows, points, np.maximum(square, 0.0, out=square)
 
 

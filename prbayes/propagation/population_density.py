@@ -145,14 +145,17 @@ class ExponentialForm:
         anchors = tuple(values[inside[pivots]] for values in points)
         return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
-    def natural_parameters(self, at_anchors: Floats) -> tuple[Floats, Bools]:
+    def natural_parameters(
+        self, at_anchors: Floats, largest: float = 1000.0
+    ) -> tuple[Floats, Bools]:
         """Return H from log-densities at the anchors, (S, q + 1), and which rows are rounded, (S,).
 
-        The last column of H is minus the log-normaliser. Log-densities at points would be off by
-        more than 1e-12 in rounded rows, which are zero: they are small differences of large
-        numbers, of populations far narrower than the points, or far from them, or invalid.
+        The last column of H is minus the log-normaliser. Rows are rounded, and zero, if a
+        log-density at an anchor is at least ``largest``: those at points are then small differences
+        of large numbers, off by up to 1e-15 of these. Such populations are far narrower than the
+        points, or far from them, or invalid.
         """
-        is_rounded = ~(np.abs(at_anchors).max(axis=1) < 1000.0)
+        is_rounded = ~(np.abs(at_anchors).max(axis=1) < largest)
         return np.where(is_rounded[:, None], 0.0, at_anchors) @ self.inverse, is_rounded
 
 

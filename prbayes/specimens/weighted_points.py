@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,6 +32,9 @@ class WeightedPoints:
     log_a: Floats  # (N, K): the numbers A
     # Form for points in the order of (K, N), so that reductions are sums of long rows.
     form: ExponentialForm | None
+    # Largest log-density at an anchor for which the form is used. Log-densities are off by 1e-7
+    # nats at most, which is far less than the Monte Carlo error.
+    largest: ClassVar[float] = 1e8
 
     @classmethod
     def of(cls, density: PopulationDensity, x: Sequence[Floats], log_a: Floats) -> WeightedPoints:
@@ -62,7 +65,7 @@ class WeightedPoints:
         at_each = self.density.inputs.for_points(parents, len(form.anchors[0]))
         with np.errstate(all="ignore"):
             (at_anchors,) = self.density.log_density(*at_each, *form.anchors)
-        natural, is_rounded = form.natural_parameters(at_anchors)
+        natural, is_rounded = form.natural_parameters(at_anchors, self.largest)
         # A is a statistic whose parameter is one. A large number replaces -inf, as a product of
         # infinity and zero is NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
@@ -96,7 +99,9 @@ class WeightedPoints:
             with np.errstate(all="ignore"):
                 at_each = self.density.inputs.for_points(parents, size)
                 (at_anchors,) = self.density.log_density(*at_each, *anchors)
-            natural, is_rounded = form.natural_parameters(at_anchors.reshape(-1, size))
+            natural, is_rounded = form.natural_parameters(
+                at_anchors.reshape(-1, size), self.largest
+            )
             natural = natural.reshape(len(parents[0]), -1, size, 1)
             is_rounded = is_rounded.reshape(len(parents[0]), -1).any(axis=1)
             statistics = np.ascontiguousarray(form.statistics.reshape(-1, count, n).T)
@@ -134,6 +139,8 @@ def _log_sum_exp_first(exponents: Floats) -> Floats:
     """Return the log of the sum of exponentials over the first axis; exponents are overwritten."""
     largest = exponents.max(axis=0)
     exponents -= largest
+    # Exponentials that underflow take seven times as long.
+    np.maximum(exponents, -700.0, out=exponents)
     np.exp(exponents, out=exponents)
     total = np.log(exponents.sum(axis=0)) + largest
     return np.where(largest < -1e299, -np.inf, total)
