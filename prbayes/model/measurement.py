@@ -335,6 +335,22 @@ class SpecimenLikelihood:
             )
         return Hyperparameters.of(model)
 
+    @property
+    def is_exchangeable(self) -> bool:
+        """Whether all specimens have the same population, outputs of one simulator and weight."""
+        first, *more = self.measurements
+        of_rows = (first.groups, first.weights, first.specimens, first.conditions)
+        return not more and not first.covariates and all(x is None for x in of_rows)
+
+    def of_rows(self, rows: Indices) -> SpecimenLikelihood:
+        """Return the likelihood of some rows of a single simulator."""
+        (measurement,) = self.measurements
+        part = replace(measurement, observed=measurement.observed[rows])
+        result = replace(self, measurements=(part,))
+        # Compiled functions and coordinates depend on the populations only, and are reused.
+        vars(result).update(density=self.density, coordinates=self.coordinates)
+        return result
+
     def observing(self, data: Mapping[str, Any], model: Any = None) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.
 

@@ -57,7 +57,8 @@ def _audited_likelihood(
         return (np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1)
 
     runs = likelihood.options.sampled
-    points = preparation.points.z[:, ::4]  # a mode has at least eight points
+    points = preparation.points.z
+    points = points[:, :: 4 if points.shape[1] >= 16 else 1]  # a mode has eight points or one
     if (uncertainty(points.reshape(-1, points.shape[2])) <= 1.0).all():
         return likelihood
     z = _likely_inputs(likelihood, thetas)

@@ -124,10 +124,12 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     It is that of the difference between two independent halves of the points of each specimen. A
     population that is narrower than the distances between points has a large one. Specimens that
     have a gross error have next to none. A specimen without a point in one of the halves is left
-    out.
+    out. Exact readings, which have one point for each mode, have no error.
     """
     x, log_a = _array_values(likelihood)
     size, half = len(next(iter(values.values()))), log_a.shape[1] // 2
+    if prepared(likelihood).points.is_exact:
+        return np.zeros(size)
     variance = np.zeros(size)
     errors = _errors(likelihood, values)
     for group, rows in likelihood.by_group:

@@ -160,13 +160,48 @@ class Likely:
 
 
 def emulate(
-    run: Run, data: SpecimenData, previous: Emulation | None = None
+    run: Run,
+    data: SpecimenData,
+    previous: Emulation | None = None,
+    part: SpecimenData | None = None,
 ) -> tuple[Emulation, SpecimenPoints, Proposals, Draws]:
     """Fit the emulator: runs over the prior, then where the specimens are until the bias is small.
 
-    ``previous`` is the emulation of the same response for other data. Raise DesignError if the
-    response cannot be emulated well enough.
+    ``previous`` is the emulation of the same response for other data. ``part`` is a sample of many
+    specimens, for which the emulator is fitted before its error is measured at all of them. Raise
+    DesignError if the response cannot be emulated well enough.
     """
+    emulation, plausible = _designed(run, data if part is None else part, previous)
+    if part is not None:
+        emulation, plausible = _of_all(run, data, emulation, plausible)
+    return emulation, *plausible.agreeing(data), plausible.draws
+
+
+def _of_all(
+    run: Run, data: SpecimenData, emulation: Emulation, plausible: Plausible
+) -> tuple[Emulation, Plausible]:
+    """Return emulation and points of all specimens, given those of a part of them.
+
+    Populations that are plausible for a part are so for all.
+    """
+    if emulation.offsets is None and data.draws is not None:
+        plausible = replace(plausible, draws=data.draws(plausible.draws.thetas))
+        plausible = plausible.of_emulation(data, emulation)
+        likely = Likely.of_draws(data, plausible)
+        before, rng = emulation.surface, np.random.default_rng([data.seed, 6])
+        emulation = audited(run, data, emulation, likely, rng)
+        if emulation.bias <= 1.5 * data.options.bias:
+            if emulation.surface is not before:
+                modes = plausible.proposals.modes
+                plausible = plausible.of_emulation(data, emulation, modes)
+            return emulation, plausible
+    return _designed(run, data, emulation)
+
+
+def _designed(
+    run: Run, data: SpecimenData, previous: Emulation | None
+) -> tuple[Emulation, Plausible]:
+    """Return an emulation whose bias is small, or raise, and coarse points of the specimens."""
     emulation = first_emulation(run, data) if previous is None else previous
     population = normal_of(data.inner[:, data.free])
     most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
@@ -206,15 +241,13 @@ def emulate(
                     emulation = corrected(run, data, emulation, population)
                 is_good = bool(may_be_rough) or len(emulation.z) >= most
             if is_good:
-                plausible = plausible.of_emulation(data, emulation)
-                return emulation, *plausible.agreeing(data), plausible.draws
+                return emulation, plausible.of_emulation(data, emulation)
         if len(emulation.z) >= most:
             if not likely.proposals.is_open() and most_corrections(*data.known.shape):
                 emulation = corrected(run, data, emulation, population)
             if emulation.bias > data.options.bias:
                 require_accurate(data, emulation, likely)
-            plausible = Plausible.of(data, emulation, wider(population))
-            return emulation, *plausible.agreeing(data), plausible.draws
+            return emulation, Plausible.of(data, emulation, wider(population))
         # A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and
         # at most three times the first runs.
         share = 2 if emulation.bias > 3 * data.options.bias else 4

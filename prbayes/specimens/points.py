@@ -76,6 +76,7 @@ class SpecimenPoints:
     n_roots: Indices  # (N,): modes of the readings' density with a thousandth of the mass
     mode: Indices  # (N, K): mode whose proposal drew the point
     difference: float = np.nan  # the half difference of the log-likelihoods
+    is_exact: bool = False  # whether readings determine the inputs, so that a mode has one point
 
     def rows(self, index: Indices) -> SpecimenPoints:
         """Return the points of selected specimens."""
@@ -92,6 +93,33 @@ def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
         np.concatenate([first.log_proposal, second.log_proposal], axis=1) + np.log(2),
         first.n_roots,
         np.concatenate([first.mode, second.mode], axis=1),
+    )
+
+
+def points_by_mode(points: SpecimenPoints, modes: Modes) -> SpecimenPoints:
+    """Return one point for each mode of a specimen: the weighted mean of its points.
+
+    The densities of the proposals are NaN.
+    """
+    first = np.searchsorted(modes.specimen, np.arange(len(points.z)))
+    slot = points.mode - first[:, None]
+    largest = points.log_a.max(axis=1, keepdims=True)
+    weights = np.exp(points.log_a - np.where(np.isfinite(largest), largest, 0.0))
+    of_mode = (slot[:, None] == np.arange(modes.table.shape[1])[:, None]) * weights[:, None]
+    total = of_mode.sum(axis=2)
+    of_mode /= np.where(total > 0, total, 1.0)[:, :, None]
+    with np.errstate(divide="ignore"):
+        log_a = np.log(total) + largest
+    mode = first[:, None] + np.arange(total.shape[1])
+    z, outputs = of_mode @ points.z, of_mode @ points.outputs
+    return replace(
+        points,
+        z=z,
+        outputs=outputs,
+        log_a=log_a,
+        log_proposal=np.full(total.shape, np.nan),
+        mode=mode,
+        is_exact=True,
     )
 
 
@@ -143,6 +171,8 @@ class SpecimenData:
     labels: NDArray[Any] | None = None  # labels of the N specimens; None for row numbers
     # Advice on more runs, and on another metric, that the model accepts; empty texts for none.
     remedies: Callable[[], tuple[str, str]] = lambda: ("", "")
+    # Function of hyperparameters, (S, p), that returns them as draws; for a part of the specimens.
+    draws: Callable[[Floats], Draws] | None = None
     seed: int = 0
 
     @property
@@ -207,11 +237,17 @@ class SpecimenData:
         )
 
 
-def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) -> Proposals:
+def fit_proposals(
+    data: SpecimenData,
+    emulation: Emulation,
+    population: Normal,
+    earlier: Modes | None = None,
+) -> Proposals:
     """Return proposals at the modes of all specimens.
 
     The search for modes starts at specimens of the prior, and of the population, whose outputs are
-    nearer to the specimen's readings than those of their neighbours.
+    nearer to the specimen's readings than those of their neighbours; or at the modes of an
+    ``earlier`` emulator in the same population.
     """
     residuals = data.residuals(emulation, population)
     # Candidates are not chosen by an output that a reading error dominates.
@@ -221,7 +257,10 @@ def fit_proposals(data: SpecimenData, emulation: Emulation, population: Normal) 
     error = np.median(data.readings.error_sd(target), axis=0)
     unit = np.hypot(data.readings.spread(), 10 * error)
     unit = np.where(data.readings.is_measured, unit, np.inf)
-    starts = _starts(data, emulation, residuals, target, unit)
+    if earlier is None:
+        starts = _starts(data, emulation, residuals, target, unit)
+    else:
+        starts = _as_starts(earlier, np.zeros((len(target), 1, len(data.free))))
     parts = []
     for scale in sorted(data.scales, reverse=True):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
@@ -263,8 +302,11 @@ def _starts(
     is_minimum = np.ones(distance.shape, dtype=bool)
     for column in near[:, 1:].T:
         is_minimum &= distance <= distance[:, column]
-    order = np.lexsort((distance, ~is_minimum), axis=1)[:, : data.options.starts]
-    return a[order]
+    # Minima come first. Positive numbers have the order of their bits, whose first one is free.
+    keys = distance.view(np.uint64) | (~is_minimum).astype(np.uint64) << np.uint64(63)
+    nearest = np.argpartition(keys, data.options.starts, axis=1)[:, : data.options.starts]
+    order = np.argsort(np.take_along_axis(keys, nearest, axis=1), axis=1, kind="stable")
+    return a[np.take_along_axis(nearest, order, axis=1)]
 
 
 def _as_starts(modes: Modes, starts: Floats) -> Floats:
@@ -356,10 +398,12 @@ class Plausible:
             return False
         return bool(sizes.min() > 0.3 and sizes.max() < 3.0)
 
-    def of_emulation(self, data: SpecimenData, emulation: Emulation) -> Plausible:
-        """Return the same draws with proposals of a better emulator."""
+    def of_emulation(
+        self, data: SpecimenData, emulation: Emulation, earlier: Modes | None = None
+    ) -> Plausible:
+        """Return the same draws with proposals of a better emulator, from ``earlier`` modes."""
         reference = self.proposals.residuals.population
-        proposals = fit_proposals(data, emulation, reference)
+        proposals = fit_proposals(data, emulation, reference, earlier)
         points = draw_points(data, proposals, self.points.log_a.shape[1], data.seed)
         points = at_scale(data, points, emulation.error, self.scale)
         return replace(self, proposals=proposals, points=points)
@@ -388,7 +432,17 @@ class Plausible:
         scale = modes.scale[np.abs(modes.scale - self.scale).argmin()]
         counts = (masses[0] > 1e-3 * largest[modes.specimen]) & (modes.scale == scale)
         n_roots = np.bincount(modes.specimen[counts], minlength=len(data.known))
-        return replace(result, n_roots=np.maximum(n_roots, 1)), proposals
+        result = replace(result, n_roots=np.maximum(n_roots, 1))
+        if len(data.scales) > 1:
+            return result, proposals
+        # Exact readings determine the inputs of a mode, so that one point suffices.
+        fewer = points_by_mode(result, proposals.modes)
+        whole, of_fewer = (
+            self.draws.log_likelihoods(p.z, p.log_a).sum(axis=1) for p in (result, fewer)
+        )
+        with np.errstate(invalid="ignore"):
+            is_same = np.abs(whole - of_fewer).max() < 1e-3 * data.options.half_difference
+        return fewer if is_same else result, proposals
 
 
 def specimen_points(

@@ -45,7 +45,6 @@ from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
 from prbayes.specimens.coordinates import Coordinates
-from prbayes.specimens.emulation import Emulation
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
 
@@ -380,14 +379,11 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
     return fleet.calibrated(names)
 
 
-def _common_likelihood(
-    evaluator: Evaluator, observed: Mapping[str, Floats], emulated: int = 512
-) -> SpecimenLikelihood:
+def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    The emulator is fitted for ``emulated`` evenly spaced specimens. The limits of the errors of
-    emulator and points are those for one product, which has fewer specimens and a narrower
-    population.
+    The limits of the errors of emulator and points are those for one product, which has fewer
+    specimens and a narrower population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
@@ -395,39 +391,25 @@ def _common_likelihood(
     sizes = [len(values) for values in observed.values()]
     within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
     narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
-    inputs = likelihood.inputs
     sampler = likelihood.density.sampler
-    coordinates = Coordinates.of_prior(inputs, max(sizes), sampler=sampler)
-
-    def prepared_of(values: Floats, emulation: Emulation | None) -> SpecimenLikelihood:
-        fewer = np.sqrt(len(values) / np.median(sizes))
-        options = replace(
-            likelihood.options,
-            bias=likelihood.options.bias * fewer * narrower,
-            half_difference=likelihood.options.half_difference * fewer,
-        )
-        result = likelihood.observing({measurement.name: values})
-        result = replace(result, options=options, shared_emulation=emulation)
-        vars(result).update(density=likelihood.density, coordinates=coordinates)
-        prepared(result)
-        return result
-
-    if len(stacked) <= 2 * emulated:
-        return prepared_of(stacked, None)
-    order = np.argsort(stacked.reshape(len(stacked), -1)[:, 0], kind="stable")
-    rows = order[np.linspace(0, len(order) - 1, emulated).astype(np.intp)]
-    return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
+    coordinates = Coordinates.of_prior(likelihood.inputs, max(sizes), sampler=sampler)
+    fewer = np.sqrt(len(stacked) / np.median(sizes))
+    options = replace(
+        likelihood.options,
+        bias=likelihood.options.bias * fewer * narrower,
+        half_difference=likelihood.options.half_difference * fewer,
+    )
+    result = likelihood.observing({measurement.name: stacked})
+    result = replace(result, options=options, shared_emulation=None)
+    vars(result).update(density=likelihood.density, coordinates=coordinates)
+    prepared(result)
+    return result
 
 
 def _of_rows(likelihood: SpecimenLikelihood, rows: Indices) -> SpecimenLikelihood:
     """Return the likelihood of some of the specimens, with their points of quadrature."""
-    (measurement,) = likelihood.measurements
-    part = replace(measurement, observed=measurement.observed[rows])
-    result = replace(likelihood, measurements=(part,))
-    preparation = prepared(likelihood)
+    result, preparation = likelihood.of_rows(rows), prepared(likelihood)
     result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
-    # Compiled functions and coordinates depend on the populations only, and are reused.
-    vars(result).update(density=likelihood.density, coordinates=likelihood.coordinates)
     return result
 
 

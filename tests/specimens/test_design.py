@@ -279,6 +279,34 @@ def test_an_earlier_emulation_of_the_response_is_extended() -> None:
     assert len(extended.z) == len(run.z) + len(again.z)
 
 
+@pytest.mark.parametrize("is_wavy", [False, True])
+def test_an_emulator_of_some_specimens_is_audited_at_all(is_wavy: bool) -> None:
+    """A wave where no specimen of the part is needs more runs; another response does not."""
+
+    def response(z: Floats) -> Floats:
+        return np.exp(z) + is_wavy * np.where(z > 0.4, 0.2 * np.sin(15 * (z - 0.4)) ** 2, 0.0)
+
+    rng = np.random.default_rng(2)
+    x = rng.normal([[0.0]] * 40 + [[0.7]] * 20, 0.1)
+    prior = 0.4 * np.random.default_rng(1).standard_normal((4096, 1))
+
+    def data_of(x: Floats) -> SpecimenData:
+        readings, known = Readings.exact(response(x)), np.full(x.shape, np.nan)
+        return SpecimenData(
+            readings, known, prior, NormalDraws.posterior, np.array([[-1.5], [1.5]]),
+            draws=lambda thetas: NormalDraws(*np.split(thetas.mean(axis=0), 2), len(x)),
+        )  # fmt: skip
+
+    run, of_part = Recorded(response), Recorded(response)
+    emulate(of_part, data_of(x[:40]))
+    _, points, *_ = emulate(run, data_of(x), part=data_of(x[:40]))
+    further = len(run.z) - len(of_part.z)
+    assert further > 8 if is_wavy else further <= 8
+    if not is_wavy:
+        assert points.is_exact
+        np.testing.assert_allclose(points.z[:, 0], x, atol=1e-4)
+
+
 def test_likely_inputs_are_corrected_by_the_response() -> None:
     """The emulator of the first runs is poor beside a kink; after two rounds its error is small."""
 

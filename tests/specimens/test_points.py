@@ -120,6 +120,9 @@ def test_a_linear_response(d: int, m: int, size: float) -> None:
         exact = exact_log_likelihoods(a, readings, draws)
     else:  # a density beside the plane of outputs: that of the emulator's error
         exact = exact_log_likelihoods(a, replace(readings, error=np.full((N, m), 1e-5)), draws)
+    # One point suffices where exact readings determine the inputs.
+    assert points.is_exact == (size == 0 and m >= d)
+    assert points.is_exact == (points.z.shape[1] == 1)
     error = errors(points, exact, draws)
     # Standard deviation over populations, the unit of the limit on the difference of the halves
     assert points.difference <= 0.2
