@@ -149,7 +149,7 @@ class Evaluator:
         for likelihood in self.likelihoods if likelihoods is None else likelihoods:
             values = variables_at(self.hyperparameters, thetas)
             # Populations are evaluated in blocks, so that memory stays bounded with many specimens.
-            step = max(1, 4 * AT_ONCE // len(likelihood.readings))
+            step = max(1, AT_ONCE // len(likelihood.readings))
             for first in range(0, len(thetas), step):
                 rows = slice(first, first + step)
                 at_rows = {name: value[rows] for name, value in values.items()}

@@ -91,15 +91,21 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     """
     share, repeats = prepared(likelihood).share, likelihood.stacked.repeats
     errors = _errors(likelihood, values)
-    result = np.empty((len(errors), len(likelihood.readings)))
-    groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
-    for (group, rows), points in groups:
+    parts = []
+    for (group, rows), points in zip(
+        likelihood.by_group, _points_by_group(likelihood), strict=True
+    ):
         parents = likelihood.parents(values, group, rows)
-        result[:, rows] = _of_points(likelihood, errors, parents, points, rows)
+        parts.append(_of_points(likelihood, errors, parents, points, rows))
+    result = parts[0]
+    if len(parts) > 1:
+        result = np.empty((len(errors), len(likelihood.readings)))
+        for (_, rows), part in zip(likelihood.by_group, parts, strict=True):
+            result[:, rows] = part
     if share is not None:
-        result -= log_shares(likelihood, values, share)
+        result = result - log_shares(likelihood, values, share)
     if repeats is not None:
-        result += [repeats.log_density(error, np) for error in errors]
+        result = result + [repeats.log_density(error, np) for error in errors]
     result = _with_gross_errors(likelihood, values, result, slice(None))
     weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights

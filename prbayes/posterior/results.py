@@ -248,7 +248,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
     n_chains, n_draws, d = chains.thetas.shape
     specimens = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     # Diagnostics of a specimen need more draws than a predictive distribution.
-    thinned = _thinned(n_draws, n_chains * specimens / 4)
+    thinned = _thinned(n_draws, n_chains * specimens / 2)
     thetas = chains.thetas[:, thinned]
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)

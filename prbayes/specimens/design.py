@@ -171,13 +171,13 @@ def emulate(
     specimens, for which the emulator is fitted before its error is measured at all of them. Raise
     DesignError if the response cannot be emulated well enough.
     """
-    emulation, plausible = _designed(run, data if part is None else part, previous)
+    emulation, plausible = sequential_design(run, data if part is None else part, previous)
     if part is not None:
-        emulation, plausible = _of_all(run, data, emulation, plausible)
+        emulation, plausible = extend_to_all(run, data, emulation, plausible)
     return emulation, *plausible.agreeing(data), plausible.draws
 
 
-def _of_all(
+def extend_to_all(
     run: Run, data: SpecimenData, emulation: Emulation, plausible: Plausible
 ) -> tuple[Emulation, Plausible]:
     """Return emulation and points of all specimens, given those of a part of them.
@@ -188,17 +188,17 @@ def _of_all(
         plausible = replace(plausible, draws=data.draws(plausible.draws.thetas))
         plausible = plausible.of_emulation(data, emulation)
         likely = Likely.of_draws(data, plausible)
-        before, rng = emulation.surface, np.random.default_rng([data.seed, 6])
+        surface, rng = emulation.surface, np.random.default_rng([data.seed, 6])
         emulation = audited(run, data, emulation, likely, rng)
         if emulation.bias <= 1.5 * data.options.bias:
-            if emulation.surface is not before:
+            if emulation.surface is not surface:
                 modes = plausible.proposals.modes
                 plausible = plausible.of_emulation(data, emulation, modes)
             return emulation, plausible
-    return _designed(run, data, emulation)
+    return sequential_design(run, data, emulation)
 
 
-def _designed(
+def sequential_design(
     run: Run, data: SpecimenData, previous: Emulation | None
 ) -> tuple[Emulation, Plausible]:
     """Return an emulation whose bias is small, or raise, and coarse points of the specimens."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from prbayes._validate import Floats
+from prbayes._validate import IN_CACHE, Floats
 from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
@@ -132,7 +132,8 @@ class Emulation:
 
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""
-        values = self.surface.values(z)
+        blocks = np.array_split(z, 1 + len(z) // IN_CACHE)
+        values = np.concatenate([self.surface.values(block) for block in blocks])
         values[self.fails(z)] = np.nan
         return values
 

@@ -437,11 +437,9 @@ class Plausible:
             return result, proposals
         # Exact readings determine the inputs of a mode, so that one point suffices.
         fewer = points_by_mode(result, proposals.modes)
-        whole, of_fewer = (
-            self.draws.log_likelihoods(p.z, p.log_a).sum(axis=1) for p in (result, fewer)
-        )
+        sums = [self.draws.log_likelihoods(p.z, p.log_a).sum(axis=1) for p in (result, fewer)]
         with np.errstate(invalid="ignore"):
-            is_same = np.abs(whole - of_fewer).max() < 1e-3 * data.options.half_difference
+            is_same = np.ptp(sums, axis=0).max() < 1e-3 * data.options.half_difference
         return fewer if is_same else result, proposals
 
 
