@@ -170,8 +170,9 @@ def area_test(
     alpha : float
         Probability of rejecting a right model.
     null : Null, optional
-        `PosteriorNull` by default; with one population only, and one value per specimen,
-        `ExactModel`. `JointNull` for the calibration's own specimens.
+        `PosteriorNull` by default, with 999 replicates for more than 1000 values. With one
+        population only, and one value per specimen, `ExactModel`. `JointNull` for the
+        calibration's own specimens.
     specimens : as ``observed``, optional
         Labels. Values with the same label, also of several conditions, are of one specimen, and
         replicates of the null are equally dependent. Sample i of a draw must be the same specimen
@@ -229,7 +230,7 @@ def area_test(
     )
     if null is None:
         is_exact = case.n_draws == 1 and not case.is_dependent
-        null = ExactModel() if is_exact else PosteriorNull()
+        null = ExactModel() if is_exact else PosteriorNull(9999 if case.size <= 1000 else 999)
     if not null.own_specimens:
         _refuse_calibration_specimens(case)
     if case.shares_specimens:

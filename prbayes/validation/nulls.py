@@ -170,7 +170,7 @@ class PosteriorNull(Null):
         # Use every draw of the posterior equally often, in random order.
         draw_of = rng.permutation(draws[np.arange(self.replicates) % draws.size])
         # All blocks use one generator, so that results depend on the size of the blocks.
-        step = max(1, AT_ONCE // case.size)
+        step = max(1, AT_ONCE // (4 * case.size))
         for start in range(0, self.replicates, step):
             draw = draw_of[start : start + step, None]
             # Place of a specimen in its population, from 0 to 1. It is the same under all
