@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy.stats import beta, norm
+from scipy.stats import beta, gamma, norm
 
 import prbayes as prb
 from benchmarks.scoreboard.problems import frame
@@ -732,6 +732,95 @@ def test_specimens_beside_the_ends_of_a_range(response: Callable[[Any], Any]) ->
     # The Jacobian of the response is common to all populations.
     error = np.subtract(log_l, right)
     assert error - error.mean() == pytest.approx(np.zeros(5), abs=0.01)
+
+
+BESIDE = np.random.default_rng(1).beta(2, 2, 12)
+ENDED: dict[str, Callable[[], Any]] = {
+    "beta": lambda: pm.Beta.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
+    "kumaraswamy": lambda: pm.Kumaraswamy.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
+    "gamma": lambda: pm.Gamma.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
+    "weibull": lambda: pm.Weibull.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
+    "truncated": lambda: pm.TruncatedNormal.dist(
+        pm.Normal("mu", 0.5, 0.5), pm.HalfNormal("s", 0.5), lower=0, upper=1
+    ),
+    "exponential": lambda: pm.Exponential.dist(pm.HalfNormal("rate", 5)),
+}
+
+
+def model_with_end(family: str, end: float, response: Any = np.positive, **given: Any) -> pm.Model:
+    with pm.Model() as model:
+        data = response(np.append(BESIDE, end))
+        prb.Simulator("y", response, ENDED[family](), observed=data, **given)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("family", "end"),
+    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("kumaraswamy", 1.0), ("gamma", 0.0)],
+)
+def test_an_exact_reading_at_an_end_is_refused_by_its_row(family: str, end: float) -> None:
+    with pytest.raises(prb.propagation.DesignError, match="exact reading of specimen 12 whose"):
+        prb.sample(model=model_with_end(family, end), progressbar=False)
+    metric = prb.LogLikelihood(error=0.01)
+    posterior = prb.sample(model=model_with_end(family, end, metric=metric), progressbar=False)
+    assert posterior.posterior["a"].std() < 1.0
+
+
+@pytest.mark.parametrize("end", [0.0, 1e-6])
+def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: float) -> None:
+    c = np.random.default_rng(2).normal(0, 0.5, 13)
+    x = np.append(BESIDE, end)
+    with pm.Model() as model:
+        inputs = ENDED["beta"](), pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("s", 1))
+        prb.Simulator(
+            "y", lambda x, c: np.stack([x + 0 * c, c + 0.1 * x], -1), *inputs,
+            observed=np.stack([x, c + 0.1 * x], -1),
+        )  # fmt: skip
+    if end > 0:
+        right = [beta.logpdf(x, a, b).sum() for a, b in ((0.5, 1.0), (1.0, 1.0), (0.7, 0.7))]
+        function = model.compile_logp(vars=model.observed_RVs, jacobian=False)
+        at = {"mu": 0.0, "s_log__": np.log(0.5)}
+        log_l = [
+            float(function(at | {"a_log__": np.log(a), "b_log__": np.log(b)}))
+            for a, b in ((0.5, 1.0), (1.0, 1.0), (0.7, 0.7))
+        ]
+        error = np.subtract(log_l, right)
+        assert error - error[1] == pytest.approx(np.zeros(3), abs=0.1)
+        return
+    with pytest.raises(prb.propagation.DesignError, match="exact reading of specimen 12 whose in"):
+        prb.sample(model=model, progressbar=False)
+
+
+@pytest.mark.parametrize("family", ["truncated", "exponential"])
+def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None:
+    posteriors = [
+        prb.sample(model=model_with_end(family, end), random_seed=1, progressbar=False).posterior
+        for end in (0.0, 1e-4)
+    ]
+    for name in posteriors[0].data_vars:
+        means = [float(posterior[name].mean()) for posterior in posteriors]
+        assert means[0] == pytest.approx(means[1], rel=0.02)
+
+
+@pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("weibull", 1e-7), ("gamma", 1e-5)])
+def test_readings_as_small_as_the_error_of_the_emulator_are_reported(
+    family: str, end: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    prb.sample(50, model=model_with_end(family, end), progressbar=False)
+    texts = [r.getMessage() for r in caplog.records if getattr(r, "code", "") == "emulator-error"]
+    assert "the input of specimen 12 is so near an end of its range" in texts[0]
+
+
+@pytest.mark.parametrize("end", [1e-5, 1e-7])
+def test_the_logarithm_of_a_response_resolves_small_readings(end: float) -> None:
+    model = model_with_end("gamma", end, response=np.log)
+    function = model.compile_logp(vars=model.observed_RVs, jacobian=False)
+    x = np.append(BESIDE, end)
+    points = [(0.4, 1.0), (0.8, 2.0), (1.5, 3.0)]
+    right = [gamma.logpdf(x, a, scale=1 / b).sum() for a, b in points]
+    log_l = [float(function({"a_log__": np.log(a), "b_log__": np.log(b)})) for a, b in points]
+    error = np.subtract(log_l, right)
+    assert error - error[0] == pytest.approx(np.zeros(3), abs=0.02)
 
 
 @pytest.mark.parametrize("population", ["beta", "uniform"])

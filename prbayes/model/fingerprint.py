@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from operator import attrgetter
 from typing import Any
@@ -19,15 +21,18 @@ import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, Shape
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.measurement import Measurement
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
 from prbayes.model.parameters import fixed_points
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
+from prbayes.model.specimen_preparation import is_prepared, prepared
 from prbayes.response.compile import interpreted
 from prbayes.response.inputs import Inputs
+from prbayes.response.variables import listed
 
 
 class Level(IntEnum):
@@ -68,14 +73,16 @@ class SimulatorIdentity:
     n_points: int = 0  # number of runs of the design
     batches: int = 1  # number of batches in which the design's points were drawn
     epsilon: float = 1.0  # epsilon, NaN while it is not set
-    responses: tuple[float, ...] = ()  # first responses
+    responses: tuple[float, ...] = ()  # first responses, at most 16 runs
     # Discrepancies at fixed thetas; empty if they would need further responses.
     discrepancies: tuple[float, ...] = ()
-    # Aleatory inputs of the first two responses; empty if the response has epistemic inputs.
+    # Aleatory inputs of the first responses; empty if the response has epistemic inputs.
     points: tuple[tuple[float, ...], ...] = ()
     # Digests of data, weights and labels as a metric of distributions would have them; only for a
     # log-likelihood by specimen.
     with_metric: tuple[str, ...] = ()
+    # Digests of the response's code and of variables that it reads; empty in older results.
+    code: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
         model, hyperparameters = problem.model, problem.hyperparameters
         shapes = hyperparameters.shapes
         parts: list[Node | Measurement] = [*problem.nodes, *problem.measurements]
-        simulators = list(map(_simulator_identity, parts))
+        simulators = [_simulator_identity(part, problem.likelihoods) for part in parts]
         # Four points, because Sobol points are balanced if their number is a power of two.
         thetas, order = fixed_points(hyperparameters, 4)
         for k, node in enumerate(problem.nodes):
@@ -122,8 +129,9 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
         }
     else:
         model = problem
+        likelihoods = specimen_likelihoods(model).values()
         parts = [*nodes(model).values(), *measurements_of(model).values()]
-        simulators = list(map(_simulator_identity, parts))
+        simulators = [_simulator_identity(part, likelihoods) for part in parts]
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         shapes = {str(value.name): value.type.shape for value in values}
         if any(None in shape for shape in shapes.values()):
@@ -146,7 +154,9 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
     )
 
 
-def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
+def _simulator_identity(
+    simulator: Node | Measurement, likelihoods: Iterable[SpecimenLikelihood]
+) -> SimulatorIdentity:
     observed, weights, labels = simulator.observed, simulator.weights, simulator.specimens
     of_specimens: tuple[Any, ...] = ()
     fields: dict[str, Any] = {}
@@ -161,9 +171,6 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             "n_points": bound.n_runs,
             "batches": batches,
             "epsilon": simulator.epsilon_value,
-            # A design grows at its end, so that the first responses do not change.
-            "responses": _tuples(bound.first_responses[:8].ravel()),
-            "points": _first_points(simulator),
         }
     else:
         of_specimens = simulator.groups, *simulator.covariates.values(), simulator.conditions
@@ -172,6 +179,9 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             equal = np.full(n, 1 / n) if weights is None else weights / weights.sum()
             fields = {"with_metric": _digests(*_in_fixed_order(observed, equal, labels))}
     _, of_weights, of_labels = _digests(observed, weights, labels)
+    points, responses = _first_runs(simulator, likelihoods)
+    # Variables that calls change have no digest. A file has room for a hundred.
+    digests = list(simulator.responses.watched.digests().items())[:100]
     return SimulatorIdentity(
         name=simulator.name,
         data=_digest(observed, *of_specimens),
@@ -180,6 +190,13 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
         inputs=_inputs(simulator.inputs),
         metric=without_addresses(simulator.metric),
         propagation=without_addresses(simulator.propagation),
+        points=points,
+        responses=responses,
+        # Other versions of Python compile the same code differently.
+        code={
+            "version of Python": sys.version.partition(" ")[0],
+            **{k: v for k, v in digests if v},
+        },
         **fields,
     )
 
@@ -196,17 +213,34 @@ def _digests(observed: Floats, weights: Floats | None, labels: Any) -> tuple[str
     return _digest(observed), _digest(weights), of_labels
 
 
-def _first_points(node: Node) -> tuple[tuple[float, ...], ...]:
-    """Return the aleatory inputs of the first two responses, a row for each.
+def _first_runs(
+    simulator: Node | Measurement, likelihoods: Iterable[SpecimenLikelihood]
+) -> tuple[Any, Any]:
+    """Return aleatory inputs of the first runs, a row for each, and their responses as numbers.
 
-    One response alone may agree with another by chance, as at zero.
+    Designs grow at their ends, so that the first runs do not change. A likelihood by specimen has
+    none before its first use, and a user's own propagation may store no points.
     """
-    # A user's own propagation may store no points.
-    if node.inputs.epistemic or not len(node.bound.first_points):
-        return ()
-    columns = [x[:2].reshape(min(2, len(x)), -1) for x in node.bound.first_points]
-    points: tuple[tuple[float, ...], ...] = _tuples(np.concatenate(columns, axis=1))
-    return points
+    points: Sequence[Floats] = ()
+    values = np.empty(0)
+    if isinstance(simulator, Node):
+        values = simulator.bound.first_responses
+        points = () if simulator.inputs.epistemic else simulator.bound.first_points
+    for likelihood in likelihoods:
+        for measurement in likelihood.measurements:
+            if measurement.name == simulator.name and is_prepared(likelihood):
+                emulation = prepared(likelihood).emulation
+                points = likelihood.coordinates.inputs(emulation.z)
+                values = emulation.y[:, output_columns(likelihood, measurement)]
+    n_rows = len(values)
+    if not n_rows:
+        return (), ()
+    columns = [x[:n_rows].reshape(n_rows, -1) for x in points]
+    inputs = np.concatenate(columns, axis=1) if columns else np.empty((0, 0))
+    outputs = values.reshape(n_rows, -1)
+    # A file has room for some hundred numbers.
+    most = int(np.clip(400 // max(1, inputs.shape[1], outputs.shape[1]), 2, 16))
+    return _tuples(inputs[:most]), _tuples(outputs[:most].ravel())
 
 
 def _inputs(inputs: Inputs) -> str:
@@ -286,27 +320,51 @@ def require_same(
         )
 
 
-def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -> None:
+def require_same_responses(
+    got: Identity | None, expected: Identity, model: pm.Model, caller: str
+) -> None:
     """Raise a ValueError unless a model has a result's responses, also at the result's points.
 
     `problem_differences` compares responses at the same points, which are drawn through the priors.
-    With other priors, or another propagation, two responses of each simulator are computed.
+    At other points two responses of each simulator are computed, and all that the result has if the
+    code is another one and these take less than a second. None is computed of the same code of a
+    likelihood whose model is used for the first time.
     """
     stored = {} if got is None else {simulator.name: simulator for simulator in got.simulators}
-    for node in nodes(model).values():
-        saved = stored.get(node.name)
-        if saved is None or not saved.points or saved.points == _first_points(node):
+    parts: list[Node | Measurement] = [*nodes(model).values(), *measurements_of(model).values()]
+    simulators = {simulator.name: simulator for simulator in parts}
+    for new in expected.simulators:
+        if new.name not in stored:
             continue
-        shapes = node.inputs.event_shapes
-        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-        columns = np.split(np.array(saved.points), ends[:-1], axis=1)
-        aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
-        values = node.responses(aleatory, []).ravel()
-        if not _agree(values, saved.responses[: values.size]):
+        saved, simulator = stored[new.name], simulators[new.name]
+        names = [k for k, v in new.code.items() if saved.code.get(k, v) != v]
+        has_same_code = bool(saved.code) and not names
+        values: Any = new.responses
+        if saved.points and not (new.points and _agree(saved.points, new.points, first=True)):
+            if has_same_code and not new.points:
+                continue
+            shapes = simulator.inputs.event_shapes
+            ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+            columns = np.split(np.array(saved.points), ends[:-1], axis=1)
+            aleatory = [x.reshape(-1, *s) for x, s in zip(columns, shapes, strict=True)]
+            start = time.perf_counter()
+            values = simulator.responses([x[:2] for x in aleatory], []).ravel()
+            if not has_same_code and time.perf_counter() - start < 1:
+                values = simulator.responses(aleatory, []).ravel()
+        if saved.points and not _agree(values, saved.responses, first=True):
             raise ValueError(
-                f"{caller}: got a result of another problem: the response of {node.name} has other "
+                f"{caller}: got a result of another problem: the response of {new.name} has other "
                 f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"
             )
+        # Private attributes of objects are often memories of earlier calls.
+        public = [name for name in names if "._" not in name]
+        if public and "version of Python" not in names:
+            text = (
+                f"{caller}: {new.name}: {listed(public)} has changed since the result was made. "
+                "The first runs have the same values, others may differ; pass the model that the "
+                "result was made from."
+            )
+            report(Finding("other-code", text, "expensive.md#nothing-is-computed-twice"))
 
 
 def require_together(
@@ -323,10 +381,13 @@ def require_together(
     """
     with_identity = [i for i in identities.values() if i is not None]
     expected = with_identity[0] if with_identity else None
-    if model is not None and (nodes(model) or specimen_likelihoods(model)):
+    has_simulator = model is not None and (nodes(model) or specimen_likelihoods(model))
+    if model is not None and has_simulator:
         expected = identity_of(model)
     for label, identity in identities.items():
         require_same(identity, expected, f"{caller}: {label}", level)
+        if model is not None and expected is not None and has_simulator:
+            require_same_responses(identity, expected, model, f"{caller}: {label}")
     return expected
 
 
@@ -404,7 +465,7 @@ def _simulator_differences(
     has_same_points = same_priors and a.propagation == b.propagation and not mixed
     if inputs[0] != inputs[1]:
         populations.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
-    elif has_same_points and not _agree(a.responses, b.responses):
+    elif has_same_points and not _agree(a.responses, b.responses, first=True):
         populations.append(f"the response of {a.name} has other values at the same points")
     optimum = [
         _unlike(f"{field} of {a.name}", getattr(a, field), getattr(b, field))
@@ -432,8 +493,13 @@ def _unlike(what: str, got: object, expected: object) -> str:
     return f"{what}: got {got}, expected {expected}"
 
 
-def _agree(got: Any, expected: Any) -> bool:
-    """Return whether numbers are the same up to rounding, relative to the largest of them."""
+def _agree(got: Any, expected: Any, *, first: bool = False) -> bool:
+    """Return whether numbers are the same up to rounding, relative to the largest of them.
+
+    With ``first`` those at the start of two sequences are compared, as many as both have.
+    """
+    if first:
+        got, expected = got[: len(expected)], expected[: len(got)]
     a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     size = np.abs(a[np.isfinite(a)]).max(initial=0.0)
     # The tolerance allows for another machine, or another version of NumPy.

@@ -6,7 +6,7 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -17,7 +17,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices
 from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
@@ -46,12 +46,21 @@ from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
-from prbayes.specimens.design import emulate, first_runs, most_corrections, most_runs
+from prbayes.specimens.design import (
+    emulate,
+    first_runs,
+    most_corrections,
+    most_runs,
+    refuse_at_end,
+    shares_of_distance,
+)
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
 from prbayes.specimens.points import (
+    Draws,
     SpecimenData,
     SpecimenPoints,
     draw_points,
+    likely_weights,
     normal_of,
     specimen_points,
 )
@@ -307,6 +316,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error, data.remedies),
         *coverage_findings(likelihood, data, points, draws.specimens()),
+        *_end_findings(runs, data, emulation, points, draws),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
@@ -322,6 +332,76 @@ def _part(likelihood: SpecimenLikelihood, size: int = 512) -> SpecimenData | Non
     # Estimates from a part scatter more, so that the same bias is a smaller share of their scatter.
     bias = part.options.bias * np.sqrt(size / n)
     return replace(part, options=replace(part.options, bias=bias))
+
+
+def _end_findings(
+    runs: CheckedRuns,
+    data: SpecimenData,
+    emulation: Emulation,
+    points: SpecimenPoints,
+    draws: Draws,
+) -> list[Finding]:
+    """Report specimens whose inputs are known worse than their distances from an end of the range.
+
+    The end of an input with a logarithmic coordinate is zero. The error of such an input counts by
+    the change of the populations' log-densities over posterior draws, from .1 nats on. It is zero
+    of a density that is finite at the end. Raise DesignError if the error is nine tenths of the
+    distance. A few runs are computed at inputs that are far below all others.
+    """
+    likelihood, coordinates = runs.likelihood, runs.likelihood.coordinates
+    weights = likely_weights(data, points, normal_of(draws.specimens()[:, data.free]))
+    z = points.z[np.arange(len(weights)), weights.argmax(axis=1)]
+    is_log = coordinates.is_log & ~coordinates.is_condition
+    scale = np.where(is_log, 1 / coordinates.half_width, np.inf)
+    distance = np.minimum(np.min(np.abs(coordinates.ends[:, None] - z), axis=0), scale)
+    ended = [k for k in data.free if np.isfinite(distance[:, k]).all()]
+    if not ended:
+        return []
+    steps = [np.where(np.arange(z.shape[1]) == k, 0.5 * distance, 0.0) for k in ended]
+
+    def secants(values: Callable[[Floats], Floats], rows: Indices) -> Floats:
+        """Return changes of the values over half a distance to both sides, (k, m, ended)."""
+        changes = [values((z + step)[rows]) - values((z - step)[rows]) for step in steps]
+        return np.asarray(np.stack(changes, axis=-1) / distance[rows][:, None, ended])
+
+    # Secants, because the slopes of a surface say nothing of changes that are smaller than its
+    # error.
+    _, jacobian = emulation(z)
+    jacobian[:, :, ended] = secants(emulation.values, np.arange(len(z)))
+    at_end = shares_of_distance(data, emulation.error, z, jacobian, scale).max(axis=1) >= 0.9
+    error = np.tile(emulation.error, (len(z), 1))
+    low, middle = np.quantile(z, [0.25, 0.5], axis=0)
+    depth = np.where(is_log, (middle - z) / np.maximum(middle - low, 1e-300), 0.0).max(axis=1)
+    rows = np.argsort(-depth)[:2]
+    rows = rows[depth[rows] > 6]
+    if rows.size and not (likelihood.has_table or likelihood.calls_response):
+        by_readings = 3 * data.readings.comparison_sd(0 * emulation.error)[rows]
+        misfit = np.abs(runs(z[rows]) - data.readings.values[rows])
+        error[rows] = np.fmax(error[rows], misfit - by_readings)
+        jacobian[rows[:, None], :, ended] = np.moveaxis(secants(runs, rows), -1, 1)
+    shares = shares_of_distance(data, error, z, jacobian, scale).max(axis=1)
+    if shares.max() <= 0.03:
+        return []
+    density = partial(SpecimenPopulations(likelihood).log_likelihoods, draws.thetas)
+    tilts = np.zeros(len(z))
+    for step in steps:
+        low, high = (density(at[:, None], np.zeros((len(z), 1))) for at in (z - step, z + step))
+        is_finite = np.isfinite(low) & np.isfinite(high)
+        change = np.subtract(high, low, where=is_finite, out=np.zeros(low.shape))
+        tilts = np.maximum(tilts, shares * change.std(axis=0))
+    worst = int(tilts.argmax())
+    if not np.sqrt((tilts**2).sum()) > 0.1:
+        return []
+    if at_end[worst]:
+        refuse_at_end(data, worst)
+    label = worst if data.labels is None else data.labels[worst]
+    text = (
+        f"{likelihood.name}: the input of specimen {label} is so near an end of its range that the "
+        f"emulator's error is {shares[worst]:.0%} of the distance: posterior means may be off by "
+        f"{tilts[worst]:.1g} standard deviations or more; pass "
+        "metric=prb.LogLikelihood(error=...) with the error of the readings."
+    )
+    return [Finding("emulator-error", text, "likelihood.md#emulator-error")]
 
 
 def _data_findings(

@@ -37,7 +37,7 @@ from prbayes.model.evaluator import (
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, variables_at
-from prbayes.model.specimen_audit import audited_evaluator
+from prbayes.model.specimen_audit import audited_evaluator, unaudited
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
@@ -58,6 +58,7 @@ from prbayes.optimize.optimum import (
     point_text,
     require_sampling,
 )
+from prbayes.response.budget import BudgetError, lift
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.specimens.points import agreeing_points, fit_proposals
 
@@ -105,7 +106,12 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
         is_audited = [mode.value - modes[0].value <= (0.0 if is_last else 6.0) for mode in modes]
-        latest = audited_evaluator(evaluator, thetas[is_audited], is_last=is_last)
+        spent: tuple[Finding, ...] = ()
+        try:
+            latest = audited_evaluator(evaluator, thetas[is_audited], is_last=is_last)
+        except BudgetError as error:
+            spent, latest = unaudited(error, "the optima", "prb.minimize"), evaluator
+            lift()
         if latest is evaluator:
             break
         evaluator = latest
@@ -121,7 +127,10 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious
     if not is_supported.any():
         findings += report(_UNSUPPORTED)
-    findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
+    findings += [
+        *spent,
+        *report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known])),
+    ]
     local_optima = tuple(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
         | {"weight": float(weight)}

@@ -46,6 +46,7 @@ from prbayes.model.fingerprint import (
     identity_from_attributes,
     identity_of,
     require_same,
+    require_same_responses,
 )
 from prbayes.model.locking import locked
 from prbayes.model.parameters import (
@@ -556,7 +557,9 @@ def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
 
 def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) -> None:
     """Raise with all differences if a result is of another problem than a model's."""
-    require_same(identity_in(result), identity_of(model), caller, level)
+    identity, expected = identity_in(result), identity_of(model)
+    require_same(identity, expected, caller, level)
+    require_same_responses(identity, expected, model, caller)
 
 
 def identity_in(result: Any) -> Identity | None:

@@ -19,7 +19,7 @@ from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
-from prbayes.model.specimen_audit import audited_evaluator
+from prbayes.model.specimen_audit import audited_evaluator, unaudited
 from prbayes.numerics.modes import Laplace, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum, point_text
@@ -34,7 +34,7 @@ from prbayes.posterior.smc import (
     result_of,
 )
 from prbayes.posterior.target import Target, posterior_target
-from prbayes.response.budget import limited
+from prbayes.response.budget import BudgetError, limited
 from prbayes.response.inputs import model_on_context
 
 
@@ -158,6 +158,7 @@ def draw_posterior(
     settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
         chains = None
+        findings: tuple[Finding, ...] = ()
         for round_ in range(MAX_ROUNDS + 1):
             target = posterior_target(evaluator, optimum)
             modes = modes_of(target)
@@ -175,16 +176,20 @@ def draw_posterior(
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
             latest = evaluator
-            if is_audited:
-                latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
-            if not refine_at(latest, thetas[:THETAS]) and latest is evaluator:
+            try:
+                if is_audited:
+                    latest = audited_evaluator(evaluator, thetas, is_last=round_ == MAX_ROUNDS)
+                if not refine_at(latest, thetas[:THETAS]) and latest is evaluator:
+                    break
+            except BudgetError as spent:
+                findings = unaudited(spent, "the draws", "prb.sample")
                 break
             evaluator = latest
         if chains is None:
             return smc.sample(evaluator, settings)
         if modes is not None:
-            modal = mode_findings(target, modes, chains.thetas)
-            chains = replace(chains, findings=report(*modal))
+            findings += report(*mode_findings(target, modes, chains.thetas))
+            chains = replace(chains, findings=findings)
         return result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
 
 

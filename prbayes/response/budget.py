@@ -80,6 +80,11 @@ def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
 unlimited = partial(limited, None, None)
 
 
+def lift() -> None:
+    """Suspend the budget in the rest of a `limited` block, for work that costs no response."""
+    _current.set(Budget())
+
+
 @dataclass(frozen=True)
 class RunCost:
     """Runs of the response that a propagation needs."""

@@ -44,7 +44,6 @@ from prbayes.model.fingerprint import (
     Level,
     as_attributes,
     identity_of,
-    require_same_responses,
 )
 from prbayes.model.locking import locked
 from prbayes.model.parameters import element_name, finite_draws, fixed_values
@@ -402,7 +401,6 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
     model = model_on_context(model, caller)
     if not (isinstance(result, Optimum) and model is result.model):
         require_of_model(result, model, caller, Level.POPULATIONS)
-        require_same_responses(identity_in(result), model, caller)
     return model
 
 

@@ -147,6 +147,11 @@ class Likely:
         of_population = (root**2).sum(axis=1)
         return bool((variance <= largest**2 * of_population).all())
 
+    def best(self) -> Floats:
+        """Return the likeliest input of each specimen, (N, d)."""
+        best = self.weights.argmax(axis=1)
+        return self.points.z[np.arange(len(best)), best]
+
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
         """Return inputs, (count, d), that are likely under a wider population.
 
@@ -428,9 +433,24 @@ def _with_bias_at_ends(
     """
     if data.ends is None or np.isinf(data.ends).all():
         return emulation
-    best = likely.weights.argmax(axis=1)
-    z = likely.points.z[np.arange(len(best)), best]
-    _, jacobian = emulation(z)
+    z = likely.best()
+    share = shares_of_distance(data, emulation.error, z, emulation(z)[1])
+    at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
+    return replace(emulation, bias=max(emulation.bias, float(at_ends)))
+
+
+def shares_of_distance(
+    data: SpecimenData,
+    error: Floats,
+    z: Floats,
+    jacobian: Floats,
+    scale: Floats | float = np.inf,
+) -> Floats:
+    """Return errors of inputs z, (N, d), in units of their distances from the ends, (N, free).
+
+    ``error``, (m,), is that of the emulator, ``jacobian``, (N, m, d), its slope. ``scale``, (d,),
+    is the largest distance. Shares above 3 are 3.
+    """
 
     def input_sd(sd: Floats) -> Floats:
         """Return standard deviations of the inputs, (N, free), by those of the outputs, (N, m)."""
@@ -438,17 +458,17 @@ def _with_bias_at_ends(
         covariance = np.linalg.pinv(slopes.swapaxes(1, 2) @ slopes)
         return np.asarray(np.sqrt(np.einsum("ndd->nd", covariance)))
 
-    by_emulator = input_sd(np.where(data.readings.is_measured, emulation.error, np.inf))
-    by_all = input_sd(data.readings.comparison_sd(emulation.error))
+    by_emulator = input_sd(np.where(data.readings.is_measured, error, np.inf))
+    by_all = input_sd(data.readings.comparison_sd(error))
     # Errors of readings smooth the density near the end, so that the emulator's error is compared
     # with them as well as with the distance.
     by_readings = np.sqrt(np.maximum(by_all**2 - by_emulator**2, 0.0))
+    low, high = (-np.inf, np.inf) if data.ends is None else data.ends
     # The distance is reduced by three standard deviations, because the input is not known exactly.
-    distance = np.minimum(z - data.ends[0], data.ends[1] - z)[:, data.free] - 3 * by_emulator
+    distance = np.minimum(z - low, high - z)[:, data.free] - 3 * by_emulator
+    distance = np.minimum(distance, np.broadcast_to(scale, z.shape)[:, data.free])
     share = by_emulator / np.maximum(np.maximum(distance, by_readings), 1e-300)
-    share = np.clip(share, 0.0, 3.0)
-    at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
-    return replace(emulation, bias=max(emulation.bias, float(at_ends)))
+    return np.asarray(np.nan_to_num(np.clip(share, 0.0, 3.0)))
 
 
 def _near_population(
@@ -593,12 +613,25 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
     return emulation
 
 
+def refuse_at_end(data: SpecimenData, specimen: int) -> None:
+    """Raise for a specimen whose input is nearer to an end of its range than it is known."""
+    label = specimen if data.labels is None else data.labels[specimen]
+    raise DesignError(
+        f"{data.name}: got an exact reading of specimen {label} whose input is at an end of the "
+        "input's range, or nearer to it than the emulator is accurate, where densities of "
+        "populations may be infinite or zero; expected readings farther from the end; pass "
+        "metric=prb.LogLikelihood(error=...) with the standard deviation of the readings' error"
+    )
+
+
 def require_accurate(data: SpecimenData, emulation: Emulation, likely: Likely) -> None:
     """Raise an error that names the output and the specimen at which the emulator is worst."""
     share = emulation.error / data.readings.spread()
     output = int(np.argmax(share))
-    best = likely.weights.argmax(axis=1)
-    z = likely.points.z[np.arange(len(best)), best]
+    z = likely.best()
+    shares = shares_of_distance(data, emulation.error, z, emulation(z)[1]).max(axis=1)
+    if np.sqrt((shares**2).mean()) > 0.1:
+        refuse_at_end(data, int(shares.argmax()))
     variance = emulation.surface.variance(z)[:, output]
     is_read = data.readings.is_measured[:, output]
     specimen = int(np.argmax(np.where(is_read, variance, -1.0)))

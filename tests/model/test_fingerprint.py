@@ -30,6 +30,7 @@ from prbayes.model.fingerprint import (
     require_same,
 )
 from prbayes.model.random_variable import nodes
+from prbayes.model.specimen_likelihood import measurements_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import Propagation
 
@@ -212,7 +213,7 @@ def test_an_identity_computes_no_response_and_compares_them(
     count, draws = node.bound.responses.count, node.bound.draws
     found = identity_of(evaluator)
     assert (node.bound.responses.count, node.bound.draws) == (count, draws)
-    assert len(found.simulators[0].responses) == 8
+    assert len(found.simulators[0].responses) == 16
     assert len(found.log_prior) == 4
     changed = identity_of(Problem(slope=4.0, propagation=propagation).model())
     texts = problem_differences(changed, found, Level.POPULATIONS)
@@ -388,7 +389,7 @@ def test_other_responses_are_refused_like_other_data(pair: str) -> None:
 
 @pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
 def test_predict_compares_responses_also_with_another_prior(propagation: Any) -> None:
-    """Design points are drawn through the prior: two responses are computed at those stored."""
+    """Design points are drawn through the prior: responses are computed at those stored."""
     same, wrong = (
         Problem(prior=(1.5, 1.0), slope=slope, propagation=propagation).model()
         for slope in (2.0, 2.01)
@@ -398,10 +399,116 @@ def test_predict_compares_responses_also_with_another_prior(propagation: Any) ->
         before = responses.count
         x = pm.Normal.dist(same["mu"], 1.0)
         prb.predict(result, np.positive, x, model=same, stored=False)
-        assert responses.count == before + 2
+        # The function reads the prior from its closure, and therefore counts as another one.
+        assert responses.count == before + 2 + 16
         x = pm.Normal.dist(wrong["mu"], 1.0)
         with pytest.raises(ValueError, match="the response of y has other values at the same poi"):
             prb.predict(result, np.positive, x, model=wrong, stored=False)
+
+
+# Log-likelihoods by specimen, whose models have no runs before their first use.
+
+
+def likelihood_model(
+    response: Callable[..., Any], n_outputs: int = 0, mean: float = 2.0, **given: Any
+) -> pm.Model:
+    observed = OBSERVED[:12, None] + np.zeros(n_outputs) if n_outputs else OBSERVED[:12]
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", mean, 2.0), pm.HalfNormal("sigma", 2.0), name="x")
+        prb.Simulator("y", response, x, **({"observed": observed} | given))
+    return model
+
+
+def times(slope: float, change: float = 0.0, n_outputs: int = 0) -> Callable[[Any], Any]:
+    def response(x: Any) -> Any:
+        y = slope * x + np.where(np.abs(x - 2.0) < 1.0, change, 0.0)
+        return y[..., None] + np.zeros(n_outputs) if n_outputs else y
+
+    return response
+
+
+@cache
+def fitted_likelihood() -> tuple[Optimum, xr.DataTree]:
+    model = likelihood_model(times(1.0))
+    return prb.minimize(model, **QUIET), prb.sample(100, model=model, random_seed=1, **QUIET)
+
+
+USES: dict[str, Callable[[Any, pm.Model], Any]] = {
+    "diagnose": lambda result, model: prb.diagnose(result, model=model),
+    "compare": lambda result, model: prb.compare({"a": result}, model=model),
+    "population": lambda result, model: prb.population(result, model=model),
+    "individuals": lambda result, model: prb.individuals(result, model=model),
+    "Report": lambda result, model: report(
+        **{"optimum" if isinstance(result, Optimum) else "posterior": result}, model=model
+    ),
+}
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("slope", [2.0, 1.01])
+def test_a_likelihood_of_another_response_is_refused(use: str, slope: float) -> None:
+    for result in fitted_likelihood():
+        with pytest.raises(ValueError, match="the response of y has other values at the same po"):
+            USES[use](result, likelihood_model(times(slope)))
+
+
+@pytest.mark.parametrize("use", USES)
+def test_a_likelihood_of_the_same_response_is_accepted(
+    use: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for result in fitted_likelihood():
+        USES[use](result, likelihood_model(times(1.0)))
+    assert "other-code" not in {getattr(record, "code", "") for record in caplog.records}
+
+
+def test_the_same_code_computes_no_run_before_the_first_use() -> None:
+    model = likelihood_model(times(1.0))
+    prb.population(fitted_likelihood()[1], model=model)
+    (measurement,) = measurements_of(model).values()
+    # Twice in a trial at the simulator's creation, which is no run of the emulator.
+    assert measurement.responses.computed == 0
+
+
+def test_other_priors_leave_responses_comparable() -> None:
+    for mean, slope in ((1.5, 1.0), (1.5, 1.01)):
+        model = likelihood_model(times(slope), mean=mean)
+        if slope == 1:
+            prb.compare({"a": fitted_likelihood()[1]}, model=model)
+            continue
+        with pytest.raises(ValueError, match="the response of y has other values"):
+            prb.compare({"a": fitted_likelihood()[1]}, model=model)
+
+
+def test_other_code_with_the_same_runs_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    def tail(x: Any) -> Any:
+        return 1.0 * x + np.where(x > 1e3, 1.0, 0.0)
+
+    prb.population(fitted_likelihood()[1], model=likelihood_model(tail))
+    (text,) = [r.getMessage() for r in caplog.records if getattr(r, "code", "") == "other-code"]
+    assert "y: its code, or a file that it names, has changed since the result was made" in text
+
+
+def test_a_change_near_the_data_is_found_by_the_stored_runs() -> None:
+    with pytest.raises(ValueError, match="the response of y has other values"):
+        prb.population(fitted_likelihood()[1], model=likelihood_model(times(1.0, change=0.1)))
+
+
+def test_curves_of_many_outputs_have_an_identity_in_a_file() -> None:
+    error = {"metric": prb.LogLikelihood(error=0.5)}
+    models = [likelihood_model(times(s, n_outputs=1000), 1000, **error) for s in (1.0, 1.01)]
+    result = prb.minimize(models[0], **QUIET).to_datatree()
+    assert identity_from_attributes(result["optimum"].attrs) is not None
+    with pytest.raises(ValueError, match="the response of y has other values"):
+        prb.compare({"a": result}, model=models[1])
+
+
+def test_tables_of_other_runs_are_refused() -> None:
+    x = np.linspace(-10.0, 14.0, 80)
+    tables = [prb.Runs({"x": x}, slope * x) for slope in (1.0, 1.0, 1.01)]
+    result = prb.minimize(likelihood_model(tables[0]), **QUIET)
+    prb.compare({"a": result}, model=likelihood_model(tables[1]))
+    with pytest.raises(ValueError, match="the response of y has other values"):
+        prb.compare({"a": result}, model=likelihood_model(tables[2]))
 
 
 @pytest.mark.long

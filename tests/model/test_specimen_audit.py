@@ -8,6 +8,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes._finding import Finding, from_json
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_preparation import prepared
@@ -49,6 +50,10 @@ def exact(of_mu: tuple[float, float], of_sigma: float, x: Any) -> tuple[Any, Any
     return mean, np.sqrt(square - mean**2)
 
 
+def findings_of(result: Any) -> tuple[Finding, ...]:
+    return from_json(result["posterior"].attrs["findings"])
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
     response, *priors, x = PROBLEMS[name]
@@ -65,6 +70,37 @@ def test_the_maximum_is_at_inputs_that_exist(name: str) -> None:
     optimum = prb.minimize(build(response, *priors, x))
     np.testing.assert_allclose(optimum.theta[0], x.mean(), rtol=1e-3)
     assert optimum.local_optima == ()
+
+
+@pytest.mark.parametrize("most", [74, 110])
+def test_a_budget_that_ends_in_the_audit_keeps_the_draws(most: int) -> None:
+    model = build(*PROBLEMS["pole"])
+    result = prb.sample(model=model, max_runs=most, random_seed=1)
+    assert result.posterior.sizes["draw"] == 1000
+    (text,) = [f.text for f in findings_of(result) if f.code == "budget-spent"]
+    assert text.startswith(f"max_runs = {most} was reached before the runs were checked at the dra")
+    # A larger budget gives the same as a new model.
+    again = prb.sample(model=model, max_runs=300, random_seed=1)
+    expected, sd = exact(*PROBLEMS["pole"][1:])
+    assert "budget-spent" not in {f.code for f in findings_of(again)}
+    np.testing.assert_allclose(again.posterior["mu"].mean(), expected[0], atol=0.1 * sd[0])
+
+
+def test_a_budget_that_ends_in_the_audit_keeps_the_optimum() -> None:
+    model = build(*PROBLEMS["pole"])
+    optimum = prb.minimize(model, max_runs=90)
+    (text,) = [f.text for f in optimum.findings if f.code == "budget-spent"]
+    assert text.startswith("max_runs = 90 was reached before the runs were checked at the optima")
+    again = prb.minimize(model)
+    assert "budget-spent" not in {f.code for f in again.findings}
+    assert again.point["mu"] == pytest.approx(PROBLEMS["pole"][3].mean(), rel=1e-3)
+
+
+def test_a_budget_of_the_first_runs_gives_no_answer() -> None:
+    with pytest.raises(
+        prb.response.BudgetError, match="max_runs = 40 was reached before there was"
+    ):
+        prb.sample(model=build(*PROBLEMS["pole"]), max_runs=40)
 
 
 def test_a_smooth_response_needs_no_further_run() -> None:
