@@ -90,7 +90,7 @@ def test_a_selected_product_is_displayed(
 ) -> None:
     name = str(fleet["products"]["product"].values[1])
     product = select(fleet, name)
-    assert repr(product).startswith("1 product\n")
+    assert repr(product).startswith("1 product")
     assert name in product._repr_html_()
     table = product.to_dataframe()
     assert list(table.index) == [name]
