@@ -579,9 +579,14 @@ class SpecimenPopulations:
                 logs = np.logaddexp(np.log(0.9) + logs, log_gross)
             return np.asarray(logs.sum(axis=1))
 
+        def tempered(log_weights: Floats, thetas: Floats) -> tuple[Floats, float]:
+            if not np.isfinite(log_weights).any():
+                self._refuse_unlikely(self.log_likelihoods(thetas[:256], z, log_a))
+            return _tempered(log_weights, 10 * d)
+
         thetas = names.prior_points(2048, seed)
         log_weights = log_posterior(names, thetas, log_likelihood) - names.log_prior(thetas)
-        weights, _ = _tempered(log_weights, 10 * d)
+        weights, _ = tempered(log_weights, thetas)
         for attempt in range(12):
             mean = weights @ thetas
             away = thetas - mean
@@ -593,21 +598,26 @@ class SpecimenPopulations:
             thetas = mean + standard @ root.T
             log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
             log_density = log_posterior(names, thetas, log_likelihood)
-            weights, temper = _tempered(log_density - log_proposal, 10 * d)
+            weights, temper = tempered(log_density - log_proposal, thetas)
             if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
                 break
         rng = np.random.default_rng([seed, 5])
         return PopulationDraws(self, thetas[rng.choice(len(thetas), 256, p=weights)])
 
+    def _refuse_unlikely(self, logs: Floats) -> None:
+        """Raise for the specimen that the fewest populations reach, from log-likelihoods (S, N)."""
+        specimen = int(np.isfinite(logs).mean(axis=0).argmin())
+        labels = specimen_labels(self.likelihood)
+        label = specimen if labels is None else labels[specimen]
+        raise ValueError(
+            f"{self.likelihood.name}: got no population of the prior that reaches the inputs of "
+            f"specimen {label}, expected one at least; look at the priors and at the data's units, "
+            "and pass prb.LogLikelihood(error=...) if readings have an error"
+        )
+
 
 def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
     """Return normalised weights and the exponent that gives them a least effective sample size."""
-    if not np.isfinite(log_weights).any():
-        raise ValueError(
-            "log-likelihood: got no population of the prior that reaches the specimens, expected "
-            "one at least; look at the priors and at the data's units, and pass "
-            "prb.LogLikelihood(error=...) if readings have an error"
-        )
     temper = 1.0
     while True:
         scaled = temper * (log_weights - log_weights.max())

@@ -122,7 +122,9 @@ def test_specimens_that_no_population_reaches() -> None:
         end = pm.Uniform("end", 1, 2)
         prb.Simulator("y", lambda x: x, pm.Uniform.dist(0, end), observed=X)
     populations = populations_of(model)
-    with pytest.raises(ValueError, match="no population of the prior that reaches the specimens"):
+    with pytest.raises(
+        ValueError, match="no population of the prior that reaches the inputs of specimen"
+    ):
         populations.posterior(*points_at(populations, X + 10))
 
 
