@@ -184,22 +184,20 @@ def plan(
     populations = Populations.of(
         result, model, 2000, caller, call_settings(executor, store, version)
     )
-    evaluator = populations.evaluator
     quantity_sample = None
     findings: tuple[Finding, ...] = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
         findings, error = quantity_sample.checked_quantity(quantity)
-    unit = evaluator.hyperparameters.prior_sd
+    unit = populations.evaluator.hyperparameters.prior_sd
     modes = [populations.thetas[rows] for rows in rows_by_mode(populations.thetas / unit)]
     findings += report(*_several_modes(populations, modes))
     draws = [Draws.of(thetas, unit) for thetas in modes]
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
     now = forecast.sd([np.zeros((unit.size, unit.size))] * len(modes))
     _refuse_target(target, list(now))
-    centers = [populations.center]
-    if len(modes) > 1:
-        centers = [np.median(thetas, axis=0) for thetas in modes]
+    is_single = len(modes) == 1
+    centers = [populations.center if is_single else np.median(thetas, axis=0) for thetas in modes]
     samples = {
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()

@@ -17,7 +17,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
@@ -357,38 +357,23 @@ def _end_findings(
     ended = [k for k in data.free if np.isfinite(distance[:, k]).all()]
     if not ended:
         return []
-    steps = [np.where(np.arange(z.shape[1]) == k, 0.5 * distance, 0.0) for k in ended]
-
-    def secants(values: Callable[[Floats], Floats], rows: Indices) -> Floats:
-        """Return changes of the values over half a distance to both sides, (k, m, ended)."""
-        changes = [values((z + step)[rows]) - values((z - step)[rows]) for step in steps]
-        return np.asarray(np.stack(changes, axis=-1) / distance[rows][:, None, ended])
-
     # Secants, because the slopes of a surface say nothing of changes that are smaller than its
     # error.
     _, jacobian = emulation(z)
-    jacobian[:, :, ended] = secants(emulation.values, np.arange(len(z)))
+    jacobian[:, :, ended] = secants(emulation.values, z, distance, ended)
     at_end = shares_of_distance(data, emulation.error, z, jacobian, scale).max(axis=1) >= 0.9
     error = np.tile(emulation.error, (len(z), 1))
-    low, middle = np.quantile(z, [0.25, 0.5], axis=0)
-    depth = np.where(is_log, (middle - z) / np.maximum(middle - low, 1e-300), 0.0).max(axis=1)
-    rows = np.argsort(-depth)[:2]
-    rows = rows[depth[rows] > 6]
+    rows = low_outliers(z, is_log)
     if rows.size and not (likelihood.has_table or likelihood.calls_response):
         by_readings = 3 * data.readings.comparison_sd(0 * emulation.error)[rows]
         misfit = np.abs(runs(z[rows]) - data.readings.values[rows])
         error[rows] = np.fmax(error[rows], misfit - by_readings)
-        jacobian[rows[:, None], :, ended] = np.moveaxis(secants(runs, rows), -1, 1)
+        slopes = secants(runs, z[rows], distance[rows], ended)
+        jacobian[rows[:, None], :, ended] = np.moveaxis(slopes, -1, 1)
     shares = shares_of_distance(data, error, z, jacobian, scale).max(axis=1)
     if shares.max() <= 0.03:
         return []
-    density = partial(SpecimenPopulations(likelihood).log_likelihoods, draws.thetas)
-    tilts = np.zeros(len(z))
-    for step in steps:
-        low, high = (density(at[:, None], np.zeros((len(z), 1))) for at in (z - step, z + step))
-        is_finite = np.isfinite(low) & np.isfinite(high)
-        change = np.subtract(high, low, where=is_finite, out=np.zeros(low.shape))
-        tilts = np.maximum(tilts, shares * change.std(axis=0))
+    tilts = shares * log_density_changes(likelihood, draws.thetas, two_sides(z, distance, ended))
     worst = int(tilts.argmax())
     if not np.sqrt((tilts**2).sum()) > 0.1:
         return []
@@ -402,6 +387,48 @@ def _end_findings(
         "metric=prb.LogLikelihood(error=...) with the error of the readings."
     )
     return [Finding("emulator-error", text, "likelihood.md#emulator-error")]
+
+
+def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Floats, Floats]]:
+    """Return points half a distance, (n, d), below and above z in each of the columns."""
+    steps = [np.where(np.arange(z.shape[1]) == k, 0.5 * distance, 0.0) for k in columns]
+    return [(z - step, z + step) for step in steps]
+
+
+def secants(
+    values: Callable[[Floats], Floats], z: Floats, distance: Floats, columns: list[int]
+) -> Floats:
+    """Return slopes of values (n, m) over half a distance to both sides, (n, m, columns)."""
+    changes = [values(high) - values(low) for low, high in two_sides(z, distance, columns)]
+    return np.asarray(np.stack(changes, axis=-1) / distance[:, None, columns])
+
+
+def low_outliers(z: Floats, is_log: Bools) -> Indices:
+    """Return at most two rows of z, (n, d), that are far below the others in a logarithmic column.
+
+    They are more than six times as far below the median as the lower quartile.
+    """
+    low, middle = np.quantile(z, [0.25, 0.5], axis=0)
+    depth = np.where(is_log, (middle - z) / np.maximum(middle - low, 1e-300), 0.0).max(axis=1)
+    rows = np.argsort(-depth)[:2]
+    return rows[depth[rows] > 6]
+
+
+def log_density_changes(
+    likelihood: SpecimenLikelihood, thetas: Floats, sides: Sequence[tuple[Floats, Floats]]
+) -> Floats:
+    """Return the largest standard deviation over thetas of changes of log-densities, (n,).
+
+    The changes are those of the populations' log-densities between two points of each specimen.
+    """
+    density = partial(SpecimenPopulations(likelihood).log_likelihoods, thetas)
+    deviations = []
+    for points in sides:
+        low, high = (density(z[:, None], np.zeros((len(z), 1))) for z in points)
+        is_finite = np.isfinite(low) & np.isfinite(high)
+        change = np.subtract(high, low, where=is_finite, out=np.zeros(low.shape))
+        deviations.append(change.std(axis=0))
+    return np.max(deviations, axis=0)
 
 
 def _data_findings(

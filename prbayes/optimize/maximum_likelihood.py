@@ -92,16 +92,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
             optima.append(_descend(objective, start, settings))
             if objective.count > settings.max_evaluations:
                 break
-        preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
-        # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
-        errors = [
-            max(preparation.points.difference, likelihood.options.half_difference)
-            for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
-        ]
-        is_supported = _supported(evaluator, optima)
-        if is_supported.any():
-            optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
-        modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+        modes, is_supported = supported_modes(evaluator, objective, optima)
         thetas = np.stack([mode.theta for mode in modes])
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
@@ -123,9 +114,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     else:
         log_prior = hyperparameters.log_prior(thetas)
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
-    findings = [finding for preparation in preparations for finding in preparation.findings]
-    n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious
-    if not is_supported.any():
+    findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
+    n_known = len(modes) if is_supported else 1  # the other modes are spurious
+    if not is_supported:
         findings += report(_UNSUPPORTED)
     findings += [
         *spent,
@@ -139,7 +130,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
     # The covariance is NaN at the edge of a support.
     is_jump = np.isnan(best.covariance).any()
-    is_converged = best.converged and not is_jump and bool(is_supported.any())
+    is_converged = best.converged and not is_jump and is_supported
     return Optimum(
         point=point,
         stderr=stderr,
@@ -189,6 +180,25 @@ def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
     return np.sqrt(variance) <= largest
+
+
+def supported_modes(
+    evaluator: Evaluator, objective: _Objective, optima: Sequence[Mode]
+) -> tuple[list[Mode], bool]:
+    """Return the distinct optima, best first, without spurious ones, and whether any is supported.
+
+    If all optima are spurious, none is left out.
+    """
+    # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
+    errors = [
+        max(prepared(likelihood).points.difference, likelihood.options.half_difference)
+        for likelihood in evaluator.likelihoods
+    ]
+    is_supported = _supported(evaluator, optima)
+    if is_supported.any():
+        optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
+    modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+    return modes, bool(is_supported.any())
 
 
 def mode_weights(
@@ -397,14 +407,14 @@ def _values_beside(objective: _Objective, theta: Floats, shift: Floats) -> Float
     return np.array([objective(theta + shift)[0], objective(theta - shift)[0]])
 
 
-def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:
+def _distinct(optima: Sequence[Mode], objective: _Objective, error: float) -> list[Mode]:
     """Return the modes within 30 nats of the best optimum, best first.
 
     Optima closer than a hundredth of the prior's width are the same.
     """
     ordered = sorted((o for o in optima if np.isfinite(o.value)), key=lambda o: o.value)
     if not ordered:
-        return optima[:1]
+        return list(optima[:1])
     modes = ordered[:1]
     for optimum in ordered[1:]:
         if optimum.value > ordered[0].value + 30 or not optimum.converged:

@@ -32,7 +32,8 @@ from prbayes.inference.checks.population import (
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import element_names, variables_at
-from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators, arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import (
@@ -110,11 +111,13 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
     return Checked(remarks=tuple(remarks))
 
 
-def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
-    """Report the error of the surface of each table of runs, as a finding from ``largest`` on.
+def check_simulators(evaluator: Evaluator) -> Checked:
+    """Report the error of the surface of each table of runs, and specimens without labels.
 
-    An error of a tenth of a standard deviation of the data widens populations by half a percent.
+    An error above a tenth of a standard deviation of the data, which widens populations by half a
+    percent, is a finding.
     """
+    largest = 0.1
     checked = Checked()
     for simulator in evaluator.simulators:
         table = simulator.responses.function
@@ -127,7 +130,7 @@ def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
             )
             report = (Finding("table-error", text, "runs.md#the-error-of-the-surface"),)
             checked += Checked(report) if share > largest else Checked(remarks=report)
-    return checked
+    return checked + Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))
 
 
 # -- population ------------------------------------------------------------------------------

@@ -222,8 +222,7 @@ def sequential_design(
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
         is_complete = batches >= enough or len(emulation.z) >= most
-        is_open = likely.proposals.is_open()
-        can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
+        can_correct = may_correct(data, likely) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it matters less, because the inputs are not known well.
         is_last = further >= (1 if has_fewer_readings else 2) or len(emulation.z) >= most
@@ -244,23 +243,31 @@ def sequential_design(
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
-                is_good = bool(may_be_rough) or len(emulation.z) >= most
+                is_good = may_be_rough or len(emulation.z) >= most
             if is_good:
                 return emulation, plausible.of_emulation(data, emulation)
         if len(emulation.z) >= most:
-            if not likely.proposals.is_open() and most_corrections(*data.known.shape):
+            if may_correct(data, likely):
                 emulation = corrected(run, data, emulation, population)
             if emulation.bias > data.options.bias:
                 require_accurate(data, emulation, likely)
             return emulation, Plausible.of(data, emulation, wider(population))
-        # A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and
-        # at most three times the first runs.
-        share = 2 if emulation.bias > 3 * data.options.bias else 4
-        growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
-        count = max(data.options.sampled + 2, growth if previous is None else 0)
+        count = data.options.sampled + 2
+        if previous is None:
+            count = max(count, batch_size(data, emulation))
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def batch_size(data: SpecimenData, emulation: Emulation) -> int:
+    """Return the number of runs by which an emulation of no other data grows.
+
+    A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and at
+    most three times the first runs.
+    """
+    share = 2 if emulation.bias > 3 * data.options.bias else 4
+    return min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
 
 
 def wider(population: Normal) -> Normal:
@@ -575,6 +582,11 @@ def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) ->
 def most_corrections(specimens: int, dimensions: int) -> int:
     """Return the largest number of runs of corrections: three a specimen, none for many."""
     return 3 * specimens if 2 * specimens <= most_runs(dimensions) else 0
+
+
+def may_correct(data: SpecimenData, likely: Likely) -> bool:
+    """Return whether the readings determine the inputs of the specimens, and these are not many."""
+    return not likely.proposals.is_open() and most_corrections(*data.known.shape) > 0
 
 
 def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: Normal) -> Emulation:
