@@ -20,7 +20,7 @@ from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, variables_at
+from prbayes.model.parameters import Hyperparameters, joined_graphs, variables_at
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -236,7 +236,7 @@ class Evaluator:
                 value = pt.switch(
                     log_prior > -np.inf, total - log_prior if prior else total, np.inf
                 )
-                (value,), theta = self.hyperparameters.joined([value])
+                (value,), theta = joined_graphs(self.hyperparameters, [value])
                 outputs = [value, pt.grad(value, theta)] if gradient else [value]
                 self.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
         function = self.functions[key]

@@ -103,18 +103,13 @@ class Hyperparameters:
         with interpreted():
             return cls(model, model.initial_point(random_seed=0))
 
-    def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
-        """Return graphs of the value variables as graphs of one vector theta, and that vector."""
-        outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
-        return without_dims(outputs), theta
-
     def compile(self, graphs: Sequence[Any]) -> Any:
         """Compile graphs of the value variables into a function of thetas, shape (P, d).
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
         with interpreted():
-            outputs, theta = self.joined(graphs)
+            outputs, theta = joined_graphs(self, graphs)
             batch = pt.dmatrix("thetas")
             batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
             return compiled([batch], batched)
@@ -141,10 +136,6 @@ class Hyperparameters:
         values = self._log_prior(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(sum(values), len(thetas)))
 
-    def in_support(self, thetas: Floats) -> Any:
-        """Return which thetas have a finite log prior, shape (P,)."""
-        return np.isfinite(self.log_prior(thetas))
-
     @cached_property
     @interpreted()
     def _constrain(self) -> Any:
@@ -164,36 +155,6 @@ class Hyperparameters:
             variable.name: np.array(np.broadcast_to(value, (size, *np.shape(value)[1:])))
             for variable, value in zip(variables, values, strict=True)
         }
-
-    def unconstrained(self, point: Mapping[str, Any]) -> Floats:
-        """Return theta, shape (d,), of a point given in the user's own units.
-
-        Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
-        value is outside its support.
-        """
-        if not isinstance(point, Mapping):
-            raise TypeError(
-                f"start: got {called(point)}, expected a dict with a value for each free variable"
-            )
-        free = {rv.name: rv for rv in self.model.free_RVs}
-        if set(point) != set(free):
-            raise KeyError(
-                f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
-            )
-        draws = []
-        for name, rv in free.items():
-            value = real_array(point[name], f"start: {name}")
-            shape = event_shape(rv)
-            if value.shape not in ((), shape):
-                raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
-            draws.append(np.broadcast_to(value, shape)[None])
-        thetas = self.thetas_of(draws)
-        if not (np.isfinite(thetas).all() and self.in_support(thetas).all()):
-            raise ValueError(
-                f"start: got {dict(point)}, expected values inside the support of the priors"
-            )
-        theta: Floats = thetas[0]
-        return theta
 
     @cached_property
     @interpreted()
@@ -255,6 +216,50 @@ class Hyperparameters:
             return self.prior_thetas(size, seed)
         thetas = self.thetas_of(self.quantiles(sobol(size, self.quantiles.size, seed)))
         return np.where(np.isfinite(thetas), thetas, self.initial)
+
+
+def joined_graphs(hyperparameters: Hyperparameters, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
+    """Return graphs of the value variables as graphs of one vector theta, and that vector."""
+    outputs, theta = join_nonshared_inputs(
+        hyperparameters.point, list(graphs), hyperparameters.model.value_vars
+    )
+    return without_dims(outputs), theta
+
+
+def in_support(hyperparameters: Hyperparameters, thetas: Floats) -> Any:
+    """Return which thetas have a finite log prior, shape (P,)."""
+    return np.isfinite(hyperparameters.log_prior(thetas))
+
+
+def unconstrained(hyperparameters: Hyperparameters, point: Mapping[str, Any]) -> Floats:
+    """Return theta, shape (d,), of a point given in the user's own units.
+
+    Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
+    value is outside its support.
+    """
+    if not isinstance(point, Mapping):
+        raise TypeError(
+            f"start: got {called(point)}, expected a dict with a value for each free variable"
+        )
+    free = {rv.name: rv for rv in hyperparameters.model.free_RVs}
+    if set(point) != set(free):
+        raise KeyError(
+            f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
+        )
+    draws = []
+    for name, rv in free.items():
+        value = real_array(point[name], f"start: {name}")
+        shape = event_shape(rv)
+        if value.shape not in ((), shape):
+            raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
+        draws.append(np.broadcast_to(value, shape)[None])
+    thetas = hyperparameters.thetas_of(draws)
+    if not (np.isfinite(thetas).all() and in_support(hyperparameters, thetas).all()):
+        raise ValueError(
+            f"start: got {dict(point)}, expected values inside the support of the priors"
+        )
+    theta: Floats = thetas[0]
+    return theta
 
 
 def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:

@@ -21,7 +21,7 @@ from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import overlap
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, in_support
 from prbayes.numerics.derivatives import cross, differences
 from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
@@ -464,8 +464,8 @@ class AreaGuide:
             area.of(*population) / area.scale
             for area, population in zip(self.areas, populations, strict=True)
         ]
-        in_support = self.evaluator.hyperparameters.in_support(thetas)
-        total = np.where(in_support, np.sum(areas, axis=0), np.inf)
+        is_possible = in_support(self.evaluator.hyperparameters, thetas)
+        total = np.where(is_possible, np.sum(areas, axis=0), np.inf)
         objective = np.zeros(len(thetas))
         for node, scale, population in zip(
             self.evaluator.nodes, self.scales, populations, strict=True

@@ -36,7 +36,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, variables_at
+from prbayes.model.parameters import Hyperparameters, joined_graphs, unconstrained, variables_at
 from prbayes.model.specimen_audit import audited_evaluator, unaudited
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
@@ -265,7 +265,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     """Return the user's start, or likely points of the prior, and the number screened."""
     hyperparameters = evaluator.hyperparameters
     if settings.start is not None:
-        return [hyperparameters.unconstrained(settings.start)], 0
+        return [unconstrained(hyperparameters, settings.start)], 0
     n_screened = 1024
     thetas = hyperparameters.prior_points(n_screened, settings.random_seed)
     values = evaluator.total(thetas, np.empty(0))
@@ -708,7 +708,7 @@ class SpecimenRefits:
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
                 for w, g in zip(weights, graphs, strict=True)
             ]
-            (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
+            (value,), theta = joined_graphs(evaluator.hyperparameters, [-sum(terms)])
             gradient = pt.grad(value, theta)
             outputs = ninf_for_invalid([value, gradient])
             evaluator.functions[key] = compiled([theta, *weights], outputs)

@@ -65,7 +65,7 @@ from prbayes.model.evaluator import (
     with_unchanged_runs,
 )
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS, Hyperparameters
+from prbayes.model.parameters import THETAS, Hyperparameters, unconstrained
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Result, Search, Trace, approach, minimise, settle
@@ -379,7 +379,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         scales = initial_scales(evaluator, prior=settings.prior)
         theta = hyperparameters.initial
         if settings.start is not None:
-            theta = hyperparameters.unconstrained(settings.start)
+            theta = unconstrained(hyperparameters, settings.start)
         elif not evaluator.responses_per_theta:
             points = hyperparameters.prior_points(THETAS, settings.random_seed)
             candidates = np.concatenate([theta[None], points])

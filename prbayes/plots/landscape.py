@@ -14,7 +14,7 @@ from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.model.parameters import optimum_elements, single_elements, split_elements
+from prbayes.model.parameters import in_support, optimum_elements, single_elements, split_elements
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import (
     BLUE,
@@ -326,7 +326,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
             steps = np.linspace(center[name][0], end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
             ok = np.isfinite(thetas).all(axis=1)
-            ok[ok] = evaluator.hyperparameters.in_support(thetas[ok])
+            ok[ok] = in_support(evaluator.hyperparameters, thetas[ok])
             ends.append(end if ok.all() else float(steps[max(int(np.argmin(ok)) - 1, 0)]))
         axes.append(np.linspace(ends[0], ends[1], points))
 

@@ -23,7 +23,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from prbayes._validate import Floats, called, positive_integer, real_array, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, in_support
 from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
@@ -320,7 +320,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
             thetas[:, first : first + size] = values[name].reshape(draws, size)
         first += size
     finite = np.isfinite(thetas).all(axis=1)
-    outside = ~(finite & hyperparameters.in_support(np.where(finite[:, None], thetas, 0.0)))
+    outside = ~(finite & in_support(hyperparameters, np.where(finite[:, None], thetas, 0.0)))
     if outside.any():
         raise ValueError(
             f"start: got {int(outside.sum())} of {draws} points outside the support of the priors, "

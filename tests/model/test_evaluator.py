@@ -29,6 +29,7 @@ from prbayes.model.evaluator import (
     shortcoming,
     supports_each,
 )
+from prbayes.model.parameters import unconstrained
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
 
@@ -159,7 +160,7 @@ def test_epistemic_variables_data_and_constants(
     evaluator = Evaluator.of(model)
     slopes = (1.0, -0.5)
     points = [{"mu": 2.0, "sigma": 0.5, "slope": s} for s in slopes]
-    thetas = np.array([evaluator.hyperparameters.unconstrained(point) for point in points])
+    thetas = np.array([unconstrained(evaluator.hyperparameters, point) for point in points])
     for level_value in (3.0, 4.0):
         model.set_data("level", level_value)
         populations = evaluator.populations(thetas, 0)
