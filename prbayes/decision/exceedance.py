@@ -32,6 +32,7 @@ from prbayes.decision.populations import (
     Populations,
     output_column,
     probability_bounds,
+    share_error,
 )
 from prbayes.decision.quantities import (
     Exceedance,
@@ -338,7 +339,7 @@ class _Question:
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
         sample = self.populations.sample(quantity.response, inputs, quantity.output)
         by_draw = sample.evaluate(quantity.of, self.populations.thetas)
-        error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
+        error = share_error(sample, lambda values: quantity.of_specimen(values, np.nan))
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"

@@ -19,6 +19,7 @@ from prbayes.decision.populations import (
     Populations,
     ResponseSample,
     probability_bounds,
+    share_error,
 )
 from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.model.locking import locked
@@ -206,7 +207,7 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     """Return lower and upper ends of both bands at y, (2, m), the mean function and its error."""
     functions = _distribution_functions(sample, y)
     mean = functions.mean(axis=0)
-    error = sample.share_error(lambda values: (values[:, None] <= y).astype(float))
+    error = share_error(sample, lambda values: (values[:, None] <= y).astype(float))
     if sample.populations.are_draws:
         error = np.hypot(error, functions.std(axis=0, ddof=1) / np.sqrt(len(functions)))
     tail = (1 - prob) / 2

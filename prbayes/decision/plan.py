@@ -20,7 +20,12 @@ from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, counted, report, sentences_of
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
-from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
+from prbayes.decision.populations import (
+    Populations,
+    ResponseSample,
+    checked_quantity,
+    standard_deviation,
+)
 from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
@@ -188,7 +193,7 @@ def plan(
     findings: tuple[Finding, ...] = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-        findings, error = quantity_sample.checked_quantity(quantity)
+        findings, error = checked_quantity(quantity_sample, quantity)
     unit = populations.evaluator.hyperparameters.prior_sd
     modes = [populations.thetas[rows] for rows in rows_by_mode(populations.thetas / unit)]
     findings += report(*_several_modes(populations, modes))

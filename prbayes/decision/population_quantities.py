@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._finding import Finding
 from prbayes._validate import Floats, called
 from prbayes.decision.plan import Condition
-from prbayes.decision.populations import Populations
+from prbayes.decision.populations import Populations, checked_quantity
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
 from prbayes.model.evaluator import read_inputs_of_copy
 from prbayes.model.fingerprint import identity_from_attributes, require_together
@@ -132,7 +132,7 @@ class PopulationReader:
         elements = []
         for column, label in enumerate(labels):
             output = replace(sample, column=column if several else None)
-            findings, _ = output.checked_quantity(by_level[-1])
+            findings, _ = checked_quantity(output, by_level[-1])
             quantities = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
             numbers[0, :, -len(quantities) :] = output.evaluate(

@@ -25,6 +25,7 @@ from prbayes.decision.populations import (
     InverseTransform,
     Populations,
     ResponseSample,
+    checked_quantity,
     standard_deviation,
 )
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -164,7 +165,7 @@ def sensitivity(
         result, model, 4000, caller, call_settings(executor, store, version)
     )
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings, error = sample.checked_quantity(quantity)
+    findings, error = checked_quantity(sample, quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_points, seed)
     inputs, obstacle = input_indices(sample, quantity, n_points, seed, computed=computed)
     findings += report(*_constant_findings(hyperparameters, quantity))

@@ -124,11 +124,6 @@ class Evaluator:
         return _unpickled, (cloudpickle.dumps((self.model, targets)),)
 
     @property
-    def epsilon(self) -> Floats:
-        """The simulators' epsilons, shape (k,), NaN where unset."""
-        return np.array([node.epsilon_value for node in self.nodes])
-
-    @property
     def n_responses(self) -> int:
         """Number of scalar responses that were computed; shared responses count once."""
         # Number of responses by the id of the runs, which simulators may share.
@@ -204,52 +199,6 @@ class Evaluator:
         is_finite = np.isfinite(terms.log_prior) & np.isfinite(value)
         return np.where(is_finite, value, np.inf)
 
-    def objective(self, *, prior: bool, gradient: bool) -> Any:
-        """Compile the objective as a function of theta and scales.
-
-        (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
-
-        The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
-        Raise NotImplementedError or TypeError if the objective has no gradient.
-        """
-        model = self.model
-        if not self.has_graph:
-            if prior or gradient:
-                raise NotImplementedError("on other data the objective is evaluated, not compiled")
-            return lambda theta, scales: (self.total(theta[None], scales)[0],)
-        key = ("objective", prior, gradient)
-        if key not in self.functions:
-            with interpreted():
-                graphs = [
-                    pt.as_tensor(node.bound.discrepancy(params))
-                    for node, params in zip(self.nodes, _simulator_params(self), strict=True)
-                ]
-                graphs = model.replace_rvs_by_values(graphs)
-                for k, node in enumerate(self.nodes):
-                    if node.bound.stored:
-                        graphs[k] = with_shared_arrays(graphs[k])
-                scales = pt.dvector("scales")
-                scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
-                total = scaled - _log_other(model, _ordinary(model))
-                with building("priors"):
-                    log_prior = model.logp(vars=model.free_RVs, jacobian=False)
-                value = pt.switch(
-                    log_prior > -np.inf, total - log_prior if prior else total, np.inf
-                )
-                (value,), theta = joined_graphs(self.hyperparameters, [value])
-                outputs = [value, pt.grad(value, theta)] if gradient else [value]
-                self.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
-        function = self.functions[key]
-        symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
-
-        def counted(theta: Floats, scales: Floats) -> Any:
-            budget().check()
-            for bound in symbolic:
-                bound.responses.count_symbolic(bound.n_per_theta)
-            return function(theta, scales)
-
-        return counted
-
     def observing(
         self,
         data: dict[str, Floats],
@@ -313,6 +262,56 @@ class Evaluator:
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
         return by_name
+
+
+def epsilons(evaluator: Evaluator) -> Floats:
+    """Return the simulators' epsilons, shape (k,), NaN where unset."""
+    return np.array([node.epsilon_value for node in evaluator.nodes])
+
+
+def compiled_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
+    """Compile the objective as a function of theta and scales.
+
+    (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
+
+    The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
+    Raise NotImplementedError or TypeError if the objective has no gradient.
+    """
+    model = evaluator.model
+    if not evaluator.has_graph:
+        if prior or gradient:
+            raise NotImplementedError("on other data the objective is evaluated, not compiled")
+        return lambda theta, scales: (evaluator.total(theta[None], scales)[0],)
+    key = ("objective", prior, gradient)
+    if key not in evaluator.functions:
+        with interpreted():
+            graphs = [
+                pt.as_tensor(node.bound.discrepancy(params))
+                for node, params in zip(evaluator.nodes, _simulator_params(evaluator), strict=True)
+            ]
+            graphs = model.replace_rvs_by_values(graphs)
+            for k, node in enumerate(evaluator.nodes):
+                if node.bound.stored:
+                    graphs[k] = with_shared_arrays(graphs[k])
+            scales = pt.dvector("scales")
+            scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
+            total = scaled - _log_other(model, _ordinary(model))
+            with building("priors"):
+                log_prior = model.logp(vars=model.free_RVs, jacobian=False)
+            value = pt.switch(log_prior > -np.inf, total - log_prior if prior else total, np.inf)
+            (value,), theta = joined_graphs(evaluator.hyperparameters, [value])
+            outputs = [value, pt.grad(value, theta)] if gradient else [value]
+            evaluator.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
+    function = evaluator.functions[key]
+    symbolic = [node.bound for node in evaluator.nodes if node.bound.symbolic]
+
+    def counted(theta: Floats, scales: Floats) -> Any:
+        budget().check()
+        for bound in symbolic:
+            bound.responses.count_symbolic(bound.n_per_theta)
+        return function(theta, scales)
+
+    return counted
 
 
 def with_unchanged_runs(evaluator: Evaluator) -> Evaluator:

@@ -30,7 +30,9 @@ from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
     SpecimenLikelihood,
+    observed_range,
     output_columns,
+    rows_by_context,
     rows_by_group,
     specimen_numbers,
 )
@@ -258,7 +260,10 @@ def _log_share(
     likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
 ) -> Any:
     """Return the graph of the log share of each population with a response, by specimen, (S,)."""
-    coordinates, contexts = likelihood.coordinates, [rows for _, rows in likelihood.by_context]
+    coordinates, contexts = (
+        likelihood.coordinates,
+        [rows for _, rows in rows_by_context(likelihood)],
+    )
     size = len(contexts)
     context = np.empty(len(likelihood.readings), dtype=np.intp)
     for k, rows in enumerate(contexts):
@@ -429,7 +434,7 @@ def _with_reading_errors(
     result = np.where(step > 0, np.round(result / unit) * unit, result)
     share = _gross_share(measurements[0], values)
     if share is not False:
-        low, high = np.concatenate([m.range for m in measurements], axis=1)
+        low, high = np.concatenate([observed_range(m) for m in measurements], axis=1)
         middle, width = (low + high) / 2, high - low
         uniform = rng.random((size, n, middle.size))
         gross_errors = middle + width * (2 * uniform - 1)

@@ -33,7 +33,9 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    is_exchangeable,
     output_columns,
+    rows_by_context,
     specimen_labels,
 )
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
@@ -324,7 +326,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
 def _part(likelihood: SpecimenLikelihood, size: int = 512) -> SpecimenData | None:
     """Return evenly spaced specimens by their first reading; None if there are not many more."""
     n = len(likelihood.readings)
-    if n <= 2 * size or not likelihood.is_exchangeable:
+    if n <= 2 * size or not is_exchangeable(likelihood):
         return None
     order = np.argsort(likelihood.readings.values[:, 0], kind="stable")
     rows = order[np.linspace(0, n - 1, size).astype(np.intp)]
@@ -470,7 +472,7 @@ def log_shares(
 ) -> Floats:
     """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
     result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
-    for group, rows in likelihood.by_context:
+    for group, rows in rows_by_context(likelihood):
         parents = likelihood.parents(values, group, rows[:1])
         log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
         result[:, rows] = log_share[:, None]
@@ -503,7 +505,7 @@ class SpecimenPopulations:
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = variables_at(self.hyperparameters, thetas)
         free = ~likelihood.coordinates.is_condition
-        contexts = likelihood.by_group if smoothing is None else likelihood.by_context
+        contexts = likelihood.by_group if smoothing is None else rows_by_context(likelihood)
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
             if smoothing is None:

@@ -20,7 +20,7 @@ from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import overlap
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.model.parameters import THETAS, in_support
 from prbayes.numerics.derivatives import cross, differences
 from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
@@ -154,12 +154,12 @@ class Search:
         if gradient:
             # The response, or an inverse distribution function, may have no gradient.
             with suppress(NotImplementedError, NullTypeGradError):
-                exact = self.evaluator.objective(prior=self.settings.prior, gradient=True)
+                exact = compiled_objective(self.evaluator, prior=self.settings.prior, gradient=True)
 
         def values(thetas: Floats) -> Floats:
             if not self.settings.prior:
                 return self.evaluator.total(thetas, scales)  # which needs no compilation
-            single = self.evaluator.objective(prior=True, gradient=False)
+            single = compiled_objective(self.evaluator, prior=True, gradient=False)
             return np.array([float(single(theta, scales)[0]) for theta in thetas])
 
         def function(theta: Floats) -> tuple[float, Floats | None, int]:

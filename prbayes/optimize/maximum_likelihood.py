@@ -30,6 +30,7 @@ from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.model.evaluator import (
     Evaluator,
+    compiled_objective,
     only_through_prior,
     specimen_graphs,
     specimen_log_likelihoods,
@@ -232,7 +233,7 @@ class _Objective:
     """Minus the log-likelihood or log-posterior, with a trace of its evaluations."""
 
     def __init__(self, evaluator: Evaluator, prior: bool) -> None:
-        self.function = evaluator.objective(prior=prior, gradient=True)
+        self.function = compiled_objective(evaluator, prior=prior, gradient=True)
         self.unit = evaluator.hyperparameters.prior_sd
         self.thetas: list[Floats] = []
         self.values: list[float] = []

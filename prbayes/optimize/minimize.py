@@ -58,6 +58,7 @@ from prbayes.inference.resampling import SETS
 from prbayes.model.cost import explained, kept
 from prbayes.model.evaluator import (
     Evaluator,
+    epsilons,
     n_design_runs,
     only_through_prior,
     shortcomings,
@@ -465,10 +466,10 @@ def _fit(
     evaluator = search.evaluator
     fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
     problem.fits.append(fit)
-    is_unset = np.isnan(evaluator.epsilon)
+    is_unset = np.isnan(epsilons(evaluator))
     if is_unset.size > 1 and is_unset.any():
         noise = noise_floors(evaluator, fit.theta, SETS)
-        scales = np.where(is_unset, noise, evaluator.epsilon)
+        scales = np.where(is_unset, noise, epsilons(evaluator))
         fit = replace(minimise(search, fit.theta, scales, fit.trace), pilot=pilot)
         problem.fits.append(fit)
     return replace(fit, sampling=sampling_distribution(evaluator, fit.theta, fit.scales))

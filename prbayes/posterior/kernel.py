@@ -21,7 +21,7 @@ import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
 from prbayes._validate import Floats, called, positive_integer, real_array, share
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
 from prbayes.model.parameters import Hyperparameters, in_support
 from prbayes.numerics.modes import LogDensity
@@ -150,7 +150,7 @@ class BatchedKernel(SMC_KERNEL):
                 thetas, log_prior, self.log_likelihood(thetas), unknown, unknown.copy()
             )
         evaluation = self.evaluator(thetas)
-        log_likelihood = evaluation.log_likelihood(self.evaluator.epsilon)
+        log_likelihood = evaluation.log_likelihood(epsilons(self.evaluator))
         return Particles(
             thetas, evaluation.log_prior, log_likelihood, evaluation.discrepancies, evaluation.lost
         )

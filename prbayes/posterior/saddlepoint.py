@@ -31,7 +31,7 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator, coarser_evaluator, with_targets
+from prbayes.model.evaluator import Evaluator, coarser_evaluator, epsilons, with_targets
 from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
@@ -289,7 +289,7 @@ def _minimised_on_population(
         responses, weights = evaluator.populations(point[None], k)
         targets.append(prepared_on_population(node.target, responses[0], weights[0]))
     prepared = with_targets(evaluator, targets)
-    unset = np.isnan(prepared.epsilon)
+    unset = np.isnan(epsilons(prepared))
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
     minimiser = move_inside(prepared, minimiser_near(prepared, point, scales), options)

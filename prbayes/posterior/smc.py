@@ -26,6 +26,7 @@ from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
+    epsilons,
     is_current,
     missing_mass,
     n_design_runs,
@@ -304,7 +305,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
         )
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    epsilons = evaluator.epsilon
+    earlier = epsilons(evaluator)
     try:
         with designs_as_before(evaluator) as restore_designs:
             if kind is Likelihood.PSEUDO:
@@ -318,7 +319,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
                 restore_designs()
             return tree
     finally:
-        for node, value in zip(evaluator.nodes, epsilons, strict=True):
+        for node, value in zip(evaluator.nodes, earlier, strict=True):
             node.epsilon.set_value(np.asarray(value))
 
 
@@ -478,11 +479,11 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
     """Return chains with log-likelihoods, and the error and missing mass at the best draw."""
     discrepancies = chains.discrepancies
     assert discrepancies is not None
-    kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+    kernels = np.asarray(log_kernel(discrepancies, epsilons(evaluator)))
     rows = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
     other_terms = evaluator.log_other(rows).reshape(kernels.shape[:2])
     chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
-    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
+    total = (discrepancies / epsilons(evaluator)).sum(axis=-1)
     best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
     at_best = {}
     try:

@@ -39,6 +39,7 @@ from prbayes.model.evaluator import (
     TOLERABLE,
     Evaluator,
     coarser_evaluator,
+    epsilons,
     supports_each,
     with_targets,
 )
@@ -99,7 +100,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     if summary_obstacle(evaluator) is not None:
 
         def log_likelihood(thetas: Floats) -> Floats:
-            return evaluator(thetas).log_likelihood(evaluator.epsilon)
+            return evaluator(thetas).log_likelihood(epsilons(evaluator))
 
         prior_sd = evaluator.hyperparameters.prior_sd
         return Target(evaluator, log_likelihood, optima_of(optimum, evaluator), prior_sd)

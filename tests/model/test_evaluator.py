@@ -25,6 +25,7 @@ from prbayes.model.evaluator import (
     Requirement,
     Shortcoming,
     coarser_evaluator,
+    compiled_objective,
     is_current,
     shortcoming,
     supports_each,
@@ -352,7 +353,7 @@ def test_an_evaluator_of_other_data_has_a_pickle() -> None:
         back = pickle.loads(pickle.dumps(original))
         np.testing.assert_array_equal(back(thetas).discrepancies, original(thetas).discrepancies)
         values = [
-            e.objective(prior=False, gradient=False)(thetas[0], np.ones(1))
+            compiled_objective(e, prior=False, gradient=False)(thetas[0], np.ones(1))
             for e in (back, original)
         ]
         assert values[0] == values[1]

@@ -21,7 +21,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import Node, simulators
 from prbayes.propagation.base import Propagation
@@ -64,7 +64,7 @@ def reference(name: str) -> dict[str, tuple[float, float]]:
     axes = np.meshgrid(np.linspace(1.5, 2.5, 41), np.linspace(-1, 0.4, 41))
     grid = np.stack(axes, -1).reshape(-1, 2)
     terms = evaluator(grid)
-    logs = terms.log_prior + terms.log_likelihood(evaluator.epsilon)
+    logs = terms.log_prior + terms.log_likelihood(epsilons(evaluator))
     w = np.exp(logs - logs.max())
     w /= w.sum()
     result = {}

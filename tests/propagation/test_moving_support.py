@@ -13,7 +13,7 @@ import pytest
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.model.parameters import unconstrained
 from prbayes.propagation.importance import MixtureSampler
 from prbayes.propagation.moving_support import (
@@ -123,7 +123,7 @@ def test_a_discrete_support_that_moves_is_refused() -> None:
 def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Metric) -> None:
     evaluator = Evaluator.of(uniform(metric))
     theta = unconstrained(evaluator.hyperparameters, {"start": 2.013, "width": 3.05})
-    _, gradient = evaluator.objective(prior=False, gradient=True)(theta, np.ones(1))
+    _, gradient = compiled_objective(evaluator, prior=False, gradient=True)(theta, np.ones(1))
     assert np.abs(gradient).min() > 1e-3
     step = 1e-6
     for i, unit in enumerate(np.eye(2)):
