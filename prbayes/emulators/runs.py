@@ -16,7 +16,6 @@ from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
-from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs, is_missing
 
@@ -158,7 +157,7 @@ class Runs(Shown):
     @property
     def columns(self) -> list[str]:
         """Name of each number of the inputs."""
-        return list(column_names(self.inputs, [r.size for r in self.surrogate.domain.inputs]))
+        return list(self.surrogate.domain.column_names)
 
     def error_beside(self, observed: Floats) -> float:
         """Return the largest left-out error of an output beside data (N,) or (N, m).
@@ -177,7 +176,7 @@ class Runs(Shown):
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""
-        expected = [r.size for r in self.surrogate.domain.inputs]
+        expected = self.surrogate.domain.sizes
         if list(sizes) != expected:
             raise TypeError(
                 f"{name}: response: got inputs of {list(sizes)} numbers for a table of runs of "

@@ -35,9 +35,9 @@ from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.selection import CrossValidation, points_needed
 from prbayes.emulators.surfaces import Surface, as_surface
-from prbayes.emulators.table import RunTable, read_table
+from prbayes.emulators.table import RunRecord, RunTable, read_table
 from prbayes.numerics.points import sobol
-from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
+from prbayes.response.call import CallSettings, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import (
@@ -149,7 +149,7 @@ class DesignSurface:
 
 @without_constructor
 @dataclass(frozen=True, eq=False, repr=False)
-class Surrogate(Shown):
+class Surrogate(RunRecord, Shown):
     """A surface through runs of an expensive response, to be called in its place.
 
     ``fit`` and ``load`` construct it. Like the response it takes arrays of any leading shape;
@@ -196,9 +196,6 @@ class Surrogate(Shown):
     True
     """
 
-    domain: Ranges = field(repr=False)
-    points: Floats = field(repr=False)
-    responses: Floats = field(repr=False)
     model: Any
     outside: OnFailure
     n_runs: int
@@ -301,7 +298,7 @@ class Surrogate(Shown):
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, prob, seed)
-        refuse_misfit(name, response, [r.size for r in domain.inputs])
+        refuse_misfit(name, response, domain.sizes)
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
         design = domain.at(_unit_points(name, domain, predictive, n, points, seed))
@@ -313,7 +310,7 @@ class Surrogate(Shown):
             database = Store(store, name, columns=design.shape[1], version=version)
         settings = CallSettings(
             name, response, executor, database, policy, retry_failed, outputs=None,
-            columns=column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs]),
+            columns=domain.column_names,
         )  # fmt: skip
         tally, runs = Tally(), Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
@@ -407,8 +404,9 @@ class Surrogate(Shown):
         try:
             surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
         except np.linalg.LinAlgError:
-            names = column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs])
-            counts = dict(zip(names, [len(set(column)) for column in design.T], strict=True))
+            counts = dict(
+                zip(domain.column_names, [len(set(column)) for column in design.T], strict=True)
+            )
             raise ValueError(
                 f"{name}: inputs: got runs that determine no surface, with numbers of different "
                 f"values {counts}, expected at least 3, and no input that follows from others; "
@@ -426,16 +424,6 @@ class Surrogate(Shown):
             _surface=replace(surfaces[best], outputs=table.labels),
         )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return tuple(r.name for r in self.domain.inputs)
-
-    @property
-    def ranges(self) -> dict[str, tuple[Any, Any]]:
-        """Lowest and highest value of each input."""
-        return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
-
     def to_dataframe(self) -> Any:
         """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
         import pandas as pd
@@ -444,7 +432,7 @@ class Surrogate(Shown):
         m = values.shape[1]
         labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
         columns = [
-            *column_names(self.names, [r.size for r in self.domain.inputs]),
+            *self.domain.column_names,
             *(labels if self._surface.outputs is None else self._surface.outputs.names),
         ]
         return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
 
@@ -17,12 +17,28 @@ from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
 
 @dataclass(frozen=True, eq=False)
-class RunTable:
+class RunRecord:
+    """Runs of a response, and the ranges of its inputs."""
+
+    domain: Ranges = field(repr=False)
+    points: Floats = field(repr=False)  # (n, columns): inputs of the runs
+    responses: Floats = field(repr=False)  # (n,) or (n, m): responses of the runs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.domain.names
+
+    @property
+    def ranges(self) -> dict[str, tuple[Any, Any]]:
+        """Lowest and highest value of each input."""
+        return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
+
+
+@dataclass(frozen=True, eq=False)
+class RunTable(RunRecord):
     """Runs, and the names of their outputs."""
 
-    domain: Ranges
-    points: Floats  # (n, columns): inputs of the runs
-    responses: Floats  # (n,) or (n, m): responses of the runs
     # Names of the outputs: "response" for a single unnamed output, "response[0]" for the first of
     # several.
     outputs: tuple[str, ...]
