@@ -123,10 +123,6 @@ class Bound(ABC):
     # Largest accepted share, at an answer, of a population on points without response.
     max_lost: float = MAX_LOST
     findings: tuple[Finding, ...] = ()  # findings about the data and the first responses
-    # Seed of the current sampler, and number of evaluations since it started. Both determine the
-    # random draws.
-    stream: int = 0
-    draws: int = 0
     # Shares without numbers of the populations in the last evaluation. They are NaN for invalid
     # populations, and for all populations if responses are stored.
     last_missing: Missing = Missing(np.array(np.nan), np.array(np.nan))
@@ -138,6 +134,9 @@ class Bound(ABC):
         self.inputs = inputs
         self.target = target
         self.responses = responses
+        # Seed of the current sampler, and number of evaluations since it started. Both determine
+        # the random draws.
+        self.stream, self.draws = 0, 0
         self.first_points: Sequence[Floats] = ()
         self.first_responses: Floats = np.empty(0)
         symbols = inputs.placeholders()

@@ -30,6 +30,7 @@ from prbayes.specimens.points import (
     likely_scale,
     likely_weights,
     normal_of,
+    residuals_of,
     typical_specimens,
 )
 from prbayes.specimens.proposals import Normal, Proposals
@@ -407,7 +408,7 @@ def error_and_bias(
         2 * np.sqrt((misfit**2).mean(axis=0)), data.options.floor * data.readings.spread()
     )
     measured = replace(emulation, error=error)
-    residuals = data.residuals(measured, likely.population)
+    residuals = residuals_of(data, measured, likely.population)
     a = residuals.whitened(z)
     _, slopes = residuals.errors(specimens, a)
     sd = data.readings.comparison_sd(error)[specimens]

@@ -206,35 +206,36 @@ class SpecimenData:
         order = np.argsort(np.abs((z - middle) / width).max(axis=1), kind="stable")
         return self.prior[order[: int(0.95 * len(order))]]
 
-    def residuals(self, emulation: Emulation, population: Normal) -> Residuals:
-        """Return the residuals of an emulator's outputs."""
-        readings, is_read = self.readings, self.readings.is_measured
-        relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
-        error = np.where(readings.is_relative, 0.0, readings.error)
-        error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
-        target = np.where(is_read, readings.values, 0.0)
-        if emulation.offsets is not None:
-            target = target - emulation.offsets
-        of_emulator = np.broadcast_to(emulation.error, target.shape)
-        columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
-        if 2 * count <= is_read.shape[1]:
-            columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
-            target, of_emulator, error, relative = (
-                np.take_along_axis(values, columns, axis=1)
-                for values in (target, of_emulator, error, relative)
-            )
-        return Residuals(
-            emulation,
-            target,
-            of_emulator,
-            error,
-            relative,
-            population,
-            self.known,
-            self.box,
-            self.order,
-            columns,
+
+def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -> Residuals:
+    """Return the residuals of an emulator's outputs."""
+    readings, is_read = data.readings, data.readings.is_measured
+    relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
+    error = np.where(readings.is_relative, 0.0, readings.error)
+    error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
+    target = np.where(is_read, readings.values, 0.0)
+    if emulation.offsets is not None:
+        target = target - emulation.offsets
+    of_emulator = np.broadcast_to(emulation.error, target.shape)
+    columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
+    if 2 * count <= is_read.shape[1]:
+        columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
+        target, of_emulator, error, relative = (
+            np.take_along_axis(values, columns, axis=1)
+            for values in (target, of_emulator, error, relative)
         )
+    return Residuals(
+        emulation,
+        target,
+        of_emulator,
+        error,
+        relative,
+        population,
+        data.known,
+        data.box,
+        data.order,
+        columns,
+    )
 
 
 def fit_proposals(
@@ -249,7 +250,7 @@ def fit_proposals(
     nearer to the specimen's readings than those of their neighbours; or at the modes of an
     ``earlier`` emulator in the same population.
     """
-    residuals = data.residuals(emulation, population)
+    residuals = residuals_of(data, emulation, population)
     # Candidates are not chosen by an output that a reading error dominates.
     target = np.where(data.readings.is_measured, data.readings.values, 0.0)
     if emulation.offsets is not None:
