@@ -37,6 +37,8 @@ IN_CACHE = 1 << 18
 _LARGEST = 1e152
 
 Shape = tuple[int, ...]  # sizes of the axes of an array
+Labels = Mapping[str, str]  # labels, units or other texts by name
+StrPath = str | os.PathLike[str]  # path of a file or folder
 
 
 def called(value: object) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,14 @@ import xarray as xr
 from scipy.special import chdtri, gammaln, logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     Bools,
     Floats,
     Seed,
+    StrPath,
     positive_integer,
     seed_number,
     share,
@@ -65,7 +65,7 @@ def exceedance(
     n_points: int | None = None,
     steps: int = 5,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
 ) -> ExceedanceTable:
@@ -429,7 +429,7 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
 
 def _error_findings(
     response: Any, estimates: Sequence[_Estimate], rough: Sequence[_Estimate]
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Report a probability with a large error, and a share of specimens without response."""
     name = response_name(response)
     findings = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import xarray as xr
 
 from prbayes._display import Table, View, percentage
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import Floats, positive_integer, share
+from prbayes._validate import Floats, StrPath, positive_integer, share
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
@@ -40,7 +39,7 @@ def p_box(
     n_draws: int = ENVELOPED,
     steps: int = 5,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> ProbabilityBox:
     r"""Return bounds of the distribution function of a response over the population.

@@ -6,7 +6,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, counted, report, sentences_of
+from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._stats import reached
-from prbayes._validate import Floats, called, positive_integer, positive_number
+from prbayes._validate import Floats, StrPath, called, positive_integer, positive_number
 from prbayes.decision.populations import (
     Populations,
     ResponseSample,
@@ -94,7 +93,7 @@ def plan(
     quantity: Quantity | None = None,
     target: Mapping[str, float] | None = None,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> PlanTable:
     r"""Predict standard deviations after k more specimens under each candidate condition.
@@ -190,7 +189,7 @@ def plan(
         result, model, 2000, caller, call_settings(executor, store, version)
     )
     quantity_sample = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
         findings, error = checked_quantity(quantity_sample, quantity)
@@ -238,7 +237,7 @@ def plan(
     )
 
 
-def _several_modes(populations: Populations, modes: Sequence[Floats]) -> tuple[Finding, ...]:
+def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
     """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
     page = "likelihood.md#several-modes"
     if isinstance(populations.result, Optimum):

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding
+from prbayes._finding import Findings
 from prbayes._validate import Floats, called
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations, checked_quantity
@@ -42,7 +42,7 @@ class Element:
     # Values by the name of a quantity, (groups, k), or (1, k) without groups. If the result is an
     # optimum, the first of the k populations is that of the optimum.
     numbers: dict[str, Floats]
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
 
 
 @dataclass(frozen=True, eq=False)

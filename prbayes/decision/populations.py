@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,9 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
-from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
+from prbayes._validate import AT_ONCE, Floats, Indices, StrPath, positive_integer, share
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
@@ -288,9 +287,7 @@ def share_error(sample: ResponseSample, counts: Callable[[Floats], Floats]) -> F
     return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
 
-def checked_quantity(
-    sample: ResponseSample, quantity: Quantity
-) -> tuple[tuple[Finding, ...], float]:
+def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findings, float]:
     """Return findings, and the error of the quantity at the centre.
 
     Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
@@ -320,7 +317,7 @@ def checked_quantity(
             f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "
             f"points, expected some; {advice}"
         )
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     if error > 0.3 * share:
         text = (
             f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
@@ -359,7 +356,7 @@ def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
     return float(np.sqrt(variance))
 
 
-def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
+def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> Findings:
     """Return a finding if the constant response beyond the runs limits a quantity."""
     if sample.design.has_runs:
         return ()
@@ -577,7 +574,7 @@ def evaluate(
     prob: float = INTERVAL,
     n_draws: int = 2000,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> QuantityTable:
     """Return a decision quantity with its interval.

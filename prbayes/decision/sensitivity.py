@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from os import PathLike
 
 import numpy as np
 import pymc as pm
@@ -19,8 +18,8 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, report, sentences_of
-from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
+from prbayes._validate import Floats, Seed, StrPath, flag, positive_integer, seed_number
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
@@ -53,7 +52,7 @@ def sensitivity(
     n_points: int = 1024,
     computed: bool = False,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
 ) -> SensitivityTable:
@@ -361,7 +360,7 @@ def input_indices(
     return SensitivityIndices(values, errors), reason
 
 
-def _constant_findings(indices: SensitivityIndices, quantity: Quantity) -> tuple[Finding, ...]:
+def _constant_findings(indices: SensitivityIndices, quantity: Quantity) -> Findings:
     """Return a finding if a quantity has no variance over the hyperparameters."""
     if not np.isnan(indices.values).any():
         return ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from prbayes._display import Shown, View
 from prbayes._finding import counted
-from prbayes._validate import Floats
+from prbayes._validate import Floats, StrPath
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
@@ -84,7 +83,7 @@ class Runs(Shown):
     @classmethod
     def read_csv(
         cls,
-        path: str | PathLike[str],
+        path: StrPath,
         inputs: Sequence[str],
         outputs: Sequence[str],
         *,

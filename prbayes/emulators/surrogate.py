@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from os import PathLike
 from typing import Any, cast
 
 import numpy as np
@@ -21,6 +20,7 @@ from prbayes._validate import (
     Floats,
     Seed,
     Shape,
+    StrPath,
     file_path,
     flag,
     plain_text,
@@ -220,7 +220,7 @@ class Surrogate(RunRecord, Shown):
         prob: float = 0.999,
         name: str = "surrogate",
         executor: Executor | None = None,
-        store: str | PathLike[str] | None = None,
+        store: StrPath | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
@@ -528,7 +528,7 @@ class Surrogate(RunRecord, Shown):
         """
         return replace(self, noise=seed_number(random_seed, "with_error: random_seed"))
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: StrPath) -> None:
         """Write design, responses and configuration as netCDF.
 
         Parameters
@@ -545,7 +545,7 @@ class Surrogate(RunRecord, Shown):
     @classmethod
     def load(
         cls,
-        path: str | PathLike[str],
+        path: StrPath,
         *,
         model: Any = None,
         coarse: Callable[..., Any] | None = None,

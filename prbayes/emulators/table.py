@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from prbayes._finding import counted
-from prbayes._validate import Floats, file_path, plain_text, real_array
+from prbayes._validate import Floats, StrPath, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
@@ -95,7 +94,7 @@ def read_table(caller: str, inputs: Any, responses: Any) -> RunTable:
 
 def read_csv(
     caller: str,
-    path: str | PathLike[str],
+    path: StrPath,
     inputs: Sequence[str],
     outputs: Sequence[str],
     delimiter: str,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from prbayes._finding import Finding, any_of, report
+from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
@@ -72,7 +72,7 @@ def outlier_findings(
     gross_errors: bool = False,
     apart: float = 8.0,
     share: float = 0.1,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of codes for missing values, and of values that no response explains.
 
     A code, such as -999, is farther from all other values than these are apart. Up to ``share`` of
@@ -131,7 +131,7 @@ def _separate(values: Floats, apart: float, share: float) -> Floats:
 
 def check_constant(
     name: str, responses: Floats, outputs: Sequence[str], is_stored: bool
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of outputs that are the same in all runs; raise if no others are made.
 
     Weights of equal stored responses make no difference. Responses of a propagation that simulates
@@ -174,7 +174,7 @@ def check_failing_region(
     max_lost: float,
     apart: float = 6.0,
     remedy: str = "repair the response",
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
     A value is in such a gap if it is ``apart`` times the local spacing away from the nearest finite
@@ -227,7 +227,7 @@ def check_failing_region(
     return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
-def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
+def duplicate_findings(name: str, observed: Floats) -> Findings:
     """Return a finding if each specimen without a label occurs at least twice.
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
@@ -399,7 +399,7 @@ def data_findings(
     several_roots: bool = False,
     rounded: ArrayLike = np.nan,
     options: DataCheckOptions | None = None,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of rounded, censored and repeated data, (N,) or (N, m), by output.
 
     Values that are not finite count as not measured. With several roots inputs have the same

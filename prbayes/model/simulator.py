@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from prbayes._finding import Finding, counted, report
 from prbayes._validate import (
     NO_POPULATION,
     Floats,
+    Labels,
     called,
     flag,
     observed_sample,
@@ -97,7 +98,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Labels | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed variable that compares simulated and measured responses to the model.
@@ -323,7 +324,7 @@ def _read_inputs(
 
 def _with_units(
     name: str,
-    units: Mapping[str, str] | None,
+    units: Labels | None,
     inputs: Inputs,
     response: Callable[..., Any],
     outputs: Outputs,

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from prbayes._finding import Finding, any_of, report
+from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._validate import Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
@@ -41,7 +41,7 @@ def audited_evaluator(evaluator: Evaluator, thetas: Floats, *, is_last: bool = F
     return Evaluator.of(evaluator.model)
 
 
-def unaudited(spent: BudgetError, place: str, caller: str) -> tuple[Finding, ...]:
+def unaudited(spent: BudgetError, place: str, caller: str) -> Findings:
     """Report a budget that ended before the runs were checked at a place."""
     text = (
         f"{spent} before the runs were checked at {place}, where the emulator may be wrong. Call "

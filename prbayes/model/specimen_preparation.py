@@ -12,10 +12,9 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, Findings, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
@@ -80,7 +79,7 @@ class Preparation:
     proposals: Proposals  # proposals from which the points were drawn
     # (S, p): posterior draws at which the estimates from both halves of the points agree.
     thetas: Floats
-    findings: tuple[Finding, ...]  # findings about the data and the runs, before the fit
+    findings: Findings  # findings about the data and the runs, before the fit
     # Share of a population with a response; None if it hardly changes the log-likelihood.
     share: ResponseShare | None = None
 
@@ -206,7 +205,7 @@ class CheckedRuns:
 
     likelihood: SpecimenLikelihood
     outputs: list[Floats] = field(default_factory=list)  # outputs of each batch of runs, (n, M)
-    findings: tuple[Finding, ...] = ()  # findings about the first runs
+    findings: Findings = ()  # findings about the first runs
 
     def __call__(self, z: Floats) -> Floats:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
@@ -435,7 +434,7 @@ def log_density_changes(
 
 def _data_findings(
     likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings about outliers, and about rounded, censored and repeated exact readings.
 
     Outputs, (n, M), that are the same in all runs have no findings.
@@ -527,7 +526,7 @@ class SpecimenPopulations:
         """Return coordinates of specimens of the prior predictive population, (n, d)."""
         return PopulationDraws(self, self.hyperparameters.prior_thetas(2048, 0)).specimens(1)
 
-    def order(self) -> NDArray[np.intp]:
+    def order(self) -> Indices:
         """Return the coordinates without conditions: those of the least known spread first."""
         likelihood, coordinates = self.likelihood, self.likelihood.coordinates
         values = variables_at(self.hyperparameters, self.hyperparameters.prior_thetas(256, 0))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 
-from prbayes._finding import Finding, counted, report
+from prbayes._finding import Finding, Findings, counted, report
 from prbayes._validate import Bools, Floats
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
@@ -98,7 +98,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
         is_audited = [mode.value - modes[0].value <= (0.0 if is_last else 6.0) for mode in modes]
-        spent: tuple[Finding, ...] = ()
+        spent: Findings = ()
         try:
             latest = audited_evaluator(evaluator, thetas[is_audited], is_last=is_last)
         except BudgetError as error:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, Findings, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
@@ -645,7 +645,7 @@ def optimum_findings(
     sampling: SamplingDistribution | None,
     optima: Sequence[LocalOptimum],
     design_error: float,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Report few specimens, the design's error, other optima, and identification."""
     findings: list[Finding] = []
     for node in evaluator.nodes:

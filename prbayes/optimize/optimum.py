@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view, without_constructor
-from prbayes._finding import Finding, as_json
+from prbayes._finding import Findings, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
@@ -291,7 +291,7 @@ class Optimum(PointEstimate):
     search: SearchRecord
     design_error: float = np.nan
     local_optima: tuple[dict[str, Any], ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
 
     __repr__ = _text
     _repr_html_ = _html

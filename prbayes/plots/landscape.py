@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, positive_integer, wrong_type
+from prbayes._validate import Floats, Labels, positive_integer, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -47,7 +46,7 @@ def plot_landscape(
     coords: Coords | None = None,
     points: int | None = None,
     responses: int = 0,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the objective around the optimum over one or two hyperparameters.

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, share, wrong_type
+from prbayes._validate import Floats, Labels, share, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
@@ -58,7 +58,7 @@ def plot_posterior(
     coords: Coords | None = None,
     prob: float = INTERVAL,
     backend: str | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
     """Draw the posterior of each hyperparameter against the optimum and the prior, by ArviZ.

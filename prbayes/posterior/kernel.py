@@ -11,7 +11,6 @@ import io
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,7 +19,7 @@ import pymc as pm
 import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._validate import Floats, called, positive_integer, real_array, share
+from prbayes._validate import Floats, StrPath, called, positive_integer, real_array, share
 from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
 from prbayes.model.parameters import Hyperparameters, in_support
@@ -341,9 +340,7 @@ class Checkpoint:
     raises StoreError and remains as it is.
     """
 
-    def __init__(
-        self, path: str | PathLike[str], problem: Identity, settings: dict[str, Any]
-    ) -> None:
+    def __init__(self, path: StrPath, problem: Identity, settings: dict[str, Any]) -> None:
         self.path = Path(path)
         self.problem = problem
         self.settings = dict(settings)

@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import Finding
+from prbayes._finding import Findings
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, called, flag
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
@@ -57,7 +57,7 @@ class Chains:
     # numbers `AT_BEST` by simulator.
     at_best: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
-    findings: tuple[Finding, ...] = ()  # findings about modes, which are logged already
+    findings: Findings = ()  # findings about modes, which are logged already
 
 
 def posterior_tree(

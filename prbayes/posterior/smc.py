@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from itertools import zip_longest
-from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +18,18 @@ import xarray as xr
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
-from prbayes._finding import Finding, as_json, report
+from prbayes._finding import Finding, Findings, as_json, report
 from prbayes._progress import progress, shown
-from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes._validate import (
+    Floats,
+    Seed,
+    StrPath,
+    file_path,
+    flag,
+    positive_integer,
+    seed_number,
+    share,
+)
 from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
@@ -85,7 +93,7 @@ def sample_smc(
     max_stages: int | None = None,
     max_seconds: float | None = None,
     max_runs: int | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: StrPath | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -261,7 +269,7 @@ class SamplingSettings:
     refine: bool = True
     start: Any = None
     max_stages: int | None = None
-    checkpoint: str | PathLike[str] | None = None
+    checkpoint: StrPath | None = None
     random_seed: int | None = 0
     progressbar: bool = False
     with_groups: bool = False  # whether the result has the groups of `arviz_groups`
@@ -415,7 +423,7 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats) -> Floats:
     return lost
 
 
-def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
+def _lost_findings(evaluator: Evaluator, chains: Chains) -> Findings:
     """Report draws whose populations lack responses; raise if most draws, or the best, do."""
     lost = chains.lost
     assert lost is not None

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 from scipy.special import ndtri
 
-from prbayes._finding import Finding
+from prbayes._finding import Findings
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
@@ -156,7 +156,7 @@ def require_density(evaluator: Evaluator) -> None:
         )
 
 
-def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> tuple[Finding, ...]:
+def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Findings:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
     size = 4096
     comparable = [mode["comparable"] for mode in optimum.local_optima]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import NO_POPULATION, Indices, Shape, plain_text, real_array
+from prbayes._validate import NO_POPULATION, Indices, Labels, Shape, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted, vectorize_distributions
 from prbayes.response.condition import is_condition
 from prbayes.response.pymc_dims import (
@@ -336,7 +336,7 @@ def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
     return [names[inputs.arguments.index(position)] for position in range(len(inputs.aleatory))]
 
 
-def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, str]) -> list[str]:
+def set_units(inputs: Inputs, function: Callable[..., Any], units: Labels) -> list[str]:
     """Store the units of inputs, or of their elements; return the names that have one."""
     names = aleatory_names(inputs, function)
     elements: list[str] = []

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view, without_constructor
-from prbayes._finding import Finding, counted, from_json
+from prbayes._finding import Finding, Findings, counted, from_json
 from prbayes._validate import Floats, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
@@ -100,9 +100,9 @@ class Diagnosis:
     ['few-specimens']
     """
 
-    findings: tuple[Finding, ...]
+    findings: Findings
     support: xr.Dataset = field(repr=False)
-    remarks: tuple[Finding, ...] = ()
+    remarks: Findings = ()
     untested: tuple[str, ...] = ()
 
     @property
@@ -285,7 +285,7 @@ def _checked_tree(result: object, fewest: int = 2) -> xr.DataTree:
     return tree
 
 
-def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> tuple[Finding, ...]:
+def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> Findings:
     """Return findings without copies, and no later ones on a condition reported earlier.
 
     Two findings are about the same condition if they have the same code, and the same simulator
@@ -342,7 +342,7 @@ def _check_family(optimum: Optimum) -> Checked:
     if fitted is None or np.isnan(p_value):
         checked = Checked((*small_simulators(evaluator), *failures))
         return checked + _not_tested("the data are uninformative, or too few refits converge")
-    misfits: tuple[Finding, ...] = ()
+    misfits: Findings = ()
     ties, p_spread_out = "", np.nan
     if p_value < UNLIKELY:
         ties = rounding(evaluator)

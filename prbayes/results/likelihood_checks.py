@@ -17,7 +17,7 @@ import pytensor.tensor as pt
 import xarray as xr
 from scipy.special import softmax
 
-from prbayes._finding import Finding, counted
+from prbayes._finding import Finding, Findings, counted
 from prbayes._validate import Floats
 from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
@@ -71,8 +71,8 @@ _OPTIONS = CheckOptions()
 class Checked:
     """What checks found, what they did not find, and which were not run."""
 
-    findings: tuple[Finding, ...] = ()
-    remarks: tuple[Finding, ...] = ()  # results of tests that found nothing, with their power
+    findings: Findings = ()
+    remarks: Findings = ()  # results of tests that found nothing, with their power
     untested: tuple[str, ...] = ()  # sentences on tests that were not run, with the reason
 
     def __add__(self, second: Checked) -> Checked:
@@ -329,7 +329,7 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
     return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
 
 
-def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
+def separate_modes(thetas: Floats, names: Sequence[str]) -> Findings:
     """Report chains whose means are farther apart than the chains are wide."""
     if len(thetas) < 2 or thetas.shape[1] < 4:
         return ()
@@ -350,7 +350,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
     )
 
 
-def influence(result: xr.DataTree) -> tuple[Finding, ...]:
+def influence(result: xr.DataTree) -> Findings:
     """Report specimens on which the posterior depends, by Pareto k of leave-one-out."""
     if "log_likelihood" not in result.children:
         return ()

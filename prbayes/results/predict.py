@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._display import ShownArray, View
-from prbayes._finding import Finding, as_json, counted, from_json, report
+from prbayes._finding import Finding, Findings, as_json, counted, from_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
     Indices,
     Seed,
+    StrPath,
     finite_number,
     flag,
     plain_text,
@@ -82,7 +82,7 @@ def predict(
     at: Mapping[str, float] | None = None,
     name: str | None = None,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
@@ -450,7 +450,7 @@ def thetas_of(result: Any, evaluator: Evaluator, draws: int, caller: str) -> Flo
     return evaluator.hyperparameters.thetas_of(values)
 
 
-def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:
+def width_of_epsilon(result: Any, model: pm.Model | None) -> Findings:
     """Report draws whose width is that of epsilon, from any sampler.
 
     Draws of a bootstrap, and of log-likelihoods with their default epsilon, are not reported.

@@ -11,11 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
-from prbayes._validate import Floats
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
@@ -124,7 +123,7 @@ class Likely:
 
     def sample(
         self, count: int, rng: np.random.Generator, weights: Floats | None = None
-    ) -> tuple[Floats, NDArray[np.intp]]:
+    ) -> tuple[Floats, Indices]:
         """Return likely inputs, (count, d), and their specimens, which repeat only beyond N."""
         weights = self.weights if weights is None else weights
         n = len(weights)
@@ -320,7 +319,7 @@ def joined(
     emulation: Emulation,
     likely: Likely,
     sampled: Floats,
-    specimens: NDArray[np.intp],
+    specimens: Indices,
     possible: Floats,
     distant: Floats,
 ) -> Emulation:
@@ -358,7 +357,7 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
     return np.asarray(np.maximum(np.minimum(error, improved), floor))
 
 
-def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
+def _is_new(runs: Floats, z: Floats, scale: Floats) -> Bools:
     """Return which points (k, d) coincide with no run and with no earlier point, (k,)."""
     cells = np.round(np.concatenate([runs, z]) / (1e-4 * scale))
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -367,9 +366,7 @@ def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
     return is_first[len(runs) :]
 
 
-def _compared(
-    run: Run, emulation: Emulation, z: Floats, is_new: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
+def _compared(run: Run, emulation: Emulation, z: Floats, is_new: Bools) -> tuple[Floats, Floats]:
     """Return outputs at new points, and the emulator's misfits, (k, m): zero at old points."""
     misfit = np.zeros((len(z), emulation.y.shape[1]))
     outputs = run(z[is_new]) if is_new.any() else misfit[:0]
@@ -396,7 +393,7 @@ def error_and_bias(
     emulation: Emulation,
     likely: Likely,
     z: Floats,
-    specimens: NDArray[np.intp],
+    specimens: Indices,
     misfit: Floats,
 ) -> tuple[Floats, float]:
     """Return the error of the emulator, (m,), and the bias that it causes, from misfits (n, m)."""
@@ -479,9 +476,7 @@ def shares_of_distance(
     return np.asarray(np.nan_to_num(np.clip(share, 0.0, 3.0)))
 
 
-def _near_population(
-    data: SpecimenData, z: Floats, population: Normal, far: float = 6.0
-) -> NDArray[np.bool_]:
+def _near_population(data: SpecimenData, z: Floats, population: Normal, far: float = 6.0) -> Bools:
     """Return which runs are near a population, (n,), at least twice those of the first batch.
 
     A response that oscillates in the tails of a vague prior needs short lengths there alone.
