@@ -103,9 +103,9 @@ def _audited_likelihood(
             "posterior standard deviations at inputs that posterior draws make likely, expected "
             f"at most {likelihood.options.bias}; {advice}"
         )
-    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
-    surface, *_ = fit_surface(z, y, readings, likelihood.name, emulation.surface)
-    extended = Emulation(z, y, surface, emulation.error, np.inf)
+    grown = emulation.with_runs(fresh, outputs)
+    surface, *_ = fit_surface(grown.z, grown.y, readings, likelihood.name, emulation.surface)
+    extended = replace(grown, surface=surface, bias=np.inf)
     result = replace(likelihood, shared_emulation=extended)
     # The first record identifies the problem, because every use of the model has it at first.
     result.cache["first"] = likelihood.cache.get("first", likelihood)

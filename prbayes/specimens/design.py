@@ -32,7 +32,7 @@ from prbayes.specimens.points import (
     residuals_of,
     typical_specimens,
 )
-from prbayes.specimens.proposals import Normal, Proposals
+from prbayes.specimens.proposals import Normal, Proposals, best_rows
 from prbayes.specimens.weighted_points import fit_normal
 
 
@@ -67,9 +67,8 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
         z[:, column] = values
     y = run(z)
     while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
-        more = data.inner[
-            np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)
-        ]
+        rng = np.random.default_rng([data.seed, len(z)])
+        more = data.inner[rng.integers(0, len(data.inner), n)]
         z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
     surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
     rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
@@ -329,18 +328,15 @@ def joined(
     a coarser error is allowed.
     """
     fresh = np.concatenate([sampled, possible, distant])
-    is_new = _is_new(emulation.z, fresh, likely.scale(data))
-    outputs, misfit = _compared(run, emulation, fresh, is_new)
+    grown, misfit, is_new = _compared(run, emulation, fresh, likely.scale(data))
     at_sampled, at_possible, _ = np.split(misfit, [len(sampled), len(sampled) + len(possible)])
     error, bias = error_and_bias(data, emulation, likely, sampled, specimens, at_sampled)
     bias = max(bias, _bias_of_possible(data, at_possible))
-    z, y = np.concatenate([emulation.z, fresh[is_new]]), np.concatenate([emulation.y, outputs])
-    rows = _near_population(data, z, likely.population)
-    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
+    grown, left_out = _refitted(data, grown, likely.population)
     if np.isfinite(bias):
         at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
         error = _improved(data, error, at_sampled)
-    return _with_bias_at_ends(data, Emulation(z, y, surface, error, bias), likely)
+    return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
 def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
@@ -366,12 +362,27 @@ def _is_new(runs: Floats, z: Floats, scale: Floats) -> Bools:
     return is_first[len(runs) :]
 
 
-def _compared(run: Run, emulation: Emulation, z: Floats, is_new: Bools) -> tuple[Floats, Floats]:
-    """Return outputs at new points, and the emulator's misfits, (k, m): zero at old points."""
+def _compared(
+    run: Run, emulation: Emulation, z: Floats, scale: Floats
+) -> tuple[Emulation, Floats, Bools]:
+    """Return the emulation with runs at points, its misfits there, (k, m), and which are new, (k,).
+
+    Misfits are zero at old points. The surface is not fitted again.
+    """
+    is_new = _is_new(emulation.z, z, scale)
     misfit = np.zeros((len(z), emulation.y.shape[1]))
     outputs = run(z[is_new]) if is_new.any() else misfit[:0]
     misfit[is_new] = outputs - emulation.surface.values(z[is_new])
-    return outputs, misfit
+    return emulation.with_runs(z[is_new], outputs), misfit, is_new
+
+
+def _refitted(
+    data: SpecimenData, emulation: Emulation, population: Normal
+) -> tuple[Emulation, Floats]:
+    """Return the emulation with a surface through all of its runs, and left-out errors, (n, m)."""
+    z, y, rows = emulation.z, emulation.y, _near_population(data, emulation.z, population)
+    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
+    return replace(emulation, surface=surface, offsets=None), left_out
 
 
 def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
@@ -540,34 +551,27 @@ def audited(
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
     z = np.concatenate([sampled, candidates[rows], possible])
-    is_new = _is_new(emulation.z, z, likely.scale(data))
-    outputs, misfit = _compared(run, emulation, z, is_new)
+    grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
     weighted = np.sqrt(2 * stratum)[:, None] * at_audited
     audited_z = z[: len(specimens)]
     error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
-    bias = max(bias, _bias_of_possible(data, at_possible))
-    all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
-    bias = max(bias, emulation.bias)
+    bias = max(bias, _bias_of_possible(data, at_possible), emulation.bias)
     pooled = data.readings.relative_error
     if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
         # Eight runs may miss the places where the emulator is wrong, so that the new error is the
         # geometric mean of the stated and the measured one.
         measured = np.sqrt(((error / emulation.error) ** 2).mean())
         error = np.sqrt(min(measured, 1.0)) * emulation.error
-        emulation = replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
-        return _with_bias_at_ends(data, emulation, likely)
-    used = _near_population(data, all_z, likely.population)
-    surface, left_out, _ = fit_surface(
-        all_z, all_y, data.readings, data.name, emulation.surface, used
-    )
+        return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
+    grown, left_out = _refitted(data, grown, likely.population)
     if bias <= 1.5 * data.options.bias:
         at_audited = left_out[len(emulation.z) :][: is_new[: len(specimens)].sum()]
         error = _improved(data, error, at_audited)
     else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)
-    return _with_bias_at_ends(data, Emulation(all_z, all_y, surface, error, bias), likely)
+    return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
 def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
@@ -601,17 +605,14 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         modes = likely.proposals.modes
         if seed == 0 and not likely.is_known():
             return uncorrected
-        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
-        rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
+        rows = best_rows(modes.specimen, modes.misfit + 0.05 * (modes.a**2).sum(axis=1))
         z = residuals.coordinates(modes.specimen[rows], modes.a[rows])
         outputs = run(z)
-        emulated = emulation.surface.values(z)
-        misfit = outputs - emulated - offsets[modes.specimen[rows]]
+        misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
         offsets[modes.specimen[rows]] += np.nan_to_num(misfit)
-        all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, outputs])
         error, bias = error_and_bias(data, emulation, likely, z, modes.specimen[rows], misfit)
         emulation = replace(
-            emulation, z=all_z, y=all_y, error=error, bias=bias, offsets=offsets.copy()
+            emulation.with_runs(z, outputs), error=error, bias=bias, offsets=offsets.copy()
         )
         if seed and not is_rough(data, emulation):
             break

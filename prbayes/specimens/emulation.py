@@ -6,7 +6,7 @@ No guard detects an error of the emulator that is smooth between the runs which 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -121,6 +121,10 @@ class Emulation:
         if self.ends is not None:
             return self.ends
         return np.stack([self.z.min(axis=0), self.z.max(axis=0)])
+
+    def with_runs(self, z: Floats, y: Floats) -> Emulation:
+        """Return the emulation with more runs, (k, d) and (k, m), and the same surface."""
+        return replace(self, z=np.concatenate([self.z, z]), y=np.concatenate([self.y, y]))
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
