@@ -70,6 +70,7 @@ def outlier_findings(
     outputs: Sequence[str],
     *,
     gross_errors: bool = False,
+    remedy: str = "use metric=prb.LogLikelihood(gross_errors=True)",
     apart: float = 8.0,
     share: float = 0.1,
 ) -> Findings:
@@ -110,8 +111,7 @@ def outlier_findings(
         far = far[(far < finite.min()) | (far > finite.max())]
         if far.size:
             where = f" and outside the first {len(finite)} responses"
-            advice = "look at units and typing errors, leave them out, or use "
-            add(label, far, where, f"{advice}metric=prb.LogLikelihood(gross_errors=True).")
+            add(label, far, where, f"look at units and typing errors, leave them out, or {remedy}.")
     return tuple(findings)
 
 
@@ -635,15 +635,15 @@ def misfit_findings(
         return []
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
     off = np.sqrt(np.mean((best.errors[is_poor] * sd) ** 2, axis=0))
-    outputs = ", ".join(f"{value:.2g}" for value in off)
     return [
         Finding(
             "readings-misfit",
             f"{name}: no inputs in the range of the priors reproduce the readings of "
-            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
-            "mean square, by output), expected less than the error of the readings; pass "
-            "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
-            "single specimens, or look at the order of the outputs, the response and the priors.",
+            f"{poor.size} of {int(has_root.sum())} specimens, which are off by up to "
+            f"{off.max():.2g} (root mean square of an output), expected less than the error of the "
+            "readings; pass prb.LogLikelihood(error=...) with its standard deviation, or "
+            "gross_errors=True for single specimens, or look at the order of the outputs, the "
+            "response and the priors.",
             "likelihood.md#readings-that-no-inputs-reproduce",
         )
     ]
@@ -664,13 +664,13 @@ def repeat_findings(name: str, repeats: Repeats, largest: float = 50.0) -> list[
         return []
     specimens = int(is_poor[:-1].any(axis=1).sum())
     which = f"{specimens} of {len(repeats.count)} specimens" if specimens else "the specimens"
-    times = ", ".join(f"{value:.2g}" for value in np.sqrt(ratio[-1][count[-1] > 0]))
+    times = np.sqrt(ratio[-1][count[-1] > 0]).max()
     return [
         Finding(
             "readings-misfit",
-            f"{name}: repeated readings of {which} scatter more than their error: by {times} "
-            "times the error (root mean square, by output), expected about once; correct the "
-            "readings, pass prb.LogLikelihood(error=...) with their standard deviation, or an "
+            f"{name}: repeated readings of {which} scatter more than their error: by {times:.2g} "
+            "times the error (root mean square of the worst output), expected about once; correct "
+            "the readings, pass prb.LogLikelihood(error=...) with their standard deviation, or an "
             "unknown one as a variable, or gross_errors=True for single specimens.",
             "likelihood.md#readings-that-no-inputs-reproduce",
         )

@@ -231,7 +231,12 @@ def computed(simulator: AnySimulator) -> Node:
                 remedy=simulator.responses.remedy,
             )
             outliers = outlier_findings(
-                simulator.name, target.observed, bound.first_responses, outputs.names
+                simulator.name,
+                target.observed,
+                bound.first_responses,
+                outputs.names,
+                remedy="use metric=prb.LogLikelihood(gross_errors=True) with the default "
+                "propagation",
             )
             bound.findings = report(*constant, *findings, *outliers)
             # Duplicates with labels were reported when the simulator was defined.

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from prbayes._finding import Finding, Findings, any_of, report
+from prbayes._finding import Finding, any_of, report
 from prbayes._validate import Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
@@ -20,34 +20,37 @@ from prbayes.model.remedies import remedies_of
 from prbayes.model.specimen_likelihood import draw_inputs, specimen_likelihoods
 from prbayes.model.specimen_preparation import CheckedRuns, first_run_count, prepared
 from prbayes.propagation.base import DesignError
-from prbayes.response.budget import BudgetError
+from prbayes.response.budget import BudgetError, lift
 from prbayes.specimens.design import farthest, most_runs
 from prbayes.specimens.emulation import Emulation, fit_surface
 
 
-def audited_evaluator(evaluator: Evaluator, thetas: Floats, *, is_last: bool = False) -> Evaluator:
+def audited_evaluator(
+    evaluator: Evaluator, thetas: Floats, place: str, *, is_last: bool = False
+) -> tuple[Evaluator, tuple[Finding, ...]]:
     """Return the evaluator with emulators that are right at likely inputs of draws, (S, p).
 
     It is the same object if no emulator has changed. Raise DesignError if one would change in the
-    last round, or has its largest number of runs. A budget that ends leaves the model as it was.
+    last round, or has its largest number of runs. A budget that ends is a finding with the
+    ``place``, and leaves the model as it was. The rest of the work needs no response.
     """
-    records = {old: _audited_likelihood(old, thetas, is_last) for old in evaluator.likelihoods}
+    try:
+        records = {old: _audited_likelihood(old, thetas, is_last) for old in evaluator.likelihoods}
+        for new in records.values():
+            prepared(new)
+    except BudgetError as spent:
+        lift()
+        text = (
+            f"{spent} before the runs were checked at {place}, where the emulator may be wrong. "
+            "Call the function again with a larger budget."
+        )
+        finding = Finding("budget-spent", text, "expensive.md#a-night-is-not-enough")
+        return evaluator, report(finding)
     if all(new is old for old, new in records.items()):
-        return evaluator
-    for new in records.values():
-        prepared(new)
+        return evaluator, ()
     for rv, old in specimen_likelihoods(evaluator.model).items():
         rv.owner.op.assign(rv.owner, records[old])
-    return Evaluator.of(evaluator.model)
-
-
-def unaudited(spent: BudgetError, place: str, caller: str) -> Findings:
-    """Report a budget that ended before the runs were checked at a place."""
-    text = (
-        f"{spent} before the runs were checked at {place}, where the emulator may be wrong. Call "
-        f"{caller} again with a larger budget."
-    )
-    return report(Finding("budget-spent", text, "expensive.md#a-night-is-not-enough"))
+    return Evaluator.of(evaluator.model), ()
 
 
 def _audited_likelihood(

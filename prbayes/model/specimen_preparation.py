@@ -446,7 +446,12 @@ def _data_findings(
         simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
         has_gross_errors = m.gross_errors is not False
         findings += outlier_findings(
-            m.name, values, simulated, m.outputs.names, gross_errors=has_gross_errors
+            m.name,
+            values,
+            simulated,
+            m.outputs.names,
+            gross_errors=has_gross_errors,
+            remedy="pass gross_errors=True beside the other arguments of prb.LogLikelihood",
         )
         if len(finite):
             is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0

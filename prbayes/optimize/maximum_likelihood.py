@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 
-from prbayes._finding import Finding, Findings, counted, report
+from prbayes._finding import Finding, counted, report
 from prbayes._validate import Bools, Floats
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
@@ -38,7 +38,7 @@ from prbayes.model.evaluator import (
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, joined_graphs, unconstrained, variables_at
-from prbayes.model.specimen_audit import audited_evaluator, unaudited
+from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
     PopulationDraws,
@@ -59,7 +59,6 @@ from prbayes.optimize.optimum import (
     point_text,
     require_sampling,
 )
-from prbayes.response.budget import BudgetError, lift
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.specimens.points import agreeing_points, fit_proposals
 
@@ -97,13 +96,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         thetas = np.stack([mode.theta for mode in modes])
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
-        is_audited = [mode.value - modes[0].value <= (0.0 if is_last else 6.0) for mode in modes]
-        spent: Findings = ()
-        try:
-            latest = audited_evaluator(evaluator, thetas[is_audited], is_last=is_last)
-        except BudgetError as error:
-            spent, latest = unaudited(error, "the optima", "prb.minimize"), evaluator
-            lift()
+        rows = thetas[[mode.value - modes[0].value <= (0.0 if is_last else 6.0) for mode in modes]]
+        latest, spent = audited_evaluator(evaluator, rows, "the optima", is_last=is_last)
         if latest is evaluator:
             break
         evaluator = latest
@@ -115,14 +109,12 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     else:
         log_prior = hyperparameters.log_prior(thetas)
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
-    findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
+    preparations = map(prepared, evaluator.likelihoods)
+    findings = [*spent, *(finding for p in preparations for finding in p.findings)]
     n_known = len(modes) if is_supported else 1  # the other modes are spurious
     if not is_supported:
         findings += report(_UNSUPPORTED)
-    findings += [
-        *spent,
-        *report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known])),
-    ]
+    findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
     local_optima = tuple(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
         | {"weight": float(weight)}

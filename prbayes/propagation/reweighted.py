@@ -20,7 +20,7 @@ from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, positive_integer
 from prbayes.emulators.kriging import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
-from prbayes.metrics.base import Basis, Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy, is_additive
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import (
     MAX_LOST,
@@ -524,6 +524,8 @@ def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> Non
             f"{dimensions} inputs are many for stored responses alone: {leave}use "
             "propagation=prb.Resimulated(n), which has no design"
         )
+        if not is_additive(bound.target):
+            advice += " and metric=prb.ProbabilityResidual() for prb.sample"
     text = (
         f"{bound.name}: the design of {bound.config.n} runs supports a typical population of the "
         f"prior with a weight effective sample size of {ess:.0f}, expected at least "

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 
 from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
@@ -289,25 +289,31 @@ def _starts(
     a = np.concatenate([residuals.whitened(of_prior), a])
     # In the units of the prior's spread: a narrow population would leave regions far apart.
     _, near = cKDTree(a).query(a, min(len(a), 4 + 2 * len(free)))
-    distance = np.zeros((n, len(a)))
-    with np.errstate(invalid="ignore", over="ignore"):
-        if len(free) == data.known.shape[1]:
-            values = emulation.values(residuals.coordinates(np.zeros(len(a), dtype=int), a))
-            for readings, simulated, scale in zip(target.T, values.T, unit.T, strict=True):
-                distance += ((readings[:, None] - simulated) / scale[:, None]) ** 2
-        else:
-            for i in range(n):
-                values = emulation.values(residuals.coordinates(np.full(len(a), i), a))
-                distance[i] = (((target[i] - values) / unit[i]) ** 2).sum(axis=1)
-    distance = np.where(np.isnan(distance), np.inf, distance)
-    is_minimum = np.ones(distance.shape, dtype=bool)
-    for column in near[:, 1:].T:
-        is_minimum &= distance <= distance[:, column]
-    # Minima come first. Positive numbers have the order of their bits, whose first one is free.
-    keys = distance.view(np.uint64) | (~is_minimum).astype(np.uint64) << np.uint64(63)
-    nearest = np.argpartition(keys, data.options.starts, axis=1)[:, : data.options.starts]
-    order = np.argsort(np.take_along_axis(keys, nearest, axis=1), axis=1, kind="stable")
-    return a[np.take_along_axis(nearest, order, axis=1)]
+    # Without conditions all specimens have the same outputs at the starts.
+    is_common = len(free) == data.known.shape[1]
+    common = emulation.values(residuals.coordinates(np.zeros(len(a), dtype=int), a))[None]
+    starts = []
+    for rows in np.array_split(np.arange(n), 1 + n * len(a) // IN_CACHE):
+        values = common
+        if not is_common:
+            z = residuals.coordinates(rows.repeat(len(a)), np.tile(a, (len(rows), 1)))
+            values = emulation.values(z).reshape(len(rows), len(a), -1)
+        distance = np.zeros((len(rows), len(a)))
+        with np.errstate(invalid="ignore", over="ignore"):
+            for readings, simulated, scale in zip(
+                target[rows].T, values.T, unit[rows].T, strict=True
+            ):
+                distance += ((readings[:, None] - simulated.T) / scale[:, None]) ** 2
+        distance = np.where(np.isnan(distance), np.inf, distance)
+        is_minimum = np.ones(distance.shape, dtype=bool)
+        for column in near[:, 1:].T:
+            is_minimum &= distance <= distance[:, column]
+        # Minima come first. Positive numbers have the order of their bits, whose first one is free.
+        keys = distance.view(np.uint64) | (~is_minimum).astype(np.uint64) << np.uint64(63)
+        nearest = np.argpartition(keys, data.options.starts, axis=1)[:, : data.options.starts]
+        order = np.argsort(np.take_along_axis(keys, nearest, axis=1), axis=1, kind="stable")
+        starts.append(a[np.take_along_axis(nearest, order, axis=1)])
+    return np.concatenate(starts)
 
 
 def _as_starts(modes: Modes, starts: Floats) -> Floats:

@@ -38,6 +38,7 @@ from prbayes.model.simulator_with_data import number_specimens
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
 from prbayes.response.condition import is_condition
+from prbayes.results.products import product_names
 
 
 @locked
@@ -449,9 +450,13 @@ def _require_candidates(candidates: object) -> None:
             raise TypeError(f"rank: candidates: got label {label!r:.60}, expected a text")
         names = set(candidate) if isinstance(candidate, xr.Dataset) else set()
         if not isinstance(candidate, Optimum) and not {"score", "weight", "data"} <= names:
+            got, products = called(candidate), product_names(candidate)
+            if products:
+                got = f"posteriors of the product {', '.join(products[:3])}"
             raise TypeError(
-                f"rank: candidates: {label}: got {called(candidate)}, expected an Optimum or "
-                "what prb.cross_validate returned"
+                f"rank: candidates: {label}: got {got}, expected an Optimum or what "
+                "prb.cross_validate returned; models are calibrated again without a part of the "
+                "data: pass prb.minimize(model) of each model"
             )
 
 

@@ -471,10 +471,10 @@ class Products(Tree):
 
     def to_dataframe(self) -> Any:
         """Return a row for each product: mean and sd of each hyperparameter, and its test."""
-        posterior = self["posterior"].to_dataset()
+        posterior, products = self._tables()
         columns: dict[str, Any] = {}
         for name, draws in posterior.data_vars.items():
-            values = draws.values  # (chain, draw, product, *shape)
+            values = draws.transpose("chain", "draw", "product", ...).values
             for index in np.ndindex(values.shape[3:]):
                 element = element_name(str(name), index)
                 of_products = values[:, :, :, *index]
@@ -484,12 +484,18 @@ class Products(Tree):
             {name: ("product", values) for name, values in columns.items()},
             {"product": posterior["product"]},
         )
-        numbers = self["products"].to_dataset().drop_vars("finding")
-        return table.merge(numbers).to_dataframe()
+        return table.merge(products.drop_vars("finding")).to_dataframe()
+
+    def _tables(self) -> list[xr.Dataset]:
+        """Return posteriors and products with dimensions that a selection has lost."""
+        tables = [self["posterior"].to_dataset(), self["products"].to_dataset()]
+        for k, dims in enumerate((("chain", "draw", "product"), ("product",))):
+            tables[k] = tables[k].expand_dims([dim for dim in dims if dim not in tables[k].dims])
+        return tables
 
     def to_view(self) -> View:
         """Return what a reader sees."""
-        products = self["products"].to_dataset()
+        _, products = self._tables()
         table = self.to_dataframe()
         columns = [name for name in table.columns if not name.startswith("sd of ")]
         rows = []
@@ -503,7 +509,7 @@ class Products(Tree):
             rows.append([str(product), *cells])
         pairs = zip(products["product"].values, products["finding"].values, strict=True)
         sentences = [f"{product}: {finding}" for product, finding in pairs if finding]
-        heading = f"{len(rows)} products"
+        heading = counted(len(rows), "product")
         if "rejected" in products:
             is_tested = np.isfinite(products["p_value"].values)
             heading += (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -454,6 +455,35 @@ def test_a_diagnosis_reports_codes(metric: prb.Metric) -> None:
         )
     optimum = prb.minimize(model, starts=0, progressbar=False)
     assert "outlying-data" in {finding.code for finding in optimum.findings}
+
+
+@pytest.mark.parametrize("given", [{}, {"error": 0.1}, {"rounded": 0.1}])
+def test_the_advice_for_an_outlier_keeps_the_other_arguments(given: dict[str, float]) -> None:
+    values = np.append(RNG.normal(3, 0.1, 24), 500.0)
+
+    def fitted(**arguments: Any) -> prb.Optimum:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
+            metric = prb.LogLikelihood(**given, **arguments)
+            prb.Simulator("y", np.positive, x, metric=metric, observed=values)
+        return prb.minimize(model, starts=0, progressbar=False)
+
+    texts = {finding.code: finding.text for finding in fitted().findings}
+    advice = "or pass gross_errors=True beside the other arguments of prb.LogLikelihood."
+    assert texts["outlying-data"].endswith(advice)
+    assert "outlying-data" not in {f.code for f in fitted(gross_errors=True).findings}
+
+
+def test_a_misfit_of_many_outputs_is_one_number() -> None:
+    t = np.linspace(0.1, 1, 200)
+    values = RNG.normal(3, 0.1, (12, 1)) * t + RNG.normal(0, 0.1, (12, 200))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
+        prb.Simulator("y", lambda x: x[..., None] * t, x, observed=values)
+    findings = prb.minimize(model, starts=0, progressbar=False).findings
+    (text,) = [f.text for f in findings if f.code == "readings-misfit"]
+    assert "which are off by up to 0.1" in text
+    assert len(text) < 500
 
 
 # -- repeated readings -----------------------------------------------------------------------------

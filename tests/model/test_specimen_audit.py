@@ -110,7 +110,7 @@ def test_a_smooth_response_needs_no_further_run() -> None:
     thetas = evaluator.hyperparameters.prior_thetas(100, 0)
     evaluator.log_other(thetas)
     n_runs = evaluator.n_responses
-    assert audited_evaluator(evaluator, thetas, is_last=True) is evaluator
+    assert audited_evaluator(evaluator, thetas, "here", is_last=True) == (evaluator, ())
     assert evaluator.n_responses == n_runs
 
 
@@ -120,7 +120,7 @@ def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
     thetas = np.stack([np.full(32, -0.7), np.full(32, np.log(0.2))], axis=1)
     evaluator.log_other(thetas)
     with pytest.raises(DesignError, match=r"not smooth enough.*an emulator of \d+ runs that would"):
-        audited_evaluator(evaluator, thetas, is_last=True)
+        audited_evaluator(evaluator, thetas, "here", is_last=True)
 
 
 def test_synthetic_data_of_the_emulator_are_not_audited() -> None:

@@ -21,6 +21,7 @@ from normal_posterior import (
 from scipy import stats
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes._validate import Floats
 from prbayes.inference.prior_continuation import ContinuedEvaluator, continuation_of
 from prbayes.metrics.base import Metric
@@ -234,6 +235,23 @@ def test_mirror_modes_have_the_weights_of_their_prior() -> None:
     assert len(likelihood.centers) == 2
     share = (posterior(likelihood)["mu"] > 1).mean()
     assert share == pytest.approx(1 / (1 + np.exp(0.5)), abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("metric", "error", "is_uncertain"),
+    [(AREA, 0.1, True), (KLD, 0.05, False), (prb.ProbabilityResidual(), 0.05, False)],
+)
+def test_shares_of_mirror_populations(metric: Metric, error: float, is_uncertain: bool) -> None:
+    observed = np.random.default_rng(0).normal(0.9, 0.5, 25) ** 2
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("s", 1))
+        prb.Simulator(
+            "y", np.square, x, metric=metric, observed=observed, propagation=prb.Reweighted(256)
+        )
+    draws = prb.sample(model=model, **QUIET).posterior
+    assert float((draws["mu"] > 0).mean()) == pytest.approx(0.5, abs=error)
+    (text,) = [f.text for f in from_json(draws.attrs["findings"]) if f.code == "second-mode"]
+    assert ("(uncertain by .1" in text) is is_uncertain
 
 
 def test_simulators_have_the_data_of_their_own_specimens() -> None:

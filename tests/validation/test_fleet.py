@@ -1,5 +1,6 @@
 """Products of a fleet have the posteriors that they have alone."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -73,6 +74,38 @@ def test_an_executor_changes_nothing(metric: prb.Metric | None) -> None:
     with ThreadPoolExecutor(1) as executor:
         other = prb.calibrate_each(data, executor=executor, **settings)
     xr.testing.assert_identical(alone, other)
+
+
+@pytest.mark.parametrize(
+    "select",
+    [
+        lambda fleet, name: fleet.sel(product=name),
+        lambda fleet, name: fleet.sel(product=[name]),
+        lambda fleet, name: fleet.isel(chain=0).sel(product=name),
+        lambda fleet, name: fleet.isel(draw=slice(0, 50)).sel(product=name),
+    ],
+)
+def test_a_selected_product_is_displayed(
+    fleet: xr.DataTree, select: Callable[[xr.DataTree, str], Any]
+) -> None:
+    name = str(fleet["products"]["product"].values[1])
+    product = select(fleet, name)
+    assert repr(product).startswith("1 product")
+    assert name in product._repr_html_()
+    table = product.to_dataframe()
+    assert list(table.index) == [name]
+    variable = next(iter(product["posterior"].data_vars.values()))
+    assert table.iloc[0, 0] == pytest.approx(float(variable.mean()))
+
+
+def test_a_product_has_no_rank(fleet: xr.DataTree) -> None:
+    names = fleet["products"]["product"].values
+    products = {name: fleet.sel(product=name) for name in map(str, names[:2])}
+    for candidates in (products, {"a": fleet, "b": fleet}):
+        with pytest.raises(
+            TypeError, match=r"posteriors of the product .*pass prb.minimize\(model"
+        ):
+            prb.rank(candidates)
 
 
 def test_a_product_that_no_inputs_reproduce_is_a_finding_of_its_own() -> None:

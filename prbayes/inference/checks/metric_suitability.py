@@ -38,11 +38,14 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         # The index at 1024 quantiles is 1.0 for a half-Cauchy population, 1.5 for Student's t with
         # 1.5 degrees of freedom, and 1.1 for a lognormal population with a log-scale of 2.5.
         if index < 1.1:
+            metrics = ["prb.ProbabilityResidual()", "prb.KullbackLeibler()"]
+            if node.observed.ndim > 1:
+                metrics = [f"prb.Joint({metric})" for metric in metrics]
             text = (
                 f"{node.name}: the simulated responses have so heavy a tail (tail index "
                 f"{index:.2f}; a population with an index of one or less has no mean) that the "
                 "area between distribution functions is infinite, or depends on responses beyond "
-                "the computed ones: use prb.ProbabilityResidual() or prb.KullbackLeibler(), "
+                f"the computed ones: use {' or '.join(metrics)}, "
                 "inputs with a mean, or the logarithm of the response."
             )
             findings.append(Finding("heavy-tail", text, _ADVICE))

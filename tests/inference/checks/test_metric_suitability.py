@@ -59,6 +59,20 @@ def test_an_area_of_a_population_without_a_mean_is_reported(
     assert all("one or less has no mean" in finding.text for finding in findings)
 
 
+def test_the_advice_for_several_outputs_is_accepted() -> None:
+    observed = np.abs(np.random.default_rng(1).standard_cauchy((30, 2)))
+
+    def response(x: Any) -> Any:
+        return np.stack([x, 2 * x], -1)
+
+    evaluator = evaluator_of(half_cauchy, prb.Joint(prb.AreaMetric()), observed, response)
+    (finding,) = heavy_tails(evaluator, np.zeros(1))
+    for advised in ("ProbabilityResidual", "KullbackLeibler"):
+        assert f"prb.Joint(prb.{advised}())" in finding.text
+        metric = prb.Joint(getattr(prb, advised)())
+        assert heavy_tails(evaluator_of(half_cauchy, metric, observed, response), np.zeros(1)) == []
+
+
 def lognormal() -> Any:
     return pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
 
