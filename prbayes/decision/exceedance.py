@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,8 +18,10 @@ from prbayes._finding import Finding, Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import (
     AT_ONCE,
+    ArrayFunction,
     Bools,
     Floats,
+    Function,
     Seed,
     StrPath,
     positive_integer,
@@ -53,7 +55,7 @@ from prbayes.results.predict import call_settings
 @locked
 def exceedance(
     result: Optimum | xr.DataTree,
-    response: Callable[..., Any],
+    response: Function,
     limit: float,
     *inputs: Any,
     model: pm.Model | None = None,
@@ -544,7 +546,7 @@ class _Points:
 def rare_event(
     transform: InverseTransform,
     parents: Sequence[Floats],
-    respond: Callable[[Floats], Floats],
+    respond: ArrayFunction,
     limit: float,
     size: int,
     rng: np.random.Generator,
@@ -642,7 +644,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
 def _draw_points(
     transform: InverseTransform,
     parents: Sequence[Floats],
-    respond: Callable[[Floats], Floats],
+    respond: ArrayFunction,
     rng: np.random.Generator,
     proposals: list[_Proposal],
     n: int,
@@ -716,9 +718,7 @@ def _moved(parts: list[_Part], points: _Points, limit: float) -> list[_Part]:
     return result
 
 
-def _separate(
-    parts: list[_Part], respond: Callable[[Floats], Floats], limit: float
-) -> tuple[list[_Part], int]:
+def _separate(parts: list[_Part], respond: ArrayFunction, limit: float) -> tuple[list[_Part], int]:
     """Return parts that are separate, and the number of responses that this needed.
 
     Two parts are the same if the response halfway between them is above the lower level. A part

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any
 
@@ -12,7 +11,7 @@ import xarray as xr
 
 from prbayes._display import Table, View, percentage
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import Floats, StrPath, positive_integer, share
+from prbayes._validate import Floats, Function, StrPath, positive_integer, share
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
@@ -31,7 +30,7 @@ from prbayes.results.predict import call_settings
 @locked
 def p_box(
     result: Optimum | xr.DataTree,
-    response: Callable[..., Any],
+    response: Function,
     *inputs: Any,
     model: pm.Model | None = None,
     output: Any = None,

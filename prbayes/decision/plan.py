@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +18,7 @@ from scipy.stats import rankdata
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._stats import reached
-from prbayes._validate import Floats, StrPath, called, positive_integer, positive_number
+from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
 from prbayes.decision.populations import (
     Populations,
     ResponseSample,
@@ -66,9 +66,7 @@ class Condition:
     Condition of square
     """
 
-    def __init__(
-        self, response: Callable[..., Any], *inputs: Any, metric: Metric | None = None
-    ) -> None:
+    def __init__(self, response: Function, *inputs: Any, metric: Metric | None = None) -> None:
         refuse_uncallable("prb.decision.Condition", response)
         if metric is not None and not isinstance(metric, Metric):
             raise TypeError(

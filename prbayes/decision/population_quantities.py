@@ -12,7 +12,7 @@ import xarray as xr
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Findings
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, NamedArrays, called
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations, checked_quantity
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
@@ -41,7 +41,7 @@ class Element:
     groups: Groups | None
     # Values by the name of a quantity, (groups, k), or (1, k) without groups. If the result is an
     # optimum, the first of the k populations is that of the optimum.
-    numbers: dict[str, Floats]
+    numbers: NamedArrays
     findings: Findings = ()
 
 
@@ -61,7 +61,7 @@ class PopulationReader:
         return np.vstack([populations.center[None], populations.thetas])
 
     @cached_property
-    def _points(self) -> dict[str, Floats]:
+    def _points(self) -> NamedArrays:
         return variables_at(self.populations.evaluator.hyperparameters, self._thetas)
 
     def elements(self, requested: Any) -> list[Element]:
@@ -187,7 +187,7 @@ def _side_by_side(quantities: Sequence[Quantity]) -> Callable[[Floats, Floats], 
     return functional
 
 
-def _by_name(names: Sequence[str], numbers: Floats) -> dict[str, Floats]:
+def _by_name(names: Sequence[str], numbers: Floats) -> NamedArrays:
     """Return numbers, (groups, k, q) -> (groups, k), by quantity, and the cv."""
     by_name = dict(zip(names, np.moveaxis(numbers, -1, 0), strict=True))
     mean, sd = by_name.pop("mean"), by_name.pop("sd")

@@ -19,7 +19,16 @@ from scipy.special import gammaincinv, ndtr, ndtri
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
-from prbayes._validate import AT_ONCE, Floats, Indices, StrPath, positive_integer, share
+from prbayes._validate import (
+    AT_ONCE,
+    ArrayFunction,
+    Floats,
+    Function,
+    Indices,
+    StrPath,
+    positive_integer,
+    share,
+)
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
@@ -100,7 +109,7 @@ class Populations:
         """Return about `N_CHECKED` thetas, evenly spaced in their order."""
         return self.thetas[:: max(1, len(self.thetas) // N_CHECKED)]
 
-    def responses(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Responses:
+    def responses(self, response: Function, inputs: Sequence[Any]) -> Responses:
         """Return a response with its inputs."""
         name = named_response(response, self.calling, "write the response with def")
         sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model)
@@ -122,16 +131,12 @@ class Populations:
     def _designs(self) -> dict[int, ReweightedBound | EmulatedSample]:
         return {}
 
-    def sample(
-        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any
-    ) -> ResponseSample:
+    def sample(self, response: Function, inputs: Sequence[Any], output: Any) -> ResponseSample:
         """Return one output of a response at the design's specimens, computed where unknown."""
         sample = self.sample_of_all_outputs(response, inputs)
         return replace(sample, column=output_column(sample.responses, sample.outputs, output))
 
-    def sample_of_all_outputs(
-        self, response: Callable[..., Any], inputs: Sequence[Any]
-    ) -> ResponseSample:
+    def sample_of_all_outputs(self, response: Function, inputs: Sequence[Any]) -> ResponseSample:
         """Return all outputs of a response at the design's specimens.
 
         Raises TypeError if no simulator has specimens of these inputs, and DesignError if the
@@ -261,7 +266,7 @@ class ResponseSample:
         return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
 
 
-def share_error(sample: ResponseSample, counts: Callable[[Floats], Floats]) -> Floats:
+def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
     """Return the error of the mean share of responses that count, by points and emulator.
 
     ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. The part by
@@ -432,7 +437,7 @@ class CentralSpecimens:
     def __init__(
         self,
         populations: Populations,
-        response: Callable[..., Any],
+        response: Function,
         output: Any,
         n_runs: int,
     ) -> None:

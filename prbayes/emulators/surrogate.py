@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,6 +18,7 @@ from prbayes._progress import shown
 from prbayes._validate import (
     Bools,
     Floats,
+    Function,
     Seed,
     Shape,
     StrPath,
@@ -61,7 +62,7 @@ class DesignSurface:
     event: Shape  # shape of a response
     emulator: Emulator  # emulator, fitted in the unit cube
     # The coarse response that the surface follows, and the emulator that has it as an input.
-    coarse: Callable[..., Any] | None = None
+    coarse: Function | None = None
     follower: Follower | None = None
     # Names of the outputs if the response returns a mapping, else None.
     outputs: Outputs | None = None
@@ -73,7 +74,7 @@ class DesignSurface:
         domain: Ranges,
         points: Floats,
         responses: Floats,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
         coarse_values: Floats | None = None,
         seed: int = 0,
     ) -> DesignSurface:
@@ -201,7 +202,7 @@ class Surrogate(RunRecord, Shown):
     n_runs: int
     error: CrossValidation
     noise: int | None = None
-    coarse: Callable[..., Any] | None = None
+    coarse: Function | None = None
     # A list that is empty until the first warning of points outside the ranges.
     _warned: list[bool] = field(repr=False, default_factory=list)
     _surface: DesignSurface = field(repr=False, kw_only=True)
@@ -209,12 +210,12 @@ class Surrogate(RunRecord, Shown):
     @classmethod
     def fit(
         cls,
-        response: Callable[..., Any],
+        response: Function,
         inputs: Mapping[str, Any] | Sequence[Any],
         n: int,
         *,
         model: Any = None,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
         outside: OnFailure | None = None,
         points: str = "even",
         prob: float = 0.999,
@@ -548,7 +549,7 @@ class Surrogate(RunRecord, Shown):
         path: StrPath,
         *,
         model: Any = None,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
     ) -> Surrogate:
         """Read what `save` wrote, and fit the surface again.
 
@@ -699,7 +700,7 @@ def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool
         )
 
 
-def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+def _coarse_at(name: str, coarse: Function, domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at points, (n,); NaN where it raises an error."""
     points = Points(domain.arguments(columns), domain.varying)
     try:
@@ -708,7 +709,7 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
         raise ResponseError(f"{name}: coarse: {error}") from None
 
 
-def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+def _first_coarse(name: str, coarse: Function, domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at the design; raise if it cannot be computed from the inputs."""
     refuse_uncallable(name, coarse, "coarse")
     values = _coarse_at(name, coarse, domain, columns)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._finding import counted
-from prbayes._validate import Floats, StrPath, file_path, plain_text, real_array
+from prbayes._validate import Floats, NamedArrays, StrPath, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
@@ -99,7 +99,7 @@ def read_csv(
     outputs: Sequence[str],
     delimiter: str,
     decimal: str,
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+) -> tuple[NamedArrays, NamedArrays]:
     """Return columns of a CSV file with a line of names: those of inputs, and of outputs."""
     path = file_path(path, f"{caller}: path")
     for argument, names in (("inputs", inputs), ("outputs", outputs)):

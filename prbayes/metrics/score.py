@@ -6,7 +6,6 @@ A metric with ``additive`` has a gradient that is a mean over the observed speci
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats
+from prbayes._validate import ArrayFunction, Floats
 from prbayes.metrics.base import Discrepancy, Part, is_additive
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
@@ -178,7 +177,7 @@ def tabulated_scores(
     specimens: Floats,
     options: ScoreOptions,
     total: int,
-) -> Callable[[Floats], Floats]:
+) -> ArrayFunction:
     """Return the scores as a function of responses, (..., n) or (..., n, m) -> (..., n, d).
 
     A score is a smooth function of the number that a part compares: it is interpolated. Arguments

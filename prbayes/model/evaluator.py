@@ -15,7 +15,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, NamedArrays
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
@@ -201,9 +201,9 @@ class Evaluator:
 
     def observing(
         self,
-        data: dict[str, Floats],
+        data: NamedArrays,
         metric: Metric | None = None,
-        weights: dict[str, Floats] | None = None,
+        weights: NamedArrays | None = None,
     ) -> Evaluator:
         """Return an evaluator of the same model with other observed responses, by simulator.
 
@@ -245,7 +245,7 @@ class Evaluator:
         values, weights = self.simulators[k].populations(self.parents(thetas, k))
         return values, responding_weights(values, weights)
 
-    def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
+    def support(self, thetas: Floats) -> dict[str, NamedArrays]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         by_name = {}
         for k, node in enumerate(self.nodes):
@@ -444,7 +444,7 @@ def specimen_graphs(evaluator: Evaluator) -> list[Any]:
     return list(evaluator.model.logp(vars=variables, sum=False))
 
 
-def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> NamedArrays:
     """Return log p(y_i | theta), (P, S), by simulator with a log-likelihood by specimen.
 
     Of simulators with common specimens the last has those of all, and the first ones have none.
@@ -567,7 +567,7 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
 
 
 def supports_each(
-    support: dict[str, Floats], required_ess: float, max_lost: float, requirement: Requirement
+    support: NamedArrays, required_ess: float, max_lost: float, requirement: Requirement
 ) -> Bools:
     """Return which populations a design supports, shape (P,); parameters as in `shortcoming`."""
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
@@ -579,7 +579,7 @@ def supports_each(
 
 
 def shortcoming(
-    support: dict[str, Floats],
+    support: NamedArrays,
     required_ess: float,
     max_lost: float,
     n_points: int,

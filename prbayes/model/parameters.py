@@ -7,7 +7,7 @@ Elements of variables have names such as 'mu[1]' or 'mu[Adler]', by which tables
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -20,7 +20,16 @@ import xarray as xr
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._validate import Floats, Indices, Shape, called, real_array, refuse_single_precision
+from prbayes._validate import (
+    ArrayFunction,
+    Floats,
+    Indices,
+    NamedArrays,
+    Shape,
+    called,
+    real_array,
+    refuse_single_precision,
+)
 from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
@@ -142,7 +151,7 @@ class Hyperparameters:
         """The compiled function of thetas that returns variables and deterministics."""
         return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
 
-    def constrained(self, thetas: Floats) -> dict[str, Floats]:
+    def constrained(self, thetas: Floats) -> NamedArrays:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
         if not size:  # PyTensor cannot transform empty arrays
@@ -262,7 +271,7 @@ def unconstrained(hyperparameters: Hyperparameters, point: Mapping[str, Any]) ->
     return theta
 
 
-def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> NamedArrays:
     """Return the log-density of each free variable in the user's own units, shapes (P,)."""
     values = hyperparameters._log_prior(np.ascontiguousarray(thetas))[:-1]
     return {
@@ -271,7 +280,7 @@ def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[st
     }
 
 
-def fixed_values(model: pm.Model) -> dict[str, Floats]:
+def fixed_values(model: pm.Model) -> NamedArrays:
     """Return the values of variables that are not free, as `pymc.do` and `pymc.observe` fix them.
 
     Observed variables of simulators are left out.
@@ -283,7 +292,7 @@ def fixed_values(model: pm.Model) -> dict[str, Floats]:
     return {name: x.astype(np.float64) for name, x in numbers.items() if x.dtype.kind in "biuf"}
 
 
-def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> NamedArrays:
     """Return all variables of the model, with those of `fixed_values`, shapes (P, *shape)."""
     size, fixed = len(thetas), fixed_values(hyperparameters.model).items()
     return hyperparameters.constrained(thetas) | {
@@ -292,7 +301,7 @@ def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, 
 
 
 def log_posterior(
-    hyperparameters: Hyperparameters, thetas: Floats, log_likelihood: Callable[[Floats], Floats]
+    hyperparameters: Hyperparameters, thetas: Floats, log_likelihood: ArrayFunction
 ) -> Floats:
     """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
 
@@ -400,12 +409,12 @@ def _element_names_of(name: Any, value: Any) -> list[str]:
 # Values by name.
 
 
-def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
+def split_elements(values: Mapping[Any, Any]) -> NamedArrays:
     """Return arrays (n,) by the names of elements, of arrays (n, *shape) by variable.
 
     Names have the coordinates of the arrays.
     """
-    result: dict[str, Floats] = {}
+    result: NamedArrays = {}
     for name, value in values.items():
         names = _element_names_of(name, value)
         columns = np.asarray(value).reshape(len(value), len(names))
@@ -503,7 +512,7 @@ def stacked_draws(
     return stacked
 
 
-def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
+def finite_draws(posterior: Any, names: Sequence[str]) -> NamedArrays:
     """Return the draws of free variables; raise a ValueError if one is not finite."""
     by_name = {name: draws.values for name, draws in stacked_draws(posterior, names).items()}
     for name, draws in by_name.items():

@@ -6,7 +6,7 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -16,7 +16,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, Findings, report
 from prbayes._stats import log_sum_exp
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import AT_ONCE, IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
@@ -396,9 +396,7 @@ def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Flo
     return [(z - step, z + step) for step in steps]
 
 
-def secants(
-    values: Callable[[Floats], Floats], z: Floats, distance: Floats, columns: list[int]
-) -> Floats:
+def secants(values: ArrayFunction, z: Floats, distance: Floats, columns: list[int]) -> Floats:
     """Return slopes of values (n, m) over half a distance to both sides, (n, m, columns)."""
     changes = [values(high) - values(low) for low, high in two_sides(z, distance, columns)]
     return np.asarray(np.stack(changes, axis=-1) / distance[:, None, columns])

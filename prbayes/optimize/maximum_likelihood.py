@@ -18,7 +18,7 @@ import numpy as np
 import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
-from prbayes._validate import Bools, Floats
+from prbayes._validate import Bools, Floats, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -245,7 +245,7 @@ class _Objective:
         self.values.append(value)
         return value, np.where(np.isfinite(gradient), gradient, 0.0)
 
-    def trace(self, steps: slice) -> dict[str, Floats]:
+    def trace(self, steps: slice) -> NamedArrays:
         """Return the points of one descent."""
         return {
             "theta": np.array(self.thetas[steps]),

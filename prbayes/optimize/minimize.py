@@ -19,6 +19,7 @@ from prbayes._finding import Finding, Findings, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
+    Function,
     Seed,
     flag,
     positive_integer,
@@ -240,7 +241,7 @@ def minimize(
     model: pm.Model | None = None,
     *,
     start: dict[str, Any] | None = None,
-    method: str | Callable[..., Any] | None = None,
+    method: str | Function | None = None,
     options: Mapping[str, Any] | None = None,
     prior: bool = False,
     tolerance: float = 1e-6,

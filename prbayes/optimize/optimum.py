@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Findings, as_json
-from prbayes._validate import Floats
+from prbayes._validate import Floats, NamedArrays
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
 from prbayes.inference.checks.population import failing_share
@@ -114,7 +114,7 @@ class SearchRecord:
     n_screened: int = 0
     n_computed: int = 0
     seconds: float = 0.0
-    trace: dict[str, Floats] = field(default_factory=dict)
+    trace: NamedArrays = field(default_factory=dict)
     stopped: str = ""
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, Labels, positive_integer, wrong_type
+from prbayes._validate import Floats, Labels, NamedArrays, positive_integer, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -261,7 +261,7 @@ def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:
     return evaluator.total(thetas, np.array(scales))
 
 
-def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+def free_elements(evaluator: Evaluator, thetas: Floats) -> NamedArrays:
     """Return the free variables' elements in the user's own units, shape (P,), by element name."""
     values = evaluator.hyperparameters.constrained(thetas)
     free = {str(rv.name): values[str(rv.name)] for rv in evaluator.model.free_RVs}
@@ -340,7 +340,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     return Landscape(axes, heights.reshape(coordinates[0].shape), *marks)
 
 
-def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
+def _thetas_at(evaluator: Evaluator, elements: NamedArrays) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
     with np.errstate(all="ignore"):
         return thetas_at(evaluator, elements)

@@ -19,7 +19,15 @@ import pymc as pm
 import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._validate import Floats, StrPath, called, positive_integer, real_array, share
+from prbayes._validate import (
+    Floats,
+    NamedArrays,
+    StrPath,
+    called,
+    positive_integer,
+    real_array,
+    share,
+)
 from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
 from prbayes.model.parameters import Hyperparameters, in_support
@@ -49,7 +57,7 @@ _OPTIONS = KernelOptions()
 _STATE = ("stages", "beta", "log_marginal_likelihood", "iteration")
 
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
-State = tuple[dict[str, Floats], dict[str, Any]]  # arrays of particles, and a note for JSON
+State = tuple[NamedArrays, dict[str, Any]]  # arrays of particles, and a note for JSON
 
 
 class Particles(NamedTuple):
@@ -259,7 +267,7 @@ class BatchedKernel(SMC_KERNEL):
         note["evaluations"] = [node.bound.draws for node in self.evaluator.nodes]
         return self.particles._asdict(), note
 
-    def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
+    def restore(self, arrays: NamedArrays, note: dict[str, Any]) -> None:
         """Take over a state."""
         self._take(Particles(**arrays))
         for name in _STATE:
@@ -344,7 +352,7 @@ class Checkpoint:
         self.path = Path(path)
         self.problem = problem
         self.settings = dict(settings)
-        self.arrays: dict[str, Floats] = {}
+        self.arrays: NamedArrays = {}
         self.note: dict[str, Any] = {}
         self.digest = b""  # digest of the file as this run has read or written it last
         if self.path.exists():
@@ -352,7 +360,7 @@ class Checkpoint:
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = str(np.random.SeedSequence().entropy)
 
-    def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
+    def save(self, arrays: NamedArrays, note: dict[str, Any]) -> None:
         """Replace the file; it is safe on disk when this returns."""
         variables = {}
         for name, array in arrays.items():

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import Findings
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, called, flag
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, NamedArrays, called, flag
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
     arviz_attributes,
@@ -267,7 +267,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
 
 def _log_likelihood_totals(
     evaluator: Evaluator, rows: Floats, by_specimen: xr.Dataset | None
-) -> dict[str, Floats]:
+) -> NamedArrays:
     """Return the log-likelihood of all specimens by simulator at thetas, (S, d) -> (S,).
 
     The log-likelihoods ``by_specimen`` are summed if they have all draws. Of simulators that share

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.inference.resampling import SETS, aligned, groups, observable
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
@@ -149,7 +149,7 @@ class ResimulatedScores:
     """Scores of responses computed at each theta, of simulators that share specimens."""
 
     # index, unit and score function of each simulator
-    tables: tuple[tuple[int, Floats, Callable[[Floats], Floats]], ...]
+    tables: tuple[tuple[int, Floats, ArrayFunction], ...]
     mean: Floats  # (d,): mean of the observed specimens' scores
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)

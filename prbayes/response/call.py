@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import NO_POPULATION, Bools, Floats, Indices, Shape, unmasked
+from prbayes._validate import NO_POPULATION, Bools, Floats, Function, Indices, Shape, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -38,8 +38,6 @@ from prbayes.response.store import Store, StoreError, add_digests, stored_digest
 from prbayes.response.variables import changed_names, listed, watched
 
 _log = logging.getLogger(__name__)
-
-type Function = Callable[..., Any]  # the user's response, or a part of it
 
 
 class scalar:  # noqa: N801 (reads as a function in a model)

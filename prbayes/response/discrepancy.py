@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from prbayes._finding import Finding, Findings
-from prbayes._validate import Floats, called, real_array, unmasked
-from prbayes.response.call import Function, scalar, unwrapped
+from prbayes._validate import Floats, Function, called, real_array, unmasked
+from prbayes.response.call import scalar, unwrapped
 from prbayes.response.outputs import relabelled
 
 

@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Finding, Findings, counted, from_json
-from prbayes._validate import Floats, wrong_type
+from prbayes._validate import Floats, NamedArrays, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
@@ -580,7 +580,7 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
 
 # support of the populations of a result by each design, arrays of one shape, and what the design
 # requires: weight ESS, largest lost mass and number of points; by simulator
-_Coverage = dict[str, tuple[dict[str, Floats], tuple[float, float, int]]]
+_Coverage = dict[str, tuple[NamedArrays, tuple[float, float, int]]]
 
 
 def _computed_coverage(evaluator: Evaluator, thetas: Floats) -> _Coverage:

@@ -7,14 +7,13 @@ runs, and points of the prior where a specimen could lie.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import ArrayFunction, Bools, Floats, Indices
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
@@ -47,7 +46,7 @@ def most_runs(dimensions: int) -> int:
 
 
 # Coordinates (n, d) -> outputs (n, m), NaN where there is no response.
-type Run = Callable[[Floats], Floats]
+type Run = ArrayFunction
 
 
 def first_emulation(run: Run, data: SpecimenData) -> Emulation:

@@ -5,7 +5,6 @@ No guard detects an error of the emulator that is smooth between the runs which 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -13,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import ndtri
 
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
@@ -73,7 +72,7 @@ class CompressedSurface:
 class DifferencedResponse:
     """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
 
-    values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
+    values: ArrayFunction  # coordinates (k, d) -> outputs (k, m)
     step: float = 1e-5  # step of the differences, in units of the coordinates
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
