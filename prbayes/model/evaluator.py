@@ -20,7 +20,7 @@ from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, joined_graphs, variables_at
+from prbayes.model.parameters import Hyperparameters, value_shapes, variables_at
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -299,7 +299,7 @@ def compiled_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> 
             with building("priors"):
                 log_prior = model.logp(vars=model.free_RVs, jacobian=False)
             value = pt.switch(log_prior > -np.inf, total - log_prior if prior else total, np.inf)
-            (value,), theta = joined_graphs(evaluator.hyperparameters, [value])
+            (value,), theta = evaluator.hyperparameters.joined([value])
             outputs = [value, pt.grad(value, theta)] if gradient else [value]
             evaluator.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
     function = evaluator.functions[key]
@@ -428,7 +428,7 @@ def only_through_prior(evaluator: Evaluator) -> Bools:
             joined.add(rv)
     indirect = {str(rv.name) for rv in joined - direct}
     names = [str(model.values_to_rvs[v].name) for v in model.value_vars]
-    sizes = [int(np.prod(s, dtype=int)) for s in evaluator.hyperparameters.shapes.values()]
+    sizes = [int(np.prod(s, dtype=int)) for s in value_shapes(evaluator.hyperparameters).values()]
     return np.repeat([name in indirect for name in names], sizes)
 
 

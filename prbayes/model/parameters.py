@@ -53,8 +53,6 @@ class Hyperparameters:
 
     model: pm.Model
     point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
-    # Shapes of the value variables, in their order in theta.
-    shapes: dict[str, Shape] = field(init=False)
     initial: Floats = field(init=False)  # the initial point as theta, (d,)
     size: int = field(init=False)  # length d of theta
     # Names of the elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'.
@@ -64,7 +62,7 @@ class Hyperparameters:
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the model and the point."""
-        shapes = {str(v.name): np.shape(self.point[v.name]) for v in self.model.value_vars}
+        shapes = value_shapes(self)
         values = [np.ravel(self.point[name]) for name in shapes]
         initial = np.concatenate([np.empty(0), *values])
         names: list[str] = []
@@ -81,7 +79,6 @@ class Hyperparameters:
                 "name of another, expected different names"
             )
         vars(self).update(
-            shapes=shapes,
             initial=initial,
             size=initial.size,
             names=names,
@@ -112,13 +109,18 @@ class Hyperparameters:
         with interpreted():
             return cls(model, model.initial_point(random_seed=0))
 
+    def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Return graphs of the value variables as graphs of one vector theta, and that vector."""
+        outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
+        return without_dims(outputs), theta
+
     def compile(self, graphs: Sequence[Any]) -> Any:
         """Compile graphs of the value variables into a function of thetas, shape (P, d).
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
         with interpreted():
-            outputs, theta = joined_graphs(self, graphs)
+            outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
             batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
             return compiled([batch], batched)
@@ -227,12 +229,10 @@ class Hyperparameters:
         return np.where(np.isfinite(thetas), thetas, self.initial)
 
 
-def joined_graphs(hyperparameters: Hyperparameters, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
-    """Return graphs of the value variables as graphs of one vector theta, and that vector."""
-    outputs, theta = join_nonshared_inputs(
-        hyperparameters.point, list(graphs), hyperparameters.model.value_vars
-    )
-    return without_dims(outputs), theta
+def value_shapes(hyperparameters: Hyperparameters) -> dict[str, Shape]:
+    """Return the shapes of the value variables by name, in their order in theta."""
+    point = hyperparameters.point
+    return {str(v.name): np.shape(point[v.name]) for v in hyperparameters.model.value_vars}
 
 
 def in_support(hyperparameters: Hyperparameters, thetas: Floats) -> Any:
@@ -323,7 +323,9 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, I
     ways.
     """
     plain = [
-        n for name, shape in hyperparameters.shapes.items() for n in element_names(name, shape)
+        n
+        for name, shape in value_shapes(hyperparameters).items()
+        for n in element_names(name, shape)
     ]
     order = np.argsort(plain)
     quantiles = hyperparameters.quantiles

@@ -54,11 +54,11 @@ def audited_evaluator(
 
 
 def _audited_likelihood(
-    likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool, least_share: float = 0.005
+    likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool
 ) -> SpecimenLikelihood:
     """Return a likelihood with runs where its emulator is wrong, the same if it is right.
 
-    A smaller share of the inputs than ``least_share`` may have an uncertain emulator.
+    A share of .5 % of the inputs may have an uncertain emulator.
     """
     preparation, readings = prepared(likelihood), likelihood.readings
     emulation = preparation.emulation
@@ -80,7 +80,7 @@ def _audited_likelihood(
     ratio = uncertainty(z)
     possible, ratio = z[ratio > 1.0], ratio[ratio > 1.0]
     share = len(possible) / len(z)
-    if share < least_share:
+    if share < 0.005:
         return likelihood
     fresh, counts = audit_points(emulation, possible, ratio, runs)
     weights = share * counts / len(possible)

@@ -244,7 +244,7 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
     return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
 
-def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
+def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
     """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
@@ -255,7 +255,7 @@ def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[f
     if not ends:
         return (1.0,)
     lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
-    count = 1 + int(np.ceil((highest - lowest) / np.log(ratio)))
+    count = 1 + int(np.ceil((highest - lowest) / np.log(3.0)))
     return tuple(np.exp(np.linspace(lowest, highest, count)).tolist())
 
 

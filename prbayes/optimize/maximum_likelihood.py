@@ -37,7 +37,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, joined_graphs, unconstrained, variables_at
+from prbayes.model.parameters import Hyperparameters, unconstrained, variables_at
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
@@ -701,7 +701,7 @@ class SpecimenRefits:
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
                 for w, g in zip(weights, graphs, strict=True)
             ]
-            (value,), theta = joined_graphs(evaluator.hyperparameters, [-sum(terms)])
+            (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
             outputs = ninf_for_invalid([value, gradient])
             evaluator.functions[key] = compiled([theta, *weights], outputs)

@@ -30,7 +30,7 @@ from prbayes._validate import (
 )
 from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
-from prbayes.model.parameters import Hyperparameters, in_support
+from prbayes.model.parameters import Hyperparameters, in_support, value_shapes
 from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
@@ -132,7 +132,7 @@ class BatchedKernel(SMC_KERNEL):
                 "which calibrates it"
             )
         self.variables = model.value_vars
-        shapes = self.evaluator.hyperparameters.shapes.items()
+        shapes = value_shapes(self.evaluator.hyperparameters).items()
         self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
         self.stages: Stages = {}
@@ -296,13 +296,13 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
         )
     free_rvs = hyperparameters.model.free_RVs
     rv_shapes = {str(rv.name): event_shape(rv) for rv in free_rvs}
-    rv_names = dict(zip(hyperparameters.shapes, rv_shapes, strict=True))
+    rv_names = dict(zip(value_shapes(hyperparameters), rv_shapes, strict=True))
     is_complete = all(len({*pair} & set(start)) == 1 for pair in rv_names.items())
     if not is_complete or not set(start) <= {*rv_names, *rv_shapes}:
         raise KeyError(
             f"start: got {sorted(map(str, start))}, expected values for each of {sorted(rv_shapes)}"
         )
-    shapes = rv_shapes | hyperparameters.shapes
+    shapes = rv_shapes | value_shapes(hyperparameters)
     values = {name: real_array(value, f"start: {name}") for name, value in start.items()}
     for name, value in values.items():
         expected = (draws, *shapes[name])
@@ -321,7 +321,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
     with np.errstate(all="ignore"):  # because values outside the support are refused below
         thetas = hyperparameters.thetas_of(own_units)
     first = 0
-    for name, shape in hyperparameters.shapes.items():
+    for name, shape in value_shapes(hyperparameters).items():
         size = int(np.prod(shape, dtype=int))
         if rv_names[name] not in start:
             thetas[:, first : first + size] = values[name].reshape(draws, size)

@@ -31,7 +31,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
-from prbayes.model.parameters import log_prior_terms, variables_at
+from prbayes.model.parameters import log_prior_terms, value_shapes, variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import by_simulator, simulator_records
@@ -408,7 +408,7 @@ def as_multitrace(tree: xr.DataTree, evaluator: Evaluator) -> Any:
     from pymc.backends.base import MultiTrace
     from pymc.backends.ndarray import NDArray
 
-    shapes = evaluator.hyperparameters.shapes
+    shapes = value_shapes(evaluator.hyperparameters)
     ends = np.cumsum([int(np.prod(shape, dtype=int)) for shape in shapes.values()])[:-1]
     traces = []
     for chain, thetas in enumerate(np.asarray(tree["calibration"]["theta"])):

@@ -384,8 +384,8 @@ def _refitted(
     return replace(emulation, surface=surface, offsets=None), left_out
 
 
-def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
-    """Return misfits (n, m) at possible inputs as a bias that is too large above ``largest``.
+def _bias_of_possible(data: SpecimenData, misfit: Floats) -> float:
+    """Return misfits (n, m) at possible inputs as a bias that is too large above .1.
 
     The limit is in units of the data's spread and the readings' errors.
     """
@@ -395,7 +395,7 @@ def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) 
     scaled = np.clip(scaled[np.isfinite(scaled).all(axis=1)], -3.0, 3.0)
     if not len(scaled):
         return 0.0
-    return float(data.options.bias / largest * np.sqrt((scaled**2).mean(axis=0).max()))
+    return float(data.options.bias / 0.1 * np.sqrt((scaled**2).mean(axis=0).max()))
 
 
 def error_and_bias(
@@ -438,19 +438,17 @@ def error_and_bias(
     return error, float(max(bias, narrowing))
 
 
-def _with_bias_at_ends(
-    data: SpecimenData, emulation: Emulation, likely: Likely, largest: float = 0.1
-) -> Emulation:
+def _with_bias_at_ends(data: SpecimenData, emulation: Emulation, likely: Likely) -> Emulation:
     """Return the emulation with the bias of specimens near an end of the range of their inputs.
 
     A density may be infinite at the end, so that the error of an input is compared with its
-    distance from the end. The bias is too large above a share ``largest``.
+    distance from the end. The bias is too large above a share of .1.
     """
     if data.ends is None or np.isinf(data.ends).all():
         return emulation
     z = likely.best()
     share = shares_of_distance(data, emulation.error, z, emulation(z)[1])
-    at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
+    at_ends = data.options.bias / 0.1 * np.sqrt((share**2).mean(axis=0).max())
     return replace(emulation, bias=max(emulation.bias, float(at_ends)))
 
 
@@ -486,7 +484,7 @@ def shares_of_distance(
     return np.asarray(np.nan_to_num(np.clip(share, 0.0, 3.0)))
 
 
-def _near_population(data: SpecimenData, z: Floats, population: Normal, far: float = 6.0) -> Bools:
+def _near_population(data: SpecimenData, z: Floats, population: Normal) -> Bools:
     """Return which runs are near a population, (n,), at least twice those of the first batch.
 
     A response that oscillates in the tails of a vague prior needs short lengths there alone.
@@ -494,7 +492,7 @@ def _near_population(data: SpecimenData, z: Floats, population: Normal, far: flo
     a = np.linalg.solve(population.root, (z[:, data.free] - population.mean).T)
     distance = (a**2).sum(axis=0)
     least = 2 * first_runs(z.shape[1])
-    limit = max(far**2, float(np.sort(distance)[min(least, len(z)) - 1]))
+    limit = max(6.0**2, float(np.sort(distance)[min(least, len(z)) - 1]))
     return np.asarray(distance <= limit)
 
 
@@ -573,9 +571,9 @@ def audited(
     return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
-def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
+def is_rough(data: SpecimenData, emulation: Emulation) -> bool:
     """Return whether the emulator's error is not small beside the scatter of the readings."""
-    return bool((data.readings.relative_error(emulation.error) > largest).any())
+    return bool((data.readings.relative_error(emulation.error) > 0.03).any())
 
 
 def most_corrections(specimens: int, dimensions: int) -> int:

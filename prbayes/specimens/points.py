@@ -556,16 +556,16 @@ def _half_difference(
     return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf, np.inf)
 
 
-def typical_specimens(modes: Modes, n: int, far: float = 5.0, largest: float = 50.0) -> Bools:
+def typical_specimens(modes: Modes, n: int) -> Bools:
     """Return which specimens have no gross error, (n,), by the best mode of each.
 
-    An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
+    An outlier is five robust standard deviations from the median, or no inputs reproduce it.
     """
     best = modes.rows(best_rows(modes.specimen, modes.misfit))
     specimens, a, misfit = best.specimen, best.a, best.misfit
     away = np.abs(a - np.median(a, axis=0))
     sd = 1.4826 * np.median(away, axis=0)
-    is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)
+    is_outlier = (away > 5.0 * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > 50.0)
     typical = np.ones(n, dtype=bool)
     if 2 * is_outlier.sum() < len(specimens):
         typical[specimens[is_outlier]] = False

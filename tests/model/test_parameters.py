@@ -24,6 +24,7 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
     unconstrained,
+    value_shapes,
     variable_of,
 )
 
@@ -43,7 +44,7 @@ def hyperparameters() -> Hyperparameters:
 def test_names_and_shapes(hyperparameters: Hyperparameters) -> None:
     assert hyperparameters.names == ["mu[0]", "mu[1]", "sigma_log__"]
     assert hyperparameters.readable_names == ["mu[0]", "mu[1]", "sigma"]
-    assert hyperparameters.shapes == {"mu": (2,), "sigma_log__": ()}
+    assert value_shapes(hyperparameters) == {"mu": (2,), "sigma_log__": ()}
     np.testing.assert_allclose(hyperparameters.initial, [1.0, 5.0, np.log(3.0)])
     assert hyperparameters.size == 3
     with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
