@@ -15,7 +15,7 @@ from scipy.special import chdtri, gammaln, logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Finding, Findings, as_json, report, sentences_of
-from prbayes._stats import INTERVAL, tail_levels
+from prbayes._stats import INTERVAL, positive_scale, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     ArrayFunction,
@@ -634,7 +634,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
     deviation = weights - totals[:, None]
     variance = (deviation**2).sum(axis=1)
     covariance = (terms * deviation).sum(axis=1)
-    slope = covariance / np.where(variance > 0, variance, 1.0)
+    slope = covariance / positive_scale(variance)
     shares = terms.mean(axis=1) - slope * (totals - 1)
     residuals = terms[0] - slope[0] * weights[0]
     error = residuals.std(ddof=1) / np.sqrt(residuals.size)

@@ -17,7 +17,7 @@ from scipy.stats import rankdata
 
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
-from prbayes._stats import reached
+from prbayes._stats import positive_scale, reached
 from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
 from prbayes.decision.populations import (
     Populations,
@@ -525,7 +525,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     bins = rank // size
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
-    means = sums / np.where(share > 0, share, 1.0)
+    means = sums / positive_scale(share)
     return (means * share) @ means.T
 
 

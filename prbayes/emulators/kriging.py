@@ -31,6 +31,7 @@ import numpy as np
 from numpy.polynomial.legendre import legder, legval
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from prbayes._stats import positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 
 # Largest number of runs of a surface, whose cost grows with the cube of this number.
@@ -412,7 +413,7 @@ def determine(terms: Floats) -> bool:
 def spread_of(z: Floats) -> Floats:
     """Return the standard deviation of each input, (n, d) -> (d,), or one if it is constant."""
     spread = z.std(axis=0)
-    return np.where(spread > 0, spread, 1.0)
+    return positive_scale(spread)
 
 
 def spread_rows(weights: Floats, most: int) -> Indices:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from prbayes._display import Shown, View
 from prbayes._finding import counted
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats, StrPath
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
@@ -171,7 +172,7 @@ class Runs(Shown):
         rows = is_near if is_near.sum() >= 8 else np.isfinite(values).all(axis=1)
         residuals = self.error.residuals.reshape(values.shape)[rows]
         errors = np.quantile(np.abs(residuals), 0.9, axis=0)
-        return float((errors / np.where(sd > 0, sd, np.inf)).max())
+        return float((errors / positive_scale(sd, np.inf)).max())
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""

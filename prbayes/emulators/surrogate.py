@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._display import Shown, View, without_constructor
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
+from prbayes._stats import positive_scale
 from prbayes._validate import (
     Bools,
     Floats,
@@ -592,7 +593,7 @@ class Surrogate(RunRecord, Shown):
             coarse_values = _coarse_at("Surrogate.load", coarse, domain, points)
         surface = DesignSurface.of(model, domain, points, responses, coarse, coarse_values)
         spread = np.asarray(_spread(responses[surface.usable]))
-        size = np.where(spread > 0, spread, 1.0)
+        size = positive_scale(spread)
         probes, expected = surface.probes() / size, saved.probes / size
         # The tolerance is above rounding errors of another processor, and below the effect of a
         # different setting.

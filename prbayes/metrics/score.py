@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._stats import finite_sample, quantile
+from prbayes._stats import finite_sample, positive_scale, quantile
 from prbayes._validate import ArrayFunction, Floats
 from prbayes.metrics.base import Discrepancy, Part, is_additive
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
@@ -101,7 +101,7 @@ class ShiftedResponses:
         slopes = (self.upper - self.lower) / (2 * steps)
         finite = np.where(np.isfinite(self.responses), self.responses, np.nan)
         scale = np.nanstd(finite, axis=0)
-        relative = np.where(np.isfinite(slopes), slopes, 0.0) / np.where(scale > 0, scale, 1.0)
+        relative = np.where(np.isfinite(slopes), slopes, 0.0) / positive_scale(scale)
         squares = np.mean(relative**2, axis=1)
         return np.sqrt(squares.reshape(len(steps), -1).sum(axis=1))
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding, Findings, any_of, report
-from prbayes._stats import adjusted_p_values
+from prbayes._stats import adjusted_p_values, positive_scale
 from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
@@ -578,7 +578,7 @@ def refuse_unused_inputs(name: str, z: Floats, outputs: Floats, inputs: Mapping[
     surface = fit_emulator(z, outputs)
     jacobian = surface(z)[1][:, :, list(inputs)]
     spread = outputs.std(axis=0)
-    values, directions = _singular_vectors(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
+    values, directions = _singular_vectors(jacobian / positive_scale(spread)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < 1e-3:
         raise _undetermined(name, m, directions, list(inputs.values()))
 

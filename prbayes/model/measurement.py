@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats, Indices, Shape
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
@@ -149,7 +150,7 @@ class StackedReadings:
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
             width = 2 * np.ptp(observed_range(measurement), axis=0)
-            logs = np.log(np.where(width > 0, width, 1.0))
+            logs = np.log(positive_scale(width))
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
             np.subtract.at(log_gross, index, logs)
         return cls(

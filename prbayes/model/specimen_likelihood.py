@@ -23,7 +23,7 @@ from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._stats import log_sum_exp
+from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import Floats, Indices, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.conditions import at_conditions
@@ -430,7 +430,7 @@ def _with_reading_errors(
     sd = sd * np.where(is_relative, np.abs(outputs), 1.0)
     result = outputs + sd * rng.standard_normal(outputs.shape)
     step = np.resize(readings.step, (n, count))
-    unit = np.where(step > 0, step, 1.0)
+    unit = positive_scale(step)
     result = np.where(step > 0, np.round(result / unit) * unit, result)
     share = _gross_share(measurements[0], values)
     if share is not False:

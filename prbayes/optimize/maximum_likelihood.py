@@ -18,6 +18,7 @@ import numpy as np
 import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
+from prbayes._stats import positive_scale
 from prbayes._validate import Bools, Floats, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
@@ -775,7 +776,7 @@ class SpecimenRefits:
             factors /= count
             stated = likelihood.measurements[0].weights
             if stated is not None:  # the likelihood contains stated weights, and so do the factors
-                factors = factors / np.where(stated > 0, stated, 1.0)
+                factors = factors / positive_scale(stated)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)

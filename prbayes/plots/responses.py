@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._stats import INTERVAL, distribution_function
+from prbayes._stats import INTERVAL, distribution_function, positive_scale
 from prbayes._validate import Floats, Labels, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
@@ -260,7 +260,7 @@ class _Drawing:
             places = np.arange(len(outputs.labels), dtype=np.float64)
             finite = np.where(np.isfinite(observed), observed, np.nan)
             spread = np.nanstd(finite, axis=0)
-            center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
+            center, unit = np.nanmean(finite, axis=0), positive_scale(spread)
             _name_ticks(axis, places, outputs.names)
             y += ", standard deviations from the mean"
         order = np.argsort(places)

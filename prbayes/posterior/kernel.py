@@ -19,6 +19,7 @@ import pymc as pm
 import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
+from prbayes._stats import positive_scale
 from prbayes._validate import (
     Floats,
     NamedArrays,
@@ -283,7 +284,7 @@ def correlation(start: Floats, end: Floats) -> float:
     a = start - start.mean(axis=0)
     b = end - end.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    correlations = np.abs((a * b).sum(axis=0)) / np.where(size > 0, size, 1.0)
+    correlations = np.abs((a * b).sum(axis=0)) / positive_scale(size)
     return float(np.mean(correlations))
 
 

@@ -13,6 +13,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Finding, Findings, counted, from_json
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats, NamedArrays, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
@@ -529,7 +530,7 @@ def _repeated_draws(draws: Floats) -> list[Finding]:
     for table in draws:
         size = np.abs(table).max(axis=0, initial=0.0)
         # Draws are equal if they differ by rounding alone; posteriors are far wider than that.
-        digits = np.round(table / np.where(size > 0, size, 1.0) / 1e-12)
+        digits = np.round(table / positive_scale(size) / 1e-12)
         counts.append(len(np.unique(digits, axis=0)))
     # A standard deviation from 50 different draws has an error of a tenth.
     expected = min(50, n_draws // 2)

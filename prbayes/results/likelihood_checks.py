@@ -18,6 +18,7 @@ import xarray as xr
 from scipy.special import softmax
 
 from prbayes._finding import Finding, Findings, counted
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats
 from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
@@ -334,7 +335,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> Findings:
     if len(thetas) < 2 or thetas.shape[1] < 4:
         return ()
     within = np.sqrt(thetas.var(axis=1).mean(axis=0))
-    separation = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
+    separation = np.ptp(thetas.mean(axis=1), axis=0) / positive_scale(within, np.inf)
     far = np.flatnonzero(separation > _OPTIONS.separation)
     if not far.size:
         return ()

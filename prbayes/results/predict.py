@@ -17,7 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._display import ShownArray, View
 from prbayes._finding import Finding, Findings, as_json, counted, from_json, report
 from prbayes._progress import shown
-from prbayes._stats import reached
+from prbayes._stats import positive_scale, reached
 from prbayes._validate import (
     Floats,
     Function,
@@ -615,7 +615,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
         spread = np.full(error.shape, np.nan)
         if is_finite.any():
             spread = flat[is_finite].std(axis=0)
-        share = float(np.max(error / np.where(spread > 0, spread, np.inf)))
+        share = float(np.max(error / positive_scale(spread, np.inf)))
         if share > 0.05:
             text = (
                 f"{label}: the interpolant between runs has an error of {share:.0%} of the "

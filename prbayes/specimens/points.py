@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._finding import any_of
-from prbayes._stats import log_sum_exp
+from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.mixtures import normalised_weights
@@ -107,7 +107,7 @@ def points_by_mode(points: SpecimenPoints, modes: Modes) -> SpecimenPoints:
     weights = np.exp(points.log_a - np.where(np.isfinite(largest), largest, 0.0))
     of_mode = (slot[:, None] == np.arange(modes.table.shape[1])[:, None]) * weights[:, None]
     total = of_mode.sum(axis=2)
-    of_mode /= np.where(total > 0, total, 1.0)[:, :, None]
+    of_mode /= positive_scale(total)[:, :, None]
     with np.errstate(divide="ignore"):
         log_a = np.log(total) + largest
     mode = first[:, None] + np.arange(total.shape[1])
@@ -145,7 +145,7 @@ def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
     mean = sample.mean(axis=0)
     covariance = np.atleast_2d(np.cov(sample.T)) * inflation**2
     sd = np.sqrt(np.diagonal(covariance))
-    sd = np.where(sd > 0, sd, 1.0)
+    sd = positive_scale(sd)
     correlation = covariance / np.outer(sd, sd) + 1e-10 * np.eye(len(sd))
     return Normal(mean, sd[:, None] * np.linalg.cholesky(correlation))
 
@@ -565,7 +565,7 @@ def typical_specimens(modes: Modes, n: int) -> Bools:
     specimens, a, misfit = best.specimen, best.a, best.misfit
     away = np.abs(a - np.median(a, axis=0))
     sd = 1.4826 * np.median(away, axis=0)
-    is_outlier = (away > 5.0 * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > 50.0)
+    is_outlier = (away > 5.0 * positive_scale(sd, np.inf)).any(axis=1) | (misfit > 50.0)
     typical = np.ones(n, dtype=bool)
     if 2 * is_outlier.sum() < len(specimens):
         typical[specimens[is_outlier]] = False
