@@ -25,6 +25,7 @@ import prbayes as prb
 from benchmarks.responses import RESPONSES, Response
 from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 
 LEVELS = (np.arange(31) + 0.5) / 31
 THETAS = 16
@@ -81,7 +82,7 @@ def off(evaluator: Evaluator, name: str) -> float:
         values: dict[str, Any] = {}
         for i in range(response.d):
             values |= {f"mu{i}": mean[i], f"sigma{i}": sd[i]}
-        thetas.append(evaluator.hyperparameters.unconstrained(values))
+        thetas.append(unconstrained(evaluator.hyperparameters, values))
     simulated, weights = evaluator.populations(np.array(thetas), 0)
     squares = []
     for y, w, quantiles in zip(simulated, weights, truths(name), strict=True):

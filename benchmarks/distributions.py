@@ -28,7 +28,7 @@ from scipy import special, stats
 
 import prbayes as prb
 from benchmarks.study import Study
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.propagation.base import discrepancy_error
 
 PROPAGATIONS = {
@@ -490,7 +490,7 @@ def _off(case: Case, evaluator: Evaluator, observed: Any) -> float:
 def _off_derivative(case: Case, evaluator: Evaluator) -> float:
     """Return how far a derivative is from that of differences, in units of the largest of them."""
     try:
-        objective = evaluator.objective(prior=False, gradient=True)
+        objective = compiled_objective(evaluator, prior=False, gradient=True)
     except (NotImplementedError, TypeError):
         return 0.0  # it says to have none
     step = 1e-4 * evaluator.hyperparameters.prior_sd[0]

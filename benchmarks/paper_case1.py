@@ -24,6 +24,7 @@ from benchmarks.metrics import METRICS
 from benchmarks.study import Study
 from benchmarks.systems import SYSTEMS
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 from prbayes.optimize.convergence import Search, Trace, minimise, settle
 from prbayes.optimize.objective import Method, Minimisation
 
@@ -70,7 +71,7 @@ def row(cell: str, seed: int) -> dict[str, list[float]]:
     for method, configured in METHODS.items():
         settings = Minimisation(method=configured, max_evaluations=2000)
         search = Search(ev, names.prior_sd, settings)
-        theta = names.unconstrained({"mu": system.initial[0], "sigma": system.initial[1]})
+        theta = unconstrained(names, {"mu": system.initial[0], "sigma": system.initial[1]})
         run = settle(search, minimise(search, theta, np.ones(1), Trace()))
         point = names.constrained(run.theta[None])
         mu, sigma = float(point["mu"][0]), float(point["sigma"][0])

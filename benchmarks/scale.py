@@ -51,6 +51,7 @@ def measure(kind: str, metric: str, size: int) -> dict[str, float]:
 
     import prbayes as prb
     from prbayes.model.evaluator import Evaluator
+    from prbayes.model.parameters import unconstrained
 
     before = peak()
     clock = time.process_time()
@@ -66,7 +67,7 @@ def measure(kind: str, metric: str, size: int) -> dict[str, float]:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
         prb.Simulator("y", linear, x, metric=of_distributions, observed=observed, propagation=how)
     evaluator = Evaluator.of(model)
-    center = evaluator.hyperparameters.unconstrained({"mu": 10.0, "sigma": 1.0})
+    center = unconstrained(evaluator.hyperparameters, {"mu": 10.0, "sigma": 1.0})
     count = THETAS if what == "n" else size
     thetas = center + 0.05 * np.random.default_rng(2).normal(size=(count, 2))
     evaluator(thetas[:1])

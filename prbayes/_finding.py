@@ -52,6 +52,9 @@ class Finding:
         return f'{sentence}; see prb.help("{self.code}"){period}'
 
 
+Findings = tuple[Finding, ...]  # findings in the order in which they are reported
+
+
 def counted(n: int, noun: str, plural: str = "") -> str:
     """Return a number with a noun, in the plural unless the number is one."""
     return f"{n} {noun}" if n == 1 else f"{n} {plural or f'{noun}s'}"
@@ -63,7 +66,7 @@ def any_of(*remedies: str) -> str:
     return f"{', '.join(first)}, or {last}" if first else last
 
 
-def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
+def report(*findings: Finding, level: int = logging.WARNING) -> Findings:
     """Log findings with the logger ``prbayes``, each record with its ``code``; return them."""
     for finding in findings:
         _log.log(level, "%s", finding, extra={"code": finding.code})
@@ -80,7 +83,7 @@ def sentences_of(attrs: Mapping[str, Any]) -> list[str]:
     return [str(finding) for finding in from_json(attrs.get("findings", "[]"))]
 
 
-def from_json(text: str) -> tuple[Finding, ...]:
+def from_json(text: str) -> Findings:
     """Return the findings of an attribute of a stored result, or raise `ValueError`."""
     try:
         records = json.loads(text)

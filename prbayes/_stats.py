@@ -41,6 +41,11 @@ def finite_sample(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return values[is_finite], w
 
 
+def positive_scale(scale: Floats, otherwise: float = 1.0) -> Floats:
+    """Return a scale by which numbers are divided, with another number where it is not positive."""
+    return np.where(scale > 0, scale, otherwise)
+
+
 def ranked(values: Floats, points: Floats, *, kind: Sorting = "stable") -> tuple[Indices, Indices]:
     """Return the order of values, (n,), and how many of them are not above each point, (m,)."""
     order = np.argsort(values, kind=kind)
@@ -127,7 +132,7 @@ def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> Ind
     total = np.cumsum(weights, axis=-1)
     if normalized:
         whole = total[..., -1:]
-        total = total / np.where(whole > 0, whole, 1.0)
+        total = total / positive_scale(whole)
     last = total.shape[-1] - 1
     return np.asarray(np.minimum(_row_positions(total, levels), last), dtype=np.intp)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from functools import partial
@@ -37,6 +37,11 @@ IN_CACHE = 1 << 18
 _LARGEST = 1e152
 
 Shape = tuple[int, ...]  # sizes of the axes of an array
+Labels = Mapping[str, str]  # labels, units or other texts by name
+StrPath = str | os.PathLike[str]  # path of a file or folder
+NamedArrays = dict[str, Floats]  # arrays by name
+ArrayFunction = Callable[[Floats], Floats]
+Function = Callable[..., Any]  # the user's response, or a part of it
 
 
 def called(value: object) -> str:

@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator, shortcomings
+from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import nodes
 from prbayes.response.compile import PLAIN
 
@@ -325,7 +326,7 @@ def test_set_epsilon_is_all_or_nothing(epsilon: dict[str, Any], error: type[Exce
 def test_a_few_nan_responses_are_fine_and_reported() -> None:
     model = build(lambda x: np.where(x > 3.8, np.nan, 0.75 * x), propagation=prb.Reweighted(512))
     evaluator = Evaluator.of(model)
-    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
+    theta = unconstrained(evaluator.hyperparameters, {"mu": 2.0, "sigma": 0.8})[None]
     node = next(iter(nodes(model).values()))
     lost = node.bound.support(evaluator.parents(theta, 0))["lost_mass"]
     np.testing.assert_allclose(lost, norm.sf(3.8, 2.0, 0.8), atol=0.004)
@@ -351,7 +352,7 @@ def test_specimens_that_fail_are_infinite(propagation: prb.propagation.Propagati
         lambda x: np.where(np.asarray(x) > 3.75, np.inf, 0.75 * x), propagation=propagation
     )
     evaluator = Evaluator.of(model)
-    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
+    theta = unconstrained(evaluator.hyperparameters, {"mu": 2.0, "sigma": 0.8})[None]
     values, weights = evaluator.populations(theta, 0)
     failed = weights[0][np.isinf(values[0])].sum()
     np.testing.assert_allclose(failed, norm.sf(3.75, 2.0, 0.8), atol=0.01)

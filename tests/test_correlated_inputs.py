@@ -18,6 +18,7 @@ from prbayes.inference.asymptotics import Local, local_sampling
 from prbayes.inference.refits import SamplingDistribution, refit, sampling_of_functions
 from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 from prbayes.optimize.optimum import point_and_stderr
 
 MEAN = np.array([1.0, 2.0])
@@ -82,7 +83,7 @@ def sampling_at_truth(measured: dict[str, tuple[float, float]]) -> SamplingDistr
     """Return the sampling distribution of the minimiser at the truth."""
     evaluator = Evaluator.of(model_of(measured, prb.KullbackLeibler(), n=2048, emulator=None))
     factor = np.linalg.cholesky(COVARIANCE)[np.tril_indices(2)]
-    theta = evaluator.hyperparameters.unconstrained({"mean": MEAN, "chol": factor})
+    theta = unconstrained(evaluator.hyperparameters, {"mean": MEAN, "chol": factor})
     return SamplingDistribution.of(evaluator, theta, np.ones(len(measured)))
 
 

@@ -18,6 +18,7 @@ import prbayes as prb
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.margins import margins, select_margins
+from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add_runs
 from prbayes.propagation.reweighted import same_points
@@ -89,7 +90,7 @@ def test_groups_share_a_design() -> None:
 
 def test_each_group_is_compared_with_its_population(model: pm.Model) -> None:
     evaluator = Evaluator.of(model)
-    theta = evaluator.hyperparameters.unconstrained({"mu": [0.1, 0.9], "sigma": 0.3})
+    theta = unconstrained(evaluator.hyperparameters, {"mu": [0.1, 0.9], "sigma": 0.3})
     for k, (name, mean) in enumerate(zip(NAMES, [0.1, 0.9], strict=True)):
         observed = DATA.values[name == WHO]
         np.testing.assert_array_equal(np.sort(evaluator.nodes[k].observed), np.sort(observed))
@@ -98,7 +99,7 @@ def test_each_group_is_compared_with_its_population(model: pm.Model) -> None:
         assert abs(values @ weights / 2 - mean) < 0.02
         direct = prb.ProbabilityResidual().against(observed)(values, weights)
         np.testing.assert_allclose(evaluator.discrepancies(theta[None], k), direct, rtol=1e-9)
-    moved = evaluator.hyperparameters.unconstrained({"mu": [0.1, 1.4], "sigma": 0.3})
+    moved = unconstrained(evaluator.hyperparameters, {"mu": [0.1, 1.4], "sigma": 0.3})
     before, after = evaluator(np.stack([theta, moved])).discrepancies
     assert before[0] == after[0]
     assert before[1] != after[1]
@@ -191,8 +192,8 @@ def test_populations_of_inputs_have_the_names_of_groups(model: pm.Model) -> None
 @pytest.mark.parametrize("propagation", [prb.Resimulated(256), prb.Fresh(256)])
 def test_other_propagations_have_groups(propagation: Any) -> None:
     evaluator = Evaluator.of(build(propagation=propagation))
-    theta = evaluator.hyperparameters.unconstrained({"mu": [0.0, 0.5], "sigma": 0.15})
-    far = evaluator.hyperparameters.unconstrained({"mu": [0.0, 1.5], "sigma": 0.15})
+    theta = unconstrained(evaluator.hyperparameters, {"mu": [0.0, 0.5], "sigma": 0.15})
+    far = unconstrained(evaluator.hyperparameters, {"mu": [0.0, 1.5], "sigma": 0.15})
     near_both, far_of_one = evaluator(np.stack([theta, far])).discrepancies
     assert far_of_one[1] > 5 * near_both[1]
     assert far_of_one[0] < 5 * near_both[0] + 1

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,16 @@ import xarray as xr
 from scipy.special import chdtri, gammaln, logsumexp, ndtr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, report, sentences_of
-from prbayes._stats import INTERVAL, tail_levels
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
+from prbayes._stats import INTERVAL, positive_scale, tail_levels
 from prbayes._validate import (
     AT_ONCE,
+    ArrayFunction,
     Bools,
     Floats,
+    Function,
     Seed,
+    StrPath,
     positive_integer,
     seed_number,
     share,
@@ -32,6 +34,7 @@ from prbayes.decision.populations import (
     Populations,
     output_column,
     probability_bounds,
+    share_error,
 )
 from prbayes.decision.quantities import (
     Exceedance,
@@ -52,7 +55,7 @@ from prbayes.results.predict import call_settings
 @locked
 def exceedance(
     result: Optimum | xr.DataTree,
-    response: Callable[..., Any],
+    response: Function,
     limit: float,
     *inputs: Any,
     model: pm.Model | None = None,
@@ -64,7 +67,7 @@ def exceedance(
     n_points: int | None = None,
     steps: int = 5,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
 ) -> ExceedanceTable:
@@ -338,7 +341,7 @@ class _Question:
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
         sample = self.populations.sample(quantity.response, inputs, quantity.output)
         by_draw = sample.evaluate(quantity.of, self.populations.thetas)
-        error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
+        error = share_error(sample, lambda values: quantity.of_specimen(values, np.nan))
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
@@ -428,7 +431,7 @@ def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
 
 def _error_findings(
     response: Any, estimates: Sequence[_Estimate], rough: Sequence[_Estimate]
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Report a probability with a large error, and a share of specimens without response."""
     name = response_name(response)
     findings = []
@@ -543,7 +546,7 @@ class _Points:
 def rare_event(
     transform: InverseTransform,
     parents: Sequence[Floats],
-    respond: Callable[[Floats], Floats],
+    respond: ArrayFunction,
     limit: float,
     size: int,
     rng: np.random.Generator,
@@ -631,7 +634,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
     deviation = weights - totals[:, None]
     variance = (deviation**2).sum(axis=1)
     covariance = (terms * deviation).sum(axis=1)
-    slope = covariance / np.where(variance > 0, variance, 1.0)
+    slope = covariance / positive_scale(variance)
     shares = terms.mean(axis=1) - slope * (totals - 1)
     residuals = terms[0] - slope[0] * weights[0]
     error = residuals.std(ddof=1) / np.sqrt(residuals.size)
@@ -641,7 +644,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
 def _draw_points(
     transform: InverseTransform,
     parents: Sequence[Floats],
-    respond: Callable[[Floats], Floats],
+    respond: ArrayFunction,
     rng: np.random.Generator,
     proposals: list[_Proposal],
     n: int,
@@ -715,9 +718,7 @@ def _moved(parts: list[_Part], points: _Points, limit: float) -> list[_Part]:
     return result
 
 
-def _separate(
-    parts: list[_Part], respond: Callable[[Floats], Floats], limit: float
-) -> tuple[list[_Part], int]:
+def _separate(parts: list[_Part], respond: ArrayFunction, limit: float) -> tuple[list[_Part], int]:
     """Return parts that are separate, and the number of responses that this needed.
 
     Two parts are the same if the response halfway between them is above the lower level. A part

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,12 +11,13 @@ import xarray as xr
 
 from prbayes._display import Table, View, percentage
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import Floats, positive_integer, share
+from prbayes._validate import Floats, Function, StrPath, positive_integer, share
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
     ResponseSample,
     probability_bounds,
+    share_error,
 )
 from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.model.locking import locked
@@ -31,7 +30,7 @@ from prbayes.results.predict import call_settings
 @locked
 def p_box(
     result: Optimum | xr.DataTree,
-    response: Callable[..., Any],
+    response: Function,
     *inputs: Any,
     model: pm.Model | None = None,
     output: Any = None,
@@ -39,7 +38,7 @@ def p_box(
     n_draws: int = ENVELOPED,
     steps: int = 5,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> ProbabilityBox:
     r"""Return bounds of the distribution function of a response over the population.
@@ -206,7 +205,7 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     """Return lower and upper ends of both bands at y, (2, m), the mean function and its error."""
     functions = _distribution_functions(sample, y)
     mean = functions.mean(axis=0)
-    error = sample.share_error(lambda values: (values[:, None] <= y).astype(float))
+    error = share_error(sample, lambda values: (values[:, None] <= y).astype(float))
     if sample.populations.are_draws:
         error = np.hypot(error, functions.std(axis=0, ddof=1) / np.sqrt(len(functions)))
     tail = (1 - prob) / 2

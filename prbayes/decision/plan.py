@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,15 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, counted, report, sentences_of
-from prbayes._stats import reached
-from prbayes._validate import Floats, called, positive_integer, positive_number
-from prbayes.decision.populations import Populations, ResponseSample, standard_deviation
+from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
+from prbayes._stats import positive_scale, reached
+from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
+from prbayes.decision.populations import (
+    Populations,
+    ResponseSample,
+    checked_quantity,
+    standard_deviation,
+)
 from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
@@ -62,9 +66,7 @@ class Condition:
     Condition of square
     """
 
-    def __init__(
-        self, response: Callable[..., Any], *inputs: Any, metric: Metric | None = None
-    ) -> None:
+    def __init__(self, response: Function, *inputs: Any, metric: Metric | None = None) -> None:
         refuse_uncallable("prb.decision.Condition", response)
         if metric is not None and not isinstance(metric, Metric):
             raise TypeError(
@@ -89,7 +91,7 @@ def plan(
     quantity: Quantity | None = None,
     target: Mapping[str, float] | None = None,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> PlanTable:
     r"""Predict standard deviations after k more specimens under each candidate condition.
@@ -184,22 +186,20 @@ def plan(
     populations = Populations.of(
         result, model, 2000, caller, call_settings(executor, store, version)
     )
-    evaluator = populations.evaluator
     quantity_sample = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-        findings, error = quantity_sample.checked_quantity(quantity)
-    unit = evaluator.hyperparameters.prior_sd
+        findings, error = checked_quantity(quantity_sample, quantity)
+    unit = populations.evaluator.hyperparameters.prior_sd
     modes = [populations.thetas[rows] for rows in rows_by_mode(populations.thetas / unit)]
     findings += report(*_several_modes(populations, modes))
     draws = [Draws.of(thetas, unit) for thetas in modes]
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
     now = forecast.sd([np.zeros((unit.size, unit.size))] * len(modes))
     _refuse_target(target, list(now))
-    centers = [populations.center]
-    if len(modes) > 1:
-        centers = [np.median(thetas, axis=0) for thetas in modes]
+    is_single = len(modes) == 1
+    centers = [populations.center if is_single else np.median(thetas, axis=0) for thetas in modes]
     samples = {
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()
@@ -235,7 +235,7 @@ def plan(
     )
 
 
-def _several_modes(populations: Populations, modes: Sequence[Floats]) -> tuple[Finding, ...]:
+def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
     """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
     page = "likelihood.md#several-modes"
     if isinstance(populations.result, Optimum):
@@ -525,7 +525,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     bins = rank // size
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
-    means = sums / np.where(share > 0, share, 1.0)
+    means = sums / positive_scale(share)
     return (means * share) @ means.T
 
 

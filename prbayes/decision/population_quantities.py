@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding
-from prbayes._validate import Floats, called
+from prbayes._finding import Findings
+from prbayes._validate import Floats, NamedArrays, called
 from prbayes.decision.plan import Condition
-from prbayes.decision.populations import Populations
+from prbayes.decision.populations import Populations, checked_quantity
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
 from prbayes.model.evaluator import read_inputs_of_copy
 from prbayes.model.fingerprint import identity_from_attributes, require_together
@@ -41,8 +41,8 @@ class Element:
     groups: Groups | None
     # Values by the name of a quantity, (groups, k), or (1, k) without groups. If the result is an
     # optimum, the first of the k populations is that of the optimum.
-    numbers: dict[str, Floats]
-    findings: tuple[Finding, ...] = ()
+    numbers: NamedArrays
+    findings: Findings = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class PopulationReader:
         return np.vstack([populations.center[None], populations.thetas])
 
     @cached_property
-    def _points(self) -> dict[str, Floats]:
+    def _points(self) -> NamedArrays:
         return variables_at(self.populations.evaluator.hyperparameters, self._thetas)
 
     def elements(self, requested: Any) -> list[Element]:
@@ -132,7 +132,7 @@ class PopulationReader:
         elements = []
         for column, label in enumerate(labels):
             output = replace(sample, column=column if several else None)
-            findings, _ = output.checked_quantity(by_level[-1])
+            findings, _ = checked_quantity(output, by_level[-1])
             quantities = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
             numbers[0, :, -len(quantities) :] = output.evaluate(
@@ -187,7 +187,7 @@ def _side_by_side(quantities: Sequence[Quantity]) -> Callable[[Floats, Floats], 
     return functional
 
 
-def _by_name(names: Sequence[str], numbers: Floats) -> dict[str, Floats]:
+def _by_name(names: Sequence[str], numbers: Floats) -> NamedArrays:
     """Return numbers, (groups, k, q) -> (groups, k), by quantity, and the cv."""
     by_name = dict(zip(names, np.moveaxis(numbers, -1, 0), strict=True))
     mean, sd = by_name.pop("mean"), by_name.pop("sd")

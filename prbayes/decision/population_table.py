@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import xarray as xr
 from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
-from prbayes._validate import Floats, called, flag, positive_integer, share
+from prbayes._validate import Floats, StrPath, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import PopulationReader
 from prbayes.decision.populations import Populations, quantiles_of
 from prbayes.model.locking import locked
@@ -41,7 +40,7 @@ def population(
     at: Mapping[str, float] | None = None,
     n_draws: int = 4000,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> PopulationTable:
     r"""Return mean, spread, quantiles and tolerance bounds of inputs and responses, in units.

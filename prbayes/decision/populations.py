@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,18 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import Finding, as_json, report, sentences_of
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
-from prbayes._validate import AT_ONCE, Floats, Indices, positive_integer, share
+from prbayes._validate import (
+    AT_ONCE,
+    ArrayFunction,
+    Floats,
+    Function,
+    Indices,
+    StrPath,
+    positive_integer,
+    share,
+)
 from prbayes.decision.quantities import (
     Quantile,
     Quantity,
@@ -101,7 +109,7 @@ class Populations:
         """Return about `N_CHECKED` thetas, evenly spaced in their order."""
         return self.thetas[:: max(1, len(self.thetas) // N_CHECKED)]
 
-    def responses(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Responses:
+    def responses(self, response: Function, inputs: Sequence[Any]) -> Responses:
         """Return a response with its inputs."""
         name = named_response(response, self.calling, "write the response with def")
         sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model)
@@ -123,16 +131,12 @@ class Populations:
     def _designs(self) -> dict[int, ReweightedBound | EmulatedSample]:
         return {}
 
-    def sample(
-        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any
-    ) -> ResponseSample:
+    def sample(self, response: Function, inputs: Sequence[Any], output: Any) -> ResponseSample:
         """Return one output of a response at the design's specimens, computed where unknown."""
         sample = self.sample_of_all_outputs(response, inputs)
         return replace(sample, column=output_column(sample.responses, sample.outputs, output))
 
-    def sample_of_all_outputs(
-        self, response: Callable[..., Any], inputs: Sequence[Any]
-    ) -> ResponseSample:
+    def sample_of_all_outputs(self, response: Function, inputs: Sequence[Any]) -> ResponseSample:
         """Return all outputs of a response at the design's specimens.
 
         Raises TypeError if no simulator has specimens of these inputs, and DesignError if the
@@ -248,31 +252,6 @@ class ResponseSample:
             total += np.nansum(weights, axis=0)
         return total / total.sum()
 
-    def share_error(self, counts: Callable[[Floats], Floats]) -> Floats:
-        """Return the error of the mean share of responses that count, by points and emulator.
-
-        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. The part by
-        points is the jackknife over their blocks, or one over their effective number if none or all
-        of them count. The part by emulators is the scatter of emulators without a block of the
-        runs.
-        """
-        is_counted = counts(self.values)
-        weights = self.mean_weights()
-        without = []
-        for block in range(N_BLOCKS):
-            rest = weights * (self.blocks != block)
-            without.append(rest @ is_counted / rest.sum())
-        error = np.sqrt((N_BLOCKS - 1) * np.var(without, axis=0))
-        is_weighted = is_counted[weights > 0]
-        is_same = (is_weighted == is_weighted[0]).all(axis=0)
-        error = np.where(is_same, (weights**2).sum(), error)
-        outputs = self.emulated(self.points)
-        if not outputs:
-            return error
-        mass = np.nanmean(self.masses(self.populations.thinned()), axis=0)
-        means = np.array([mass @ counts(values) for values in outputs])
-        return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
-
     def evaluate(self, functional: Callable[[Floats, Floats], Floats], thetas: Floats) -> Floats:
         """Return a functional of populations, (k, d) -> (k, ...); NaN without a population.
 
@@ -286,58 +265,85 @@ class ResponseSample:
         weights = self.masses(self.populations.thinned())
         return float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
 
-    def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
-        """Return findings, and the error of the quantity at the centre.
 
-        Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
-        no response is in the tail, or specimens failed.
-        """
-        caller, center = self.populations.caller, self.populations.center[None]
-        if quantity.needs_finite and np.isposinf(self.values[-1]):
-            raise ValueError(
-                f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
-                "responses; ask for a Quantile or an Exceedance"
-            )
-        (value,) = self.evaluate(quantity.of, center)
-        # Count responses that are equal to a quantile as beyond it, such as the largest one.
-        at, side = np.nextafter(value, -np.inf), "beyond it"
-        is_beyond = quantity.of_specimen(self.values, at)
-        if not np.isin(is_beyond, (0.0, 1.0)).all():
-            return _beyond_runs(self, quantity), _jackknife_error(self, quantity)
-        share = float(self.mean_weights() @ is_beyond)
-        is_upper = share <= 0.5
-        if not is_upper:  # because the rarer side decides how well the quantity is known
-            at, side = np.nextafter(value, np.inf), "on its other side"
-            share = float(self.mean_weights() @ (1 - quantity.of_specimen(self.values, at)))
-        error = float(self.share_error(lambda values: quantity.of_specimen(values, at)))
-        advice = "pass more responses to the propagation, or ask for a less rare quantity"
-        if share == 0:
-            raise ValueError(
-                f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "
-                f"points, expected some; {advice}"
-            )
-        findings: tuple[Finding, ...] = ()
-        if error > 0.3 * share:
-            text = (
-                f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
-                f"of {error:.2g}, which limits the accuracy of the quantity; {advice}."
-            )
-            findings = report(Finding("rough-probability", text))
-        if not isinstance(quantity, Quantile):
-            return findings, error
-        findings += _beyond_runs(self, quantity)
-        (weights,) = self.weights(center)
-        is_beyond = quantity.of_specimen(self.values, at)
-        if not self.design.on_line:  # because the jackknife of few points in a tail is itself rough
-            rare = weights * (is_beyond if is_upper else 1 - is_beyond)
-            error = max(error, float(np.linalg.norm(rare)))
-        tails = probability_bounds(share, error, float(ndtr(-1)))
-        tails *= min(quantity.probability, 1 - quantity.probability) / share
-        ends = ascending_quantile(self.values, weights, 1 - tails if is_upper else tails)
-        error = float(np.abs(ends - value).max())
-        if not self.design.has_runs:
-            error = float(np.hypot(error, _range_effect(self, quantity, center)[0]))
+def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
+    """Return the error of the mean share of responses that count, by points and emulator.
+
+    ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. The part by
+    points is the jackknife over their blocks, or one over their effective number if none or all
+    of them count. The part by emulators is the scatter of emulators without a block of the
+    runs.
+    """
+    is_counted = counts(sample.values)
+    weights = sample.mean_weights()
+    without = []
+    for block in range(N_BLOCKS):
+        rest = weights * (sample.blocks != block)
+        without.append(rest @ is_counted / rest.sum())
+    error = np.sqrt((N_BLOCKS - 1) * np.var(without, axis=0))
+    is_weighted = is_counted[weights > 0]
+    is_same = (is_weighted == is_weighted[0]).all(axis=0)
+    error = np.where(is_same, (weights**2).sum(), error)
+    outputs = sample.emulated(sample.points)
+    if not outputs:
+        return error
+    mass = np.nanmean(sample.masses(sample.populations.thinned()), axis=0)
+    means = np.array([mass @ counts(values) for values in outputs])
+    return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
+
+
+def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findings, float]:
+    """Return findings, and the error of the quantity at the centre.
+
+    Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
+    no response is in the tail, or specimens failed.
+    """
+    caller, center = sample.populations.caller, sample.populations.center[None]
+    if quantity.needs_finite and np.isposinf(sample.values[-1]):
+        raise ValueError(
+            f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
+            "responses; ask for a Quantile or an Exceedance"
+        )
+    (value,) = sample.evaluate(quantity.of, center)
+    # Count responses that are equal to a quantile as beyond it, such as the largest one.
+    at, side = np.nextafter(value, -np.inf), "beyond it"
+    is_beyond = quantity.of_specimen(sample.values, at)
+    if not np.isin(is_beyond, (0.0, 1.0)).all():
+        return _beyond_runs(sample, quantity), _jackknife_error(sample, quantity)
+    share = float(sample.mean_weights() @ is_beyond)
+    is_upper = share <= 0.5
+    if not is_upper:  # because the rarer side decides how well the quantity is known
+        at, side = np.nextafter(value, np.inf), "on its other side"
+        share = float(sample.mean_weights() @ (1 - quantity.of_specimen(sample.values, at)))
+    error = float(share_error(sample, lambda values: quantity.of_specimen(values, at)))
+    advice = "pass more responses to the propagation, or ask for a less rare quantity"
+    if share == 0:
+        raise ValueError(
+            f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "
+            f"points, expected some; {advice}"
+        )
+    findings: Findings = ()
+    if error > 0.3 * share:
+        text = (
+            f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
+            f"of {error:.2g}, which limits the accuracy of the quantity; {advice}."
+        )
+        findings = report(Finding("rough-probability", text))
+    if not isinstance(quantity, Quantile):
         return findings, error
+    findings += _beyond_runs(sample, quantity)
+    (weights,) = sample.weights(center)
+    is_beyond = quantity.of_specimen(sample.values, at)
+    if not sample.design.on_line:  # because the jackknife of few points in a tail is itself rough
+        rare = weights * (is_beyond if is_upper else 1 - is_beyond)
+        error = max(error, float(np.linalg.norm(rare)))
+    tails = probability_bounds(share, error, float(ndtr(-1)))
+    tails *= min(quantity.probability, 1 - quantity.probability) / share
+    ends = ascending_quantile(sample.values, weights, 1 - tails if is_upper else tails)
+    error = float(np.abs(ends - value).max())
+    if not sample.design.has_runs:
+        error = float(np.hypot(error, _range_effect(sample, quantity, center)[0]))
+    return findings, error
 
 
 def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
@@ -355,7 +361,7 @@ def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
     return float(np.sqrt(variance))
 
 
-def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> tuple[Finding, ...]:
+def _beyond_runs(sample: ResponseSample, quantity: Quantity) -> Findings:
     """Return a finding if the constant response beyond the runs limits a quantity."""
     if sample.design.has_runs:
         return ()
@@ -431,7 +437,7 @@ class CentralSpecimens:
     def __init__(
         self,
         populations: Populations,
-        response: Callable[..., Any],
+        response: Function,
         output: Any,
         n_runs: int,
     ) -> None:
@@ -573,7 +579,7 @@ def evaluate(
     prob: float = INTERVAL,
     n_draws: int = 2000,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
 ) -> QuantityTable:
     """Return a decision quantity with its interval.
@@ -637,7 +643,7 @@ def evaluate(
     calling = call_settings(executor, store, version)
     populations = Populations.of(result, model, n_draws, caller, calling)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings, error = sample.checked_quantity(quantity)
+    findings, error = checked_quantity(sample, quantity)
     by_draw = sample.evaluate(quantity.of, populations.thetas)
     (center,) = sample.evaluate(quantity.of, populations.center[None])
     lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], tail_levels(prob))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from prbayes._stats import ascending_quantile
-from prbayes._validate import Floats, finite_number, flag, share
+from prbayes._validate import Floats, Function, finite_number, flag, share
 from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import sobol
 from prbayes.response.response import refuse_uncallable
@@ -50,7 +50,7 @@ class Quantity(ABC):
     differentiable = True
     of_inputs = "the response"
 
-    def __init__(self, response: Callable[..., Any], *inputs: Any, output: Any = None) -> None:
+    def __init__(self, response: Function, *inputs: Any, output: Any = None) -> None:
         refuse_uncallable(f"prb.decision.{type(self).__name__}", response)
         self.response = response
         self.inputs = inputs
@@ -159,7 +159,7 @@ class Quantile(Quantity):
 
     def __init__(
         self,
-        response: Callable[..., Any],
+        response: Function,
         *inputs: Any,
         probability: float,
         output: Any = None,
@@ -210,7 +210,7 @@ class Exceedance(Quantity):
 
     def __init__(
         self,
-        response: Callable[..., Any],
+        response: Function,
         *inputs: Any,
         limit: float,
         below: bool = False,

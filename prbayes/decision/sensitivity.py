@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from os import PathLike
 
 import numpy as np
 import pymc as pm
@@ -19,12 +18,13 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, report, sentences_of
-from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
+from prbayes._finding import Finding, Findings, as_json, report, sentences_of
+from prbayes._validate import Floats, Seed, StrPath, flag, positive_integer, seed_number
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
     ResponseSample,
+    checked_quantity,
     standard_deviation,
 )
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -52,7 +52,7 @@ def sensitivity(
     n_points: int = 1024,
     computed: bool = False,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
 ) -> SensitivityTable:
@@ -164,7 +164,7 @@ def sensitivity(
         result, model, 4000, caller, call_settings(executor, store, version)
     )
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings, error = sample.checked_quantity(quantity)
+    findings, error = checked_quantity(sample, quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_points, seed)
     inputs, obstacle = input_indices(sample, quantity, n_points, seed, computed=computed)
     findings += report(*_constant_findings(hyperparameters, quantity))
@@ -360,7 +360,7 @@ def input_indices(
     return SensitivityIndices(values, errors), reason
 
 
-def _constant_findings(indices: SensitivityIndices, quantity: Quantity) -> tuple[Finding, ...]:
+def _constant_findings(indices: SensitivityIndices, quantity: Quantity) -> Findings:
     """Return a finding if a quantity has no variance over the hyperparameters."""
     if not np.isnan(indices.values).any():
         return ()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, StrPath
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Range, Ranges
@@ -36,7 +35,7 @@ class SavedSurrogate:
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
-def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
+def write_surrogate(path: StrPath, surrogate: Any, probes: Floats) -> None:
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
@@ -72,7 +71,7 @@ def write_surrogate(path: str | PathLike[str], surrogate: Any, probes: Floats) -
     replace_files({Path(path): bytes(data.to_netcdf(engine="h5netcdf"))}, "Surrogate.save: path")
 
 
-def read_surrogate(path: str | PathLike[str]) -> SavedSurrogate:
+def read_surrogate(path: StrPath) -> SavedSurrogate:
     """Read a file of `write_surrogate`; raise a StoreError if it cannot be read, or is none."""
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:

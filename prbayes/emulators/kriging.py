@@ -31,6 +31,7 @@ import numpy as np
 from numpy.polynomial.legendre import legder, legval
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from prbayes._stats import positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 
 # Largest number of runs of a surface, whose cost grows with the cube of this number.
@@ -124,14 +125,14 @@ class Kriging:
             polynomials = self.polynomials
             slopes = legval(polynomials.scaled(z)[0], legder(series)) / polynomials.half_width
             return self.values(z), (self._on_line[0](z[:, 0], 1) + slopes)[:, None]
-        kernel, factors = KERNELS[self.kernel], self._slope_factors
+        kernel, factors = KERNELS[self.kernel], self._factors[1]
         values, jacobian = np.empty(len(z)), np.empty(z.shape)
         for rows, points, square in self._distances(z):
             value, slope = kernel(square)
             steepness, *by_axis = factors @ slope
             values[rows] = steepness if value is slope else self.weights @ value
             jacobian[rows] = ((by_axis - points * steepness) / self.lengths[:, None]).T
-            trend, slopes = self._trend(z[rows])
+            trend, slopes = polynomial_trend(self, z[rows])
             values[rows] += trend
             jacobian[rows] += slopes
         return values, jacobian
@@ -144,7 +145,7 @@ class Kriging:
         kernel, values = KERNELS[self.kernel], np.empty(len(z))
         for rows, _, square in self._distances(z):
             values[rows] = self.weights @ kernel(square)[0]
-            values[rows] += self._trend(z[rows])[0]
+            values[rows] += polynomial_trend(self, z[rows])[0]
         return values
 
     def variance(self, z: Floats) -> Floats:
@@ -189,17 +190,16 @@ class Kriging:
         return Polynomials.of(self.z, self.degree)
 
     @cached_property
-    def _slope_factors(self) -> Floats:
-        """The weights of the runs, and their products with the scaled runs, (1 + d, n)."""
-        runs = (self.z - self.polynomials.center) / self.lengths
-        return np.concatenate([self.weights[None], self.weights * runs.T])
+    def _factors(self) -> tuple[Floats, Floats]:
+        """Factors of the runs in squared distances, (n, d + 2), and in slopes, (1 + d, n).
 
-    @cached_property
-    def _run_factors(self) -> Floats:
-        """Factors of the runs in squared distances |a|^2 + |b|^2 - 2 a'b, (n, d + 2)."""
+        The former are those of |a|^2 + |b|^2 - 2 a'b, the latter the weights of the runs, and their
+        products with the scaled runs.
+        """
         runs = (self.z - self.polynomials.center) / self.lengths
         of_runs = (runs**2).sum(axis=1, keepdims=True)
-        return np.concatenate([-2 * runs, of_runs, np.ones((len(runs), 1))], axis=1)
+        squares = np.concatenate([-2 * runs, of_runs, np.ones((len(runs), 1))], axis=1)
+        return squares, np.concatenate([self.weights[None], self.weights * runs.T])
 
     @cached_property
     def _quadratic_form(self) -> tuple[float, Floats, Floats]:
@@ -225,26 +225,6 @@ class Kriging:
         pieces = [-comb(5, p) * (side * distances**p) @ weights for p in range(6)]
         return PPoly(np.stack(pieces), ends), self.coefficients
 
-    def _trend(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values, (k,), and slopes, (k, d), of the polynomial at points, (k, d)."""
-        polynomials = self.polynomials
-        if self.degree <= 2:
-            # A quadratic form takes less time than products of polynomials.
-            constant, linear, hessian = self._quadratic_form
-            u = polynomials.scaled(z).T
-            slopes = u @ hessian + linear
-            values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
-            return values, slopes / polynomials.half_width
-        single = polynomials.by_input(z)
-        # Column p: Legendre series of the derivative of P_p.
-        derivative = legder(np.eye(len(single)))
-        slopes = np.empty(z.shape)
-        for a, half_width in enumerate(polynomials.half_width):
-            factors = single.copy()
-            factors[:, a] = derivative.T @ single[:-1, a]
-            slopes[:, a] = self.coefficients @ polynomials.terms(factors) / half_width
-        return self.coefficients @ polynomials.terms(single), slopes
-
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield the rows of blocks of points, the points (d, k), squared distances to runs (n, k).
 
@@ -259,8 +239,29 @@ class Kriging:
             points = ((z[rows] - self.polynomials.center) / self.lengths).T
             point_factors = np.stack([*points, np.ones(points.shape[1]), (points**2).sum(axis=0)])
             square = array[: n * points.shape[1]].reshape(n, -1)
-            np.matmul(self._run_factors, point_factors, out=square)
+            np.matmul(self._factors[0], point_factors, out=square)
             yield rows, points, np.maximum(square, 0.0, out=square)
+
+
+def polynomial_trend(surface: Kriging, z: Floats) -> tuple[Floats, Floats]:
+    """Return values, (k,), and slopes, (k, d), of the polynomial at points, (k, d)."""
+    polynomials = surface.polynomials
+    if surface.degree <= 2:
+        # A quadratic form takes less time than products of polynomials.
+        constant, linear, hessian = surface._quadratic_form
+        u = polynomials.scaled(z).T
+        slopes = u @ hessian + linear
+        values = constant + 0.5 * (u * (slopes + linear)).sum(axis=1)
+        return values, slopes / polynomials.half_width
+    single = polynomials.by_input(z)
+    # Column p: Legendre series of the derivative of P_p.
+    derivative = legder(np.eye(len(single)))
+    slopes = np.empty(z.shape)
+    for a, half_width in enumerate(polynomials.half_width):
+        factors = single.copy()
+        factors[:, a] = derivative.T @ single[:-1, a]
+        slopes[:, a] = surface.coefficients @ polynomials.terms(factors) / half_width
+    return surface.coefficients @ polynomials.terms(single), slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,7 +413,7 @@ def determine(terms: Floats) -> bool:
 def spread_of(z: Floats) -> Floats:
     """Return the standard deviation of each input, (n, d) -> (d,), or one if it is constant."""
     spread = z.std(axis=0)
-    return np.where(spread > 0, spread, 1.0)
+    return positive_scale(spread)
 
 
 def spread_rows(weights: Floats, most: int) -> Indices:

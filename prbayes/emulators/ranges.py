@@ -13,6 +13,7 @@ from pytensor.graph.basic import Variable
 
 from prbayes._validate import Bools, Floats, Shape, real_array
 from prbayes.numerics.points import sobol
+from prbayes.response.call import column_names
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, PriorSampler, valid
 from prbayes.response.inputs import model_on_context, read_inputs
@@ -62,7 +63,22 @@ class Ranges:
     @cached_property
     def free(self) -> Bools:
         """Which columns are not constant."""
-        return np.repeat(self.varying, [r.size for r in self.inputs])
+        return np.repeat(self.varying, self.sizes)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Number of columns of each input."""
+        return [r.size for r in self.inputs]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(r.name for r in self.inputs)
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """Name of each column."""
+        return column_names(self.names, self.sizes)
 
     @property
     def varying(self) -> list[bool]:
@@ -122,9 +138,9 @@ class Ranges:
     def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, Shape]:
         """Return inputs, (..., *event) each, as rows, and their leading shape; or raise."""
         if len(values) != len(self.inputs):
-            names = ", ".join(r.name for r in self.inputs)
             raise TypeError(
-                f"surrogate: got {len(values)} inputs, expected {len(self.inputs)}: {names}"
+                f"surrogate: got {len(values)} inputs, expected {len(self.inputs)}: "
+                f"{', '.join(self.names)}"
             )
         arrays = [real_array(x, r.name) for r, x in zip(self.inputs, values, strict=True)]
         leading = []

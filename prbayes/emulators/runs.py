@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from prbayes._display import Shown, View
 from prbayes._finding import counted
-from prbayes._validate import Floats
+from prbayes._stats import positive_scale
+from prbayes._validate import Floats, StrPath
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import read_csv, read_table
-from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs, is_missing
 
@@ -85,7 +84,7 @@ class Runs(Shown):
     @classmethod
     def read_csv(
         cls,
-        path: str | PathLike[str],
+        path: StrPath,
         inputs: Sequence[str],
         outputs: Sequence[str],
         *,
@@ -158,7 +157,7 @@ class Runs(Shown):
     @property
     def columns(self) -> list[str]:
         """Name of each number of the inputs."""
-        return list(column_names(self.inputs, [r.size for r in self.surrogate.domain.inputs]))
+        return list(self.surrogate.domain.column_names)
 
     def error_beside(self, observed: Floats) -> float:
         """Return the largest left-out error of an output beside data (N,) or (N, m).
@@ -173,11 +172,11 @@ class Runs(Shown):
         rows = is_near if is_near.sum() >= 8 else np.isfinite(values).all(axis=1)
         residuals = self.error.residuals.reshape(values.shape)[rows]
         errors = np.quantile(np.abs(residuals), 0.9, axis=0)
-        return float((errors / np.where(sd > 0, sd, np.inf)).max())
+        return float((errors / positive_scale(sd, np.inf)).max())
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""
-        expected = [r.size for r in self.surrogate.domain.inputs]
+        expected = self.surrogate.domain.sizes
         if list(sizes) != expected:
             raise TypeError(
                 f"{name}: response: got inputs of {list(sizes)} numbers for a table of runs of "

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from prbayes._display import without_constructor
+from prbayes._stats import positive_scale
 from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.emulator import Emulator, fit_emulator, with_failures
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
@@ -110,7 +111,7 @@ class TrainingRuns:
     def spread(self) -> Floats:
         """The standard deviation of the inputs in the relevant populations, (d,)."""
         sd = np.sqrt(self.importance @ (self.x - self.importance @ self.x) ** 2)
-        return np.where(sd > 0, sd, 1.0)
+        return positive_scale(sd)
 
     def scaled(self, x: Floats) -> Floats:
         """Return inputs in units of their spread."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import comb
@@ -18,10 +18,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, positive_integer
+from prbayes._validate import ArrayFunction, Bools, Floats, positive_integer
 from prbayes.emulators.kriging import Kriging, Polynomials, spread_of
 
-Predict = Callable[[Floats], Floats]
+Predict = ArrayFunction
 
 # Ten folds, as recommended by Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
 FOLDS = 10

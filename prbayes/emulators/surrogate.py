@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from os import PathLike
 from typing import Any, cast
 
 import numpy as np
@@ -16,11 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._display import Shown, View, without_constructor
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
+from prbayes._stats import positive_scale
 from prbayes._validate import (
     Bools,
     Floats,
+    Function,
     Seed,
     Shape,
+    StrPath,
     file_path,
     flag,
     plain_text,
@@ -35,9 +37,9 @@ from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.selection import CrossValidation, points_needed
 from prbayes.emulators.surfaces import Surface, as_surface
-from prbayes.emulators.table import RunTable, read_table
+from prbayes.emulators.table import RunRecord, RunTable, read_table
 from prbayes.numerics.points import sobol
-from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
+from prbayes.response.call import CallSettings, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import (
@@ -61,7 +63,7 @@ class DesignSurface:
     event: Shape  # shape of a response
     emulator: Emulator  # emulator, fitted in the unit cube
     # The coarse response that the surface follows, and the emulator that has it as an input.
-    coarse: Callable[..., Any] | None = None
+    coarse: Function | None = None
     follower: Follower | None = None
     # Names of the outputs if the response returns a mapping, else None.
     outputs: Outputs | None = None
@@ -73,7 +75,7 @@ class DesignSurface:
         domain: Ranges,
         points: Floats,
         responses: Floats,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
         coarse_values: Floats | None = None,
         seed: int = 0,
     ) -> DesignSurface:
@@ -149,7 +151,7 @@ class DesignSurface:
 
 @without_constructor
 @dataclass(frozen=True, eq=False, repr=False)
-class Surrogate(Shown):
+class Surrogate(RunRecord, Shown):
     """A surface through runs of an expensive response, to be called in its place.
 
     ``fit`` and ``load`` construct it. Like the response it takes arrays of any leading shape;
@@ -196,15 +198,12 @@ class Surrogate(Shown):
     True
     """
 
-    domain: Ranges = field(repr=False)
-    points: Floats = field(repr=False)
-    responses: Floats = field(repr=False)
     model: Any
     outside: OnFailure
     n_runs: int
     error: CrossValidation
     noise: int | None = None
-    coarse: Callable[..., Any] | None = None
+    coarse: Function | None = None
     # A list that is empty until the first warning of points outside the ranges.
     _warned: list[bool] = field(repr=False, default_factory=list)
     _surface: DesignSurface = field(repr=False, kw_only=True)
@@ -212,18 +211,18 @@ class Surrogate(Shown):
     @classmethod
     def fit(
         cls,
-        response: Callable[..., Any],
+        response: Function,
         inputs: Mapping[str, Any] | Sequence[Any],
         n: int,
         *,
         model: Any = None,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
         outside: OnFailure | None = None,
         points: str = "even",
         prob: float = 0.999,
         name: str = "surrogate",
         executor: Executor | None = None,
-        store: str | PathLike[str] | None = None,
+        store: StrPath | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
@@ -301,7 +300,7 @@ class Surrogate(Shown):
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, prob, seed)
-        refuse_misfit(name, response, [r.size for r in domain.inputs])
+        refuse_misfit(name, response, domain.sizes)
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
         design = domain.at(_unit_points(name, domain, predictive, n, points, seed))
@@ -313,7 +312,7 @@ class Surrogate(Shown):
             database = Store(store, name, columns=design.shape[1], version=version)
         settings = CallSettings(
             name, response, executor, database, policy, retry_failed, outputs=None,
-            columns=column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs]),
+            columns=domain.column_names,
         )  # fmt: skip
         tally, runs = Tally(), Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
@@ -407,8 +406,9 @@ class Surrogate(Shown):
         try:
             surfaces = [DesignSurface.of(m, domain, design, values, seed=seed) for m in models]
         except np.linalg.LinAlgError:
-            names = column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs])
-            counts = dict(zip(names, [len(set(column)) for column in design.T], strict=True))
+            counts = dict(
+                zip(domain.column_names, [len(set(column)) for column in design.T], strict=True)
+            )
             raise ValueError(
                 f"{name}: inputs: got runs that determine no surface, with numbers of different "
                 f"values {counts}, expected at least 3, and no input that follows from others; "
@@ -426,16 +426,6 @@ class Surrogate(Shown):
             _surface=replace(surfaces[best], outputs=table.labels),
         )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return tuple(r.name for r in self.domain.inputs)
-
-    @property
-    def ranges(self) -> dict[str, tuple[Any, Any]]:
-        """Lowest and highest value of each input."""
-        return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
-
     def to_dataframe(self) -> Any:
         """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
         import pandas as pd
@@ -444,7 +434,7 @@ class Surrogate(Shown):
         m = values.shape[1]
         labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
         columns = [
-            *column_names(self.names, [r.size for r in self.domain.inputs]),
+            *self.domain.column_names,
             *(labels if self._surface.outputs is None else self._surface.outputs.names),
         ]
         return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
@@ -540,7 +530,7 @@ class Surrogate(Shown):
         """
         return replace(self, noise=seed_number(random_seed, "with_error: random_seed"))
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: StrPath) -> None:
         """Write design, responses and configuration as netCDF.
 
         Parameters
@@ -557,10 +547,10 @@ class Surrogate(Shown):
     @classmethod
     def load(
         cls,
-        path: str | PathLike[str],
+        path: StrPath,
         *,
         model: Any = None,
-        coarse: Callable[..., Any] | None = None,
+        coarse: Function | None = None,
     ) -> Surrogate:
         """Read what `save` wrote, and fit the surface again.
 
@@ -603,7 +593,7 @@ class Surrogate(Shown):
             coarse_values = _coarse_at("Surrogate.load", coarse, domain, points)
         surface = DesignSurface.of(model, domain, points, responses, coarse, coarse_values)
         spread = np.asarray(_spread(responses[surface.usable]))
-        size = np.where(spread > 0, spread, 1.0)
+        size = positive_scale(spread)
         probes, expected = surface.probes() / size, saved.probes / size
         # The tolerance is above rounding errors of another processor, and below the effect of a
         # different setting.
@@ -711,7 +701,7 @@ def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool
         )
 
 
-def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+def _coarse_at(name: str, coarse: Function, domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at points, (n,); NaN where it raises an error."""
     points = Points(domain.arguments(columns), domain.varying)
     try:
@@ -720,7 +710,7 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
         raise ResponseError(f"{name}: coarse: {error}") from None
 
 
-def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+def _first_coarse(name: str, coarse: Function, domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at the design; raise if it cannot be computed from the inputs."""
     refuse_uncallable(name, coarse, "coarse")
     values = _coarse_at(name, coarse, domain, columns)

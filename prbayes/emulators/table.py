@@ -4,25 +4,40 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from os import PathLike
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from prbayes._finding import counted
-from prbayes._validate import Floats, file_path, plain_text, real_array
+from prbayes._validate import Floats, NamedArrays, StrPath, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
 
 @dataclass(frozen=True, eq=False)
-class RunTable:
+class RunRecord:
+    """Runs of a response, and the ranges of its inputs."""
+
+    domain: Ranges = field(repr=False)
+    points: Floats = field(repr=False)  # (n, columns): inputs of the runs
+    responses: Floats = field(repr=False)  # (n,) or (n, m): responses of the runs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.domain.names
+
+    @property
+    def ranges(self) -> dict[str, tuple[Any, Any]]:
+        """Lowest and highest value of each input."""
+        return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
+
+
+@dataclass(frozen=True, eq=False)
+class RunTable(RunRecord):
     """Runs, and the names of their outputs."""
 
-    domain: Ranges
-    points: Floats  # (n, columns): inputs of the runs
-    responses: Floats  # (n,) or (n, m): responses of the runs
     # Names of the outputs: "response" for a single unnamed output, "response[0]" for the first of
     # several.
     outputs: tuple[str, ...]
@@ -79,12 +94,12 @@ def read_table(caller: str, inputs: Any, responses: Any) -> RunTable:
 
 def read_csv(
     caller: str,
-    path: str | PathLike[str],
+    path: StrPath,
     inputs: Sequence[str],
     outputs: Sequence[str],
     delimiter: str,
     decimal: str,
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+) -> tuple[NamedArrays, NamedArrays]:
     """Return columns of a CSV file with a line of names: those of inputs, and of outputs."""
     path = file_path(path, f"{caller}: path")
     for argument, names in (("inputs", inputs), ("outputs", outputs)):

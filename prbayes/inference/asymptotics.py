@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._stats import distribution_function, quantile, reached
+from prbayes._stats import distribution_function, positive_scale, quantile, reached
 from prbayes._validate import AT_ONCE, Bools, Floats, Indices
 from prbayes.inference.resampling import (
     SETS,
@@ -266,7 +266,7 @@ class Information:
             weights = weights * subset
             total = weights.sum(axis=-1, keepdims=True)
             # A population without weight on these points has a distribution function of zeros.
-            weights = weights / np.where(total > 0, total, 1.0)
+            weights = weights / positive_scale(total)
         areas = []
         for part in self.node.target.parts:
             part_observed, rows = part.observed_of(observed)

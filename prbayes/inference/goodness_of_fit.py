@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding
-from prbayes._stats import distribution_function
+from prbayes._stats import distribution_function, positive_scale
 from prbayes._validate import Bools, Floats
 from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
@@ -323,7 +323,7 @@ class _Outputs:
         is_measured = ~np.isnan(self.values[:, pair]).any(axis=1)
         weights = self.weights[:, is_measured]
         total = weights.sum(axis=1, keepdims=True)
-        weights = weights / np.where(total > 0, total, np.nan)
+        weights = weights / positive_scale(total, np.nan)
         measured = _correlation(self.values[is_measured][:, pair], weights)
         return measured, _correlation(self.simulated[:, pair], self.masses)
 
@@ -331,7 +331,7 @@ class _Outputs:
 def _correlation(values: Floats, weights: Floats) -> Floats:
     """Return correlations, (n, 2), (S, n) -> (S,); NaN if an output does not vary."""
     spread = values.std(axis=0)
-    a, b = ((values - values.mean(axis=0)) / np.where(spread > 0, spread, 1.0)).T
+    a, b = ((values - values.mean(axis=0)) / positive_scale(spread)).T
     moments = weights @ np.column_stack([a, b, a * a, b * b, a * b])
     mean_a, mean_b, square_a, square_b, product = moments.T
     variances = (square_a - mean_a**2) * (square_b - mean_b**2)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Bools, Floats, Indices
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices, NamedArrays
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
@@ -318,7 +318,7 @@ def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats
     return values[:, :_MAX_POINTS], equal
 
 
-def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
+def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> NamedArrays:
     """Draw one data set from the populations at theta by calling the response.
 
     Specimens that cannot be observed are replaced, as in `simulated_sets`.
@@ -361,15 +361,13 @@ def observed_set(evaluator: Evaluator) -> DataSets:
     return DataSets([t.observed for t in targets], [t.weights[None] for t in targets])
 
 
-def one_set(
-    evaluator: Evaluator, sets: DataSets, i: int
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+def one_set(evaluator: Evaluator, sets: DataSets, i: int) -> tuple[NamedArrays, NamedArrays]:
     """Return the i-th data set as it would be measured: values and their weights, by simulator.
 
     Specimens of equal weights are repeated if a value occurs several times.
     """
-    data: dict[str, Floats] = {}
-    data_weights: dict[str, Floats] = {}
+    data: NamedArrays = {}
+    data_weights: NamedArrays = {}
     for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
         unit = node.target.weights
         rows = np.flatnonzero(weights[i])

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from prbayes._validate import Floats, flag
+from prbayes._validate import Floats, Function, flag
 from prbayes.metrics.base import Discrepancy, Features, Metric
 
 
@@ -40,7 +39,7 @@ class FunctionMetric(Metric):
     3.0
     """
 
-    function: Callable[..., Any]
+    function: Function
     _: KW_ONLY
     weighted: bool = False
     symbolic: ClassVar[bool] = False

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from prbayes._stats import finite_sample, quantile
+from prbayes._stats import finite_sample, positive_scale, quantile
 from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
 from prbayes.metrics.base import (
     Basis,
@@ -470,7 +470,7 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
         q_squared = (q**2 * dz).sum(axis=-1)
         size = np.sqrt(p_squared * q_squared)
         product_sum = (p * q * dz).sum(axis=-1)
-        cosine = product_sum / np.where(size > 0, size, 1.0)
+        cosine = product_sum / positive_scale(size)
         cosines.append(np.nan_to_num(cosine))
     return np.asarray(np.min(cosines, axis=0))
 

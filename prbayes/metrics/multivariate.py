@@ -426,12 +426,12 @@ def _order(key: frozenset[int]) -> tuple[int, list[int]]:
     return -len(key), sorted(key)
 
 
-def _is_rare(key: frozenset[int], has: Bools, fewest: int = 10) -> bool:
+def _is_rare(key: frozenset[int], has: Bools) -> bool:
     """Return whether too few specimens have these outputs to whiten them, or their components.
 
     Two principal components need ten specimens, because scatters of fewer are uncertain.
     """
-    needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else fewest
+    needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else 10
     return int(has[:, list(key)].all(axis=-1).sum()) < needed
 
 

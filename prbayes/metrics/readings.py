@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from prbayes._stats import positive_scale
 from prbayes._validate import Bools, Floats, Indices
 
 
@@ -75,7 +76,7 @@ class Readings:
         pooled = self.values[:, few][self.is_measured[:, few]]
         if few.sum() > 1 and pooled.size > 1:
             sd[few] = pooled.std()
-        return np.where(sd > 0, sd, 1.0)
+        return positive_scale(sd)
 
     def relative_error(self, error: Floats) -> Floats:
         """Return errors of an emulator, (m,), in units of `robust_spread`.
@@ -141,7 +142,7 @@ class Readings:
         normal = -0.5 * z**2 - 0.5 * xp.log(2 * np.pi * variance)
         terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
-            step = np.where(self.step > 0, self.step, 1.0)[:, None]
+            step = positive_scale(self.step)[:, None]
             inside = log_interval_probability(z - step / (2 * sd), z + step / (2 * sd), xp)
             is_rounded = ((self.step > 0) & self.is_measured)[:, None]
             terms = xp.where(is_rounded, inside - np.log(step), terms)

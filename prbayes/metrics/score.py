@@ -6,15 +6,14 @@ A metric with ``additive`` has a gradient that is a mean over the observed speci
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats
+from prbayes._stats import finite_sample, positive_scale, quantile
+from prbayes._validate import ArrayFunction, Floats
 from prbayes.metrics.base import Discrepancy, Part, is_additive
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
@@ -102,7 +101,7 @@ class ShiftedResponses:
         slopes = (self.upper - self.lower) / (2 * steps)
         finite = np.where(np.isfinite(self.responses), self.responses, np.nan)
         scale = np.nanstd(finite, axis=0)
-        relative = np.where(np.isfinite(slopes), slopes, 0.0) / np.where(scale > 0, scale, 1.0)
+        relative = np.where(np.isfinite(slopes), slopes, 0.0) / positive_scale(scale)
         squares = np.mean(relative**2, axis=1)
         return np.sqrt(squares.reshape(len(steps), -1).sum(axis=1))
 
@@ -178,7 +177,7 @@ def tabulated_scores(
     specimens: Floats,
     options: ScoreOptions,
     total: int,
-) -> Callable[[Floats], Floats]:
+) -> ArrayFunction:
     """Return the scores as a function of responses, (..., n) or (..., n, m) -> (..., n, d).
 
     A score is a smooth function of the number that a part compares: it is interpolated. Arguments

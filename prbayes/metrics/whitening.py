@@ -227,12 +227,12 @@ def sufficient_specimens(m: int) -> int:
     return max(5 * m, 3 * m * (m + 1) // 2)
 
 
-def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
+def _shrunk(root: Floats, n: float) -> Floats:
     """Return a root of the inverse scatter whose principal variances differ less, for few data.
 
     Without shrinkage a combination of outputs that happens to scatter little would count as much as
     all others. The ratio of neighbouring variances is reduced, at most to one, by the ratio that
-    two equal variances of n normal values exceed with probability ``chance``:
+    two equal variances of n normal values exceed with probability .1:
     ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. The shrinkage falls to zero at a sufficient number of
     specimens.
     """
@@ -241,7 +241,7 @@ def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
         return root
     _, size, axes = np.linalg.svd(np.linalg.inv(root))
     log_size = np.log(size)
-    threshold = np.sqrt(deficit) * np.arccosh(chance ** (-1 / max(n - 2, 1)))
+    threshold = np.sqrt(deficit) * np.arccosh(0.1 ** (-1 / max(n - 2, 1)))
     gaps = np.maximum(-np.diff(log_size) - threshold, 0)
     shrunk = -np.concatenate([[0.0], np.cumsum(gaps)])
     return axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean())

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from prbayes._finding import Finding, any_of, report
-from prbayes._stats import adjusted_p_values
+from prbayes._finding import Finding, Findings, any_of, report
+from prbayes._stats import adjusted_p_values, positive_scale
 from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import Readings, Repeats
@@ -71,13 +71,11 @@ def outlier_findings(
     *,
     gross_errors: bool = False,
     remedy: str = "use metric=prb.LogLikelihood(gross_errors=True)",
-    apart: float = 8.0,
-    share: float = 0.1,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of codes for missing values, and of values that no response explains.
 
-    A code, such as -999, is farther from all other values than these are apart. Up to ``share`` of
-    the values are outliers if they are outside all simulated responses, and a gap of ``apart``
+    A code, such as -999, is farther from all other values than these are apart. Up to a tenth
+    of the values are outliers if they are outside all simulated responses, and a gap of eight
     times the range of all other values separates them. Of samples of 25 lognormal values
     (sigma = 1) .3 % have such a gap, of Student's t (3) .1 %. With gross errors in the likelihood
     only codes are reported.
@@ -107,7 +105,7 @@ def outlier_findings(
         finite = simulated[k][np.isfinite(simulated[k])] if len(columns) == len(simulated) else rest
         if gross_errors or len(rest) < 8 or len(finite) < 16:  # too few values to know the range
             continue
-        far = _separate(rest, apart, share)
+        far = _separate(rest, 8.0, 0.1)
         far = far[(far < finite.min()) | (far > finite.max())]
         if far.size:
             where = f" and outside the first {len(finite)} responses"
@@ -131,7 +129,7 @@ def _separate(values: Floats, apart: float, share: float) -> Floats:
 
 def check_constant(
     name: str, responses: Floats, outputs: Sequence[str], is_stored: bool
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of outputs that are the same in all runs; raise if no others are made.
 
     Weights of equal stored responses make no difference. Responses of a propagation that simulates
@@ -172,12 +170,11 @@ def check_failing_region(
     points: Sequence[Floats],
     responses: Floats,
     max_lost: float,
-    apart: float = 6.0,
     remedy: str = "repair the response",
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
-    A value is in such a gap if it is ``apart`` times the local spacing away from the nearest finite
+    A value is in such a gap if it is six times the local spacing away from the nearest finite
     response of the output, and 40 % of the 4 d + 4 runs around that run fail. Specimens were
     measured there, so that the response should not fail. Raises DesignError if the share of such
     specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
@@ -209,7 +206,7 @@ def check_failing_region(
         distance = np.abs(column - outputs[nearest])
         # Outputs that failed or were not measured are not finite.
         with np.errstate(invalid="ignore"):
-            is_apart[:, j] = beside[nearest] & (distance > apart * np.median(steps, axis=1))
+            is_apart[:, j] = beside[nearest] & (distance > 6.0 * np.median(steps, axis=1))
         is_apart[:, j] &= np.isfinite(column)
     count = int(is_apart.any(axis=1).sum())
     if not count:
@@ -227,7 +224,7 @@ def check_failing_region(
     return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
-def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
+def duplicate_findings(name: str, observed: Floats) -> Findings:
     """Return a finding if each specimen without a label occurs at least twice.
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
@@ -399,7 +396,7 @@ def data_findings(
     several_roots: bool = False,
     rounded: ArrayLike = np.nan,
     options: DataCheckOptions | None = None,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings of rounded, censored and repeated data, (N,) or (N, m), by output.
 
     Values that are not finite count as not measured. With several roots inputs have the same
@@ -566,9 +563,7 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
     return int((readings @ direction > (runs @ direction).max()).sum())
 
 
-def refuse_unused_inputs(
-    name: str, z: Floats, outputs: Floats, inputs: Mapping[int, str], smallest: float = 1e-3
-) -> None:
+def refuse_unused_inputs(name: str, z: Floats, outputs: Floats, inputs: Mapping[int, str]) -> None:
     """Raise if the first runs, (n, d) -> (n, m), show a direction of the inputs without influence.
 
     ``inputs`` are names by column of z; those of conditions, which are known, are not among them.
@@ -583,8 +578,8 @@ def refuse_unused_inputs(
     surface = fit_emulator(z, outputs)
     jacobian = surface(z)[1][:, :, list(inputs)]
     spread = outputs.std(axis=0)
-    values, directions = _singular_vectors(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
-    if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
+    values, directions = _singular_vectors(jacobian / positive_scale(spread)[:, None])
+    if len(values) and np.median(values[:, -1] / values[:, 0]) < 1e-3:
         raise _undetermined(name, m, directions, list(inputs.values()))
 
 
@@ -617,7 +612,6 @@ def misfit_findings(
     readings: Readings,
     modes: Modes,
     error: Floats,
-    largest: float = 50.0,
     *,
     gross_errors: bool,
 ) -> list[Finding]:
@@ -629,7 +623,7 @@ def misfit_findings(
     # For each specimen take the mode with the smallest misfit.
     best = modes.rows(best_rows(modes.specimen, modes.misfit))
     has_root = np.isfinite(best.misfit)
-    is_poor = has_root & (best.misfit > largest)
+    is_poor = has_root & (best.misfit > 50.0)
     poor = best.specimen[is_poor]
     if not poor.size or (gross_errors and 2 * poor.size <= has_root.sum()):
         return []
@@ -649,7 +643,7 @@ def misfit_findings(
     ]
 
 
-def repeat_findings(name: str, repeats: Repeats, largest: float = 50.0) -> list[Finding]:
+def repeat_findings(name: str, repeats: Repeats) -> list[Finding]:
     """Report repeated readings that scatter more than the stated error allows.
 
     ``repeats`` are in units of that error, which costs n (r - 1 - log r) / 2 nats beside the best
@@ -659,7 +653,7 @@ def repeat_findings(name: str, repeats: Repeats, largest: float = 50.0) -> list[
     count = np.concatenate([repeats.count, repeats.count.sum(axis=0, keepdims=True)])
     within = np.concatenate([repeats.within, repeats.within.sum(axis=0, keepdims=True)])
     ratio = np.maximum(within / np.maximum(count, 1.0), 1.0)
-    is_poor = count / 2 * (ratio - 1 - np.log(ratio)) > largest
+    is_poor = count / 2 * (ratio - 1 - np.log(ratio)) > 50.0
     if not is_poor.any():
         return []
     specimens = int(is_poor[:-1].any(axis=1).sum())

@@ -15,12 +15,12 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, NamedArrays
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, variables_at
+from prbayes.model.parameters import Hyperparameters, value_shapes, variables_at
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -124,11 +124,6 @@ class Evaluator:
         return _unpickled, (cloudpickle.dumps((self.model, targets)),)
 
     @property
-    def epsilon(self) -> Floats:
-        """The simulators' epsilons, shape (k,), NaN where unset."""
-        return np.array([node.epsilon_value for node in self.nodes])
-
-    @property
     def n_responses(self) -> int:
         """Number of scalar responses that were computed; shared responses count once."""
         # Number of responses by the id of the runs, which simulators may share.
@@ -204,57 +199,11 @@ class Evaluator:
         is_finite = np.isfinite(terms.log_prior) & np.isfinite(value)
         return np.where(is_finite, value, np.inf)
 
-    def objective(self, *, prior: bool, gradient: bool) -> Any:
-        """Compile the objective as a function of theta and scales.
-
-        (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
-
-        The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
-        Raise NotImplementedError or TypeError if the objective has no gradient.
-        """
-        model = self.model
-        if not self.has_graph:
-            if prior or gradient:
-                raise NotImplementedError("on other data the objective is evaluated, not compiled")
-            return lambda theta, scales: (self.total(theta[None], scales)[0],)
-        key = ("objective", prior, gradient)
-        if key not in self.functions:
-            with interpreted():
-                graphs = [
-                    pt.as_tensor(node.bound.discrepancy(params))
-                    for node, params in zip(self.nodes, _simulator_params(self), strict=True)
-                ]
-                graphs = model.replace_rvs_by_values(graphs)
-                for k, node in enumerate(self.nodes):
-                    if node.bound.stored:
-                        graphs[k] = with_shared_arrays(graphs[k])
-                scales = pt.dvector("scales")
-                scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
-                total = scaled - _log_other(model, _ordinary(model))
-                with building("priors"):
-                    log_prior = model.logp(vars=model.free_RVs, jacobian=False)
-                value = pt.switch(
-                    log_prior > -np.inf, total - log_prior if prior else total, np.inf
-                )
-                (value,), theta = self.hyperparameters.joined([value])
-                outputs = [value, pt.grad(value, theta)] if gradient else [value]
-                self.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
-        function = self.functions[key]
-        symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
-
-        def counted(theta: Floats, scales: Floats) -> Any:
-            budget().check()
-            for bound in symbolic:
-                bound.responses.count_symbolic(bound.n_per_theta)
-            return function(theta, scales)
-
-        return counted
-
     def observing(
         self,
-        data: dict[str, Floats],
+        data: NamedArrays,
         metric: Metric | None = None,
-        weights: dict[str, Floats] | None = None,
+        weights: NamedArrays | None = None,
     ) -> Evaluator:
         """Return an evaluator of the same model with other observed responses, by simulator.
 
@@ -296,7 +245,7 @@ class Evaluator:
         values, weights = self.simulators[k].populations(self.parents(thetas, k))
         return values, responding_weights(values, weights)
 
-    def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
+    def support(self, thetas: Floats) -> dict[str, NamedArrays]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         by_name = {}
         for k, node in enumerate(self.nodes):
@@ -313,6 +262,56 @@ class Evaluator:
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
         return by_name
+
+
+def epsilons(evaluator: Evaluator) -> Floats:
+    """Return the simulators' epsilons, shape (k,), NaN where unset."""
+    return np.array([node.epsilon_value for node in evaluator.nodes])
+
+
+def compiled_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
+    """Compile the objective as a function of theta and scales.
+
+    (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
+
+    The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
+    Raise NotImplementedError or TypeError if the objective has no gradient.
+    """
+    model = evaluator.model
+    if not evaluator.has_graph:
+        if prior or gradient:
+            raise NotImplementedError("on other data the objective is evaluated, not compiled")
+        return lambda theta, scales: (evaluator.total(theta[None], scales)[0],)
+    key = ("objective", prior, gradient)
+    if key not in evaluator.functions:
+        with interpreted():
+            graphs = [
+                pt.as_tensor(node.bound.discrepancy(params))
+                for node, params in zip(evaluator.nodes, _simulator_params(evaluator), strict=True)
+            ]
+            graphs = model.replace_rvs_by_values(graphs)
+            for k, node in enumerate(evaluator.nodes):
+                if node.bound.stored:
+                    graphs[k] = with_shared_arrays(graphs[k])
+            scales = pt.dvector("scales")
+            scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
+            total = scaled - _log_other(model, _ordinary(model))
+            with building("priors"):
+                log_prior = model.logp(vars=model.free_RVs, jacobian=False)
+            value = pt.switch(log_prior > -np.inf, total - log_prior if prior else total, np.inf)
+            (value,), theta = evaluator.hyperparameters.joined([value])
+            outputs = [value, pt.grad(value, theta)] if gradient else [value]
+            evaluator.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
+    function = evaluator.functions[key]
+    symbolic = [node.bound for node in evaluator.nodes if node.bound.symbolic]
+
+    def counted(theta: Floats, scales: Floats) -> Any:
+        budget().check()
+        for bound in symbolic:
+            bound.responses.count_symbolic(bound.n_per_theta)
+        return function(theta, scales)
+
+    return counted
 
 
 def with_unchanged_runs(evaluator: Evaluator) -> Evaluator:
@@ -429,7 +428,7 @@ def only_through_prior(evaluator: Evaluator) -> Bools:
             joined.add(rv)
     indirect = {str(rv.name) for rv in joined - direct}
     names = [str(model.values_to_rvs[v].name) for v in model.value_vars]
-    sizes = [int(np.prod(s, dtype=int)) for s in evaluator.hyperparameters.shapes.values()]
+    sizes = [int(np.prod(s, dtype=int)) for s in value_shapes(evaluator.hyperparameters).values()]
     return np.repeat([name in indirect for name in names], sizes)
 
 
@@ -445,7 +444,7 @@ def specimen_graphs(evaluator: Evaluator) -> list[Any]:
     return list(evaluator.model.logp(vars=variables, sum=False))
 
 
-def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> NamedArrays:
     """Return log p(y_i | theta), (P, S), by simulator with a log-likelihood by specimen.
 
     Of simulators with common specimens the last has those of all, and the first ones have none.
@@ -568,7 +567,7 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
 
 
 def supports_each(
-    support: dict[str, Floats], required_ess: float, max_lost: float, requirement: Requirement
+    support: NamedArrays, required_ess: float, max_lost: float, requirement: Requirement
 ) -> Bools:
     """Return which populations a design supports, shape (P,); parameters as in `shortcoming`."""
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
@@ -580,7 +579,7 @@ def supports_each(
 
 
 def shortcoming(
-    support: dict[str, Floats],
+    support: NamedArrays,
     required_ess: float,
     max_lost: float,
     n_points: int,

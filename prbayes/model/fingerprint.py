@@ -26,7 +26,7 @@ from prbayes._validate import Floats, Shape
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
-from prbayes.model.parameters import fixed_points
+from prbayes.model.parameters import fixed_points, value_shapes
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import is_prepared, prepared
@@ -110,7 +110,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
     numbers: dict[str, Any] = {}
     if isinstance(problem, Evaluator):
         model, hyperparameters = problem.model, problem.hyperparameters
-        shapes = hyperparameters.shapes
+        shapes = value_shapes(hyperparameters)
         parts: list[Node | Measurement] = [*problem.nodes, *problem.measurements]
         simulators = [_simulator_identity(part, problem.likelihoods) for part in parts]
         # Four points, because Sobol points are balanced if their number is a power of two.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats, Indices, Shape
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
@@ -82,11 +83,6 @@ class Measurement:
         """Standard deviation of the error of a reading, (N, m), in units of an unknown error."""
         return np.ones_like(self.rows) if "error" in self.extras else self.readings.error
 
-    @cached_property
-    def range(self) -> Floats:
-        """Smallest and largest observed value of each output, (2, m)."""
-        return np.stack([np.nanmin(self.rows, axis=0), np.nanmax(self.rows, axis=0)])
-
     def observing(self, data: Any) -> Measurement:
         """Return the measurement with other observed values; the same object for equal ones."""
         values = np.asarray(data, dtype=np.float64)
@@ -96,6 +92,11 @@ class Measurement:
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
         aligned = "groups, conditions, weights= or specimens="
         return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
+
+
+def observed_range(measurement: Measurement) -> Floats:
+    """Return the smallest and largest observed value of each output, (2, m)."""
+    return np.stack([np.nanmin(measurement.rows, axis=0), np.nanmax(measurement.rows, axis=0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +149,8 @@ class StackedReadings:
             )
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
-            width = 2 * np.ptp(measurement.range, axis=0)
-            logs = np.log(np.where(width > 0, width, 1.0))
+            width = 2 * np.ptp(observed_range(measurement), axis=0)
+            logs = np.log(positive_scale(width))
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
             np.subtract.at(log_gross, index, logs)
         return cls(
@@ -300,16 +301,6 @@ class SpecimenLikelihood:
         """The index of each group, None without groups, and its specimens."""
         return rows_by_group(self.stacked.groups, len(self.readings))
 
-    @property
-    def by_context(self) -> list[tuple[int | None, Indices]]:
-        """The group, and the specimens, of each combination of group and covariates."""
-        contexts: list[tuple[int | None, Indices]] = []
-        for group, rows in self.by_group:
-            covariates = self.stacked.covariates[:, rows]
-            _, number = np.unique(covariates, axis=1, return_inverse=True)
-            contexts += [(group, rows[number == k]) for k in range(number.max() + 1)]
-        return contexts
-
     def parents(
         self, values: Mapping[str, Floats], group: int | None, specimens: Indices
     ) -> list[Floats]:
@@ -334,13 +325,6 @@ class SpecimenLikelihood:
                 "model; build the model again"
             )
         return Hyperparameters.of(model)
-
-    @property
-    def is_exchangeable(self) -> bool:
-        """Whether all specimens have the same population, outputs of one simulator and weight."""
-        first, *more = self.measurements
-        of_rows = (first.groups, first.weights, first.specimens, first.conditions)
-        return not more and not first.covariates and all(x is None for x in of_rows)
 
     def of_rows(self, rows: Indices) -> SpecimenLikelihood:
         """Return the likelihood of some rows of a single simulator."""
@@ -374,6 +358,23 @@ class SpecimenLikelihood:
             model=self.model if is_same_model else weakref.ref(model),
             shared_emulation=prepared.emulation if prepared else self.shared_emulation,
         )
+
+
+def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:
+    """Return whether all specimens have the same population, weight and outputs of a simulator."""
+    first, *more = likelihood.measurements
+    of_rows = (first.groups, first.weights, first.specimens, first.conditions)
+    return not more and not first.covariates and all(x is None for x in of_rows)
+
+
+def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:
+    """Return the group, and the specimens, of each combination of group and covariates."""
+    contexts: list[tuple[int | None, Indices]] = []
+    for group, rows in likelihood.by_group:
+        covariates = likelihood.stacked.covariates[:, rows]
+        _, number = np.unique(covariates, axis=1, return_inverse=True)
+        contexts += [(group, rows[number == k]) for k in range(number.max() + 1)]
+    return contexts
 
 
 def rows_by_group(groups: Indices | None, n: int) -> list[tuple[int | None, Indices]]:

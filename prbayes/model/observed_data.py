@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import Floats, Indices, Shape, called, real_array, sample_labels
+from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.random_variable import known_value
@@ -53,7 +53,7 @@ class ObservedData:
     def __len__(self) -> int:
         return _length(self.values)
 
-    def known_values(self, variables: Sequence[Any]) -> dict[str, Floats]:
+    def known_values(self, variables: Sequence[Any]) -> NamedArrays:
         """Return the values of conditions or covariates by name, (N,)."""
         return known_covariates(self.name, variables, self.n_rows, self.rows)
 

@@ -7,7 +7,7 @@ Elements of variables have names such as 'mu[1]' or 'mu[Adler]', by which tables
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -20,7 +20,16 @@ import xarray as xr
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._validate import Floats, Indices, Shape, called, real_array, refuse_single_precision
+from prbayes._validate import (
+    ArrayFunction,
+    Floats,
+    Indices,
+    NamedArrays,
+    Shape,
+    called,
+    real_array,
+    refuse_single_precision,
+)
 from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
@@ -44,8 +53,6 @@ class Hyperparameters:
 
     model: pm.Model
     point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
-    # Shapes of the value variables, in their order in theta.
-    shapes: dict[str, Shape] = field(init=False)
     initial: Floats = field(init=False)  # the initial point as theta, (d,)
     size: int = field(init=False)  # length d of theta
     # Names of the elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'.
@@ -55,7 +62,7 @@ class Hyperparameters:
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the model and the point."""
-        shapes = {str(v.name): np.shape(self.point[v.name]) for v in self.model.value_vars}
+        shapes = value_shapes(self)
         values = [np.ravel(self.point[name]) for name in shapes]
         initial = np.concatenate([np.empty(0), *values])
         names: list[str] = []
@@ -72,7 +79,6 @@ class Hyperparameters:
                 "name of another, expected different names"
             )
         vars(self).update(
-            shapes=shapes,
             initial=initial,
             size=initial.size,
             names=names,
@@ -141,17 +147,13 @@ class Hyperparameters:
         values = self._log_prior(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(sum(values), len(thetas)))
 
-    def in_support(self, thetas: Floats) -> Any:
-        """Return which thetas have a finite log prior, shape (P,)."""
-        return np.isfinite(self.log_prior(thetas))
-
     @cached_property
     @interpreted()
     def _constrain(self) -> Any:
         """The compiled function of thetas that returns variables and deterministics."""
         return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
 
-    def constrained(self, thetas: Floats) -> dict[str, Floats]:
+    def constrained(self, thetas: Floats) -> NamedArrays:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
         if not size:  # PyTensor cannot transform empty arrays
@@ -164,36 +166,6 @@ class Hyperparameters:
             variable.name: np.array(np.broadcast_to(value, (size, *np.shape(value)[1:])))
             for variable, value in zip(variables, values, strict=True)
         }
-
-    def unconstrained(self, point: Mapping[str, Any]) -> Floats:
-        """Return theta, shape (d,), of a point given in the user's own units.
-
-        Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
-        value is outside its support.
-        """
-        if not isinstance(point, Mapping):
-            raise TypeError(
-                f"start: got {called(point)}, expected a dict with a value for each free variable"
-            )
-        free = {rv.name: rv for rv in self.model.free_RVs}
-        if set(point) != set(free):
-            raise KeyError(
-                f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
-            )
-        draws = []
-        for name, rv in free.items():
-            value = real_array(point[name], f"start: {name}")
-            shape = event_shape(rv)
-            if value.shape not in ((), shape):
-                raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
-            draws.append(np.broadcast_to(value, shape)[None])
-        thetas = self.thetas_of(draws)
-        if not (np.isfinite(thetas).all() and self.in_support(thetas).all()):
-            raise ValueError(
-                f"start: got {dict(point)}, expected values inside the support of the priors"
-            )
-        theta: Floats = thetas[0]
-        return theta
 
     @cached_property
     @interpreted()
@@ -257,7 +229,49 @@ class Hyperparameters:
         return np.where(np.isfinite(thetas), thetas, self.initial)
 
 
-def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+def value_shapes(hyperparameters: Hyperparameters) -> dict[str, Shape]:
+    """Return the shapes of the value variables by name, in their order in theta."""
+    point = hyperparameters.point
+    return {str(v.name): np.shape(point[v.name]) for v in hyperparameters.model.value_vars}
+
+
+def in_support(hyperparameters: Hyperparameters, thetas: Floats) -> Any:
+    """Return which thetas have a finite log prior, shape (P,)."""
+    return np.isfinite(hyperparameters.log_prior(thetas))
+
+
+def unconstrained(hyperparameters: Hyperparameters, point: Mapping[str, Any]) -> Floats:
+    """Return theta, shape (d,), of a point given in the user's own units.
+
+    Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
+    value is outside its support.
+    """
+    if not isinstance(point, Mapping):
+        raise TypeError(
+            f"start: got {called(point)}, expected a dict with a value for each free variable"
+        )
+    free = {rv.name: rv for rv in hyperparameters.model.free_RVs}
+    if set(point) != set(free):
+        raise KeyError(
+            f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
+        )
+    draws = []
+    for name, rv in free.items():
+        value = real_array(point[name], f"start: {name}")
+        shape = event_shape(rv)
+        if value.shape not in ((), shape):
+            raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
+        draws.append(np.broadcast_to(value, shape)[None])
+    thetas = hyperparameters.thetas_of(draws)
+    if not (np.isfinite(thetas).all() and in_support(hyperparameters, thetas).all()):
+        raise ValueError(
+            f"start: got {dict(point)}, expected values inside the support of the priors"
+        )
+    theta: Floats = thetas[0]
+    return theta
+
+
+def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> NamedArrays:
     """Return the log-density of each free variable in the user's own units, shapes (P,)."""
     values = hyperparameters._log_prior(np.ascontiguousarray(thetas))[:-1]
     return {
@@ -266,7 +280,7 @@ def log_prior_terms(hyperparameters: Hyperparameters, thetas: Floats) -> dict[st
     }
 
 
-def fixed_values(model: pm.Model) -> dict[str, Floats]:
+def fixed_values(model: pm.Model) -> NamedArrays:
     """Return the values of variables that are not free, as `pymc.do` and `pymc.observe` fix them.
 
     Observed variables of simulators are left out.
@@ -278,7 +292,7 @@ def fixed_values(model: pm.Model) -> dict[str, Floats]:
     return {name: x.astype(np.float64) for name, x in numbers.items() if x.dtype.kind in "biuf"}
 
 
-def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, Floats]:
+def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> NamedArrays:
     """Return all variables of the model, with those of `fixed_values`, shapes (P, *shape)."""
     size, fixed = len(thetas), fixed_values(hyperparameters.model).items()
     return hyperparameters.constrained(thetas) | {
@@ -287,7 +301,7 @@ def variables_at(hyperparameters: Hyperparameters, thetas: Floats) -> dict[str, 
 
 
 def log_posterior(
-    hyperparameters: Hyperparameters, thetas: Floats, log_likelihood: Callable[[Floats], Floats]
+    hyperparameters: Hyperparameters, thetas: Floats, log_likelihood: ArrayFunction
 ) -> Floats:
     """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
 
@@ -309,7 +323,9 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, I
     ways.
     """
     plain = [
-        n for name, shape in hyperparameters.shapes.items() for n in element_names(name, shape)
+        n
+        for name, shape in value_shapes(hyperparameters).items()
+        for n in element_names(name, shape)
     ]
     order = np.argsort(plain)
     quantiles = hyperparameters.quantiles
@@ -395,12 +411,12 @@ def _element_names_of(name: Any, value: Any) -> list[str]:
 # Values by name.
 
 
-def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
+def split_elements(values: Mapping[Any, Any]) -> NamedArrays:
     """Return arrays (n,) by the names of elements, of arrays (n, *shape) by variable.
 
     Names have the coordinates of the arrays.
     """
-    result: dict[str, Floats] = {}
+    result: NamedArrays = {}
     for name, value in values.items():
         names = _element_names_of(name, value)
         columns = np.asarray(value).reshape(len(value), len(names))
@@ -498,7 +514,7 @@ def stacked_draws(
     return stacked
 
 
-def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
+def finite_draws(posterior: Any, names: Sequence[str]) -> NamedArrays:
     """Return the draws of free variables; raise a ValueError if one is not finite."""
     by_name = {name: draws.values for name, draws in stacked_draws(posterior, names).items()}
     for name, draws in by_name.items():

@@ -10,6 +10,7 @@ import pymc as pm
 
 from prbayes._display import Shown, View
 from prbayes._finding import counted
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.emulators.ranges import predictive_inputs
 from prbayes.emulators.runs import Runs, continued
@@ -99,7 +100,7 @@ def propose_runs(
     if is_outside.mean() > 0.01:
         pool = pool[is_outside]
     scaled, at_runs = domain.scaled(pool), domain.scaled(runs.points)
-    unit = np.where(scaled.std(axis=0) > 0, scaled.std(axis=0), 1.0)
+    unit = positive_scale(scaled.std(axis=0))
     squares = np.min([(((scaled - x) / unit) ** 2).sum(axis=1) for x in at_runs], axis=0)
     rows = farthest_rows(scaled / unit, min(n, len(pool)), squares)
     proposed = ProposedRuns(pool[rows], columns=runs.columns)
@@ -158,7 +159,7 @@ def _near_data(
     values = values.reshape(len(columns), -1)
     data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
     spread = np.nanstd(data, axis=0)
-    unit = np.where(spread > 0, spread, 1.0)
+    unit = positive_scale(spread)
     rows = []
     for reading in data:
         squares = np.nansum(((values - reading) / unit) ** 2, axis=1)

@@ -16,7 +16,7 @@ from prbayes._validate import Bools, Floats
 from prbayes.emulators.ranges import Ranges
 from prbayes.emulators.runs import Runs
 from prbayes.emulators.surrogate import Surrogate
-from prbayes.model.measurement import Measurement, SpecimenLikelihood
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, observed_range
 from prbayes.propagation.base import MAX_LOST
 from prbayes.specimens.emulation import near_readings
 from prbayes.specimens.points import SpecimenData, SpecimenPoints, likely_weights, normal_of
@@ -105,6 +105,6 @@ def _may_be_measured(surrogate: Surrogate, m: Measurement, columns: Floats) -> B
     domain = surrogate.domain
     unit = np.clip(np.nan_to_num(domain.scaled(columns), nan=0.5), 0, 1)
     values = surrogate._surface(domain.at(unit)).reshape(len(unit), -1)
-    low, high = m.range
+    low, high = observed_range(m)
     margin = (high - low) / 10
     return np.asarray(((values >= low - margin) & (values <= high + margin)).all(axis=1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -19,6 +19,8 @@ from prbayes._finding import Finding, counted, report
 from prbayes._validate import (
     NO_POPULATION,
     Floats,
+    Function,
+    Labels,
     called,
     flag,
     observed_sample,
@@ -88,7 +90,7 @@ _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", 
 
 def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     name: str,
-    response: Callable[..., Any],
+    response: Function,
     *inputs: Any,
     metric: Metric | None = None,
     observed: Any,
@@ -97,7 +99,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Labels | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed variable that compares simulated and measured responses to the model.
@@ -244,7 +246,7 @@ class _Arguments:
 
     name: str
     model: pm.Model
-    response: Callable[..., Any]
+    response: Function
     inputs: Inputs
     data: ObservedData
     propagation: Propagation
@@ -300,9 +302,7 @@ def _read_summary(
     return SummaryLikelihood(summary), summary.values
 
 
-def _read_inputs(
-    name: str, response: Callable[..., Any], inputs: Sequence[Any], model: pm.Model
-) -> Inputs:
+def _read_inputs(name: str, response: Function, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     """Return the inputs of a response; raise if the arguments are invalid."""
     refuse_uncallable(name, response)
     variables = read_inputs(name, inputs, model)
@@ -323,9 +323,9 @@ def _read_inputs(
 
 def _with_units(
     name: str,
-    units: Mapping[str, str] | None,
+    units: Labels | None,
     inputs: Inputs,
-    response: Callable[..., Any],
+    response: Function,
     outputs: Outputs,
 ) -> Outputs:
     """Store the units of the inputs with them, and return the outputs with their units."""

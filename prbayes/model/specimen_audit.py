@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from prbayes._finding import Finding, any_of, report
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import variables_at
@@ -54,11 +54,11 @@ def audited_evaluator(
 
 
 def _audited_likelihood(
-    likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool, least_share: float = 0.005
+    likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool
 ) -> SpecimenLikelihood:
     """Return a likelihood with runs where its emulator is wrong, the same if it is right.
 
-    A smaller share of the inputs than ``least_share`` may have an uncertain emulator.
+    A share of .5 % of the inputs may have an uncertain emulator.
     """
     preparation, readings = prepared(likelihood), likelihood.readings
     emulation = preparation.emulation
@@ -80,18 +80,11 @@ def _audited_likelihood(
     ratio = uncertainty(z)
     possible, ratio = z[ratio > 1.0], ratio[ratio > 1.0]
     share = len(possible) / len(z)
-    if share < least_share:
+    if share < 0.005:
         return likelihood
-    # Half of the runs are in the least certain part, and half are the farthest from all others.
-    scale = np.maximum(np.ptp(possible, axis=0), 1e-12)
-    worst = possible[np.argsort(-ratio)[: max(runs, len(ratio) // 20)]]
-    worst = np.random.default_rng(0).permutation(worst)[: runs // 2]
-    distant = farthest(np.concatenate([emulation.z, worst]), possible, runs // 2, scale)
-    fresh = np.unique(np.concatenate([worst, distant]), axis=0)
+    fresh, counts = audit_points(emulation, possible, ratio, runs)
+    weights = share * counts / len(possible)
     outputs = CheckedRuns(likelihood, [emulation.y])(fresh)
-    # Each run represents the inputs that are nearest to it.
-    nearest = cdist(possible / scale, fresh / scale).argmin(axis=1)
-    weights = share * np.bincount(nearest, minlength=len(fresh)) / len(possible)
     misfit = np.abs(outputs - emulation.values(fresh))
     relative = np.array([readings.relative_error(error).max() for error in misfit])
     # A wrong input shifts a mean by its distance from the other inputs at most.
@@ -113,13 +106,30 @@ def _audited_likelihood(
             "posterior standard deviations at inputs that posterior draws make likely, expected "
             f"at most {likelihood.options.bias}; {advice}"
         )
-    z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, outputs])
-    surface, *_ = fit_surface(z, y, readings, likelihood.name, emulation.surface)
-    extended = Emulation(z, y, surface, emulation.error, np.inf)
+    grown = emulation.with_runs(fresh, outputs)
+    surface, *_ = fit_surface(grown.z, grown.y, readings, likelihood.name, emulation.surface)
+    extended = replace(grown, surface=surface, bias=np.inf)
     result = replace(likelihood, shared_emulation=extended)
     # The first record identifies the problem, because every use of the model has it at first.
     result.cache["first"] = likelihood.cache.get("first", likelihood)
     return result
+
+
+def audit_points(
+    emulation: Emulation, candidates: Floats, uncertainty: Floats, count: int
+) -> tuple[Floats, Indices]:
+    """Return points of an audit, (m, d), and numbers of candidates that are nearest to each, (m,).
+
+    Half of them are in the least certain part of the candidates, and half are the farthest from all
+    others. Each point represents the candidates that are nearest to it.
+    """
+    scale = np.maximum(np.ptp(candidates, axis=0), 1e-12)
+    worst = candidates[np.argsort(-uncertainty)[: max(count, len(uncertainty) // 20)]]
+    worst = np.random.default_rng(0).permutation(worst)[: count // 2]
+    distant = farthest(np.concatenate([emulation.z, worst]), candidates, count // 2, scale)
+    points = np.unique(np.concatenate([worst, distant]), axis=0)
+    nearest = cdist(candidates / scale, points / scale).argmin(axis=1)
+    return points, np.bincount(nearest, minlength=len(points))
 
 
 def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:

@@ -23,14 +23,16 @@ from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._stats import log_sum_exp
+from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import Floats, Indices, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
     SpecimenLikelihood,
+    observed_range,
     output_columns,
+    rows_by_context,
     rows_by_group,
     specimen_numbers,
 )
@@ -258,7 +260,10 @@ def _log_share(
     likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
 ) -> Any:
     """Return the graph of the log share of each population with a response, by specimen, (S,)."""
-    coordinates, contexts = likelihood.coordinates, [rows for _, rows in likelihood.by_context]
+    coordinates, contexts = (
+        likelihood.coordinates,
+        [rows for _, rows in rows_by_context(likelihood)],
+    )
     size = len(contexts)
     context = np.empty(len(likelihood.readings), dtype=np.intp)
     for k, rows in enumerate(contexts):
@@ -425,11 +430,11 @@ def _with_reading_errors(
     sd = sd * np.where(is_relative, np.abs(outputs), 1.0)
     result = outputs + sd * rng.standard_normal(outputs.shape)
     step = np.resize(readings.step, (n, count))
-    unit = np.where(step > 0, step, 1.0)
+    unit = positive_scale(step)
     result = np.where(step > 0, np.round(result / unit) * unit, result)
     share = _gross_share(measurements[0], values)
     if share is not False:
-        low, high = np.concatenate([m.range for m in measurements], axis=1)
+        low, high = np.concatenate([observed_range(m) for m in measurements], axis=1)
         middle, width = (low + high) / 2, high - low
         uniform = rng.random((size, n, middle.size))
         gross_errors = middle + width * (2 * uniform - 1)

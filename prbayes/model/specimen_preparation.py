@@ -6,18 +6,17 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, Findings, report
 from prbayes._stats import log_sum_exp
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices
+from prbayes._validate import AT_ONCE, IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
 from prbayes.model.data_checks import (
     check_failing_region,
@@ -33,7 +32,9 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    is_exchangeable,
     output_columns,
+    rows_by_context,
     specimen_labels,
 )
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
@@ -78,7 +79,7 @@ class Preparation:
     proposals: Proposals  # proposals from which the points were drawn
     # (S, p): posterior draws at which the estimates from both halves of the points agree.
     thetas: Floats
-    findings: tuple[Finding, ...]  # findings about the data and the runs, before the fit
+    findings: Findings  # findings about the data and the runs, before the fit
     # Share of a population with a response; None if it hardly changes the log-likelihood.
     share: ResponseShare | None = None
 
@@ -204,7 +205,7 @@ class CheckedRuns:
 
     likelihood: SpecimenLikelihood
     outputs: list[Floats] = field(default_factory=list)  # outputs of each batch of runs, (n, M)
-    findings: tuple[Finding, ...] = ()  # findings about the first runs
+    findings: Findings = ()  # findings about the first runs
 
     def __call__(self, z: Floats) -> Floats:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
@@ -243,7 +244,7 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
     return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
 
-def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[float, ...]:
+def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
     """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
@@ -254,7 +255,7 @@ def _error_scales(likelihood: SpecimenLikelihood, ratio: float = 3.0) -> tuple[f
     if not ends:
         return (1.0,)
     lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
-    count = 1 + int(np.ceil((highest - lowest) / np.log(ratio)))
+    count = 1 + int(np.ceil((highest - lowest) / np.log(3.0)))
     return tuple(np.exp(np.linspace(lowest, highest, count)).tolist())
 
 
@@ -324,7 +325,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
 def _part(likelihood: SpecimenLikelihood, size: int = 512) -> SpecimenData | None:
     """Return evenly spaced specimens by their first reading; None if there are not many more."""
     n = len(likelihood.readings)
-    if n <= 2 * size or not likelihood.is_exchangeable:
+    if n <= 2 * size or not is_exchangeable(likelihood):
         return None
     order = np.argsort(likelihood.readings.values[:, 0], kind="stable")
     rows = order[np.linspace(0, n - 1, size).astype(np.intp)]
@@ -357,38 +358,23 @@ def _end_findings(
     ended = [k for k in data.free if np.isfinite(distance[:, k]).all()]
     if not ended:
         return []
-    steps = [np.where(np.arange(z.shape[1]) == k, 0.5 * distance, 0.0) for k in ended]
-
-    def secants(values: Callable[[Floats], Floats], rows: Indices) -> Floats:
-        """Return changes of the values over half a distance to both sides, (k, m, ended)."""
-        changes = [values((z + step)[rows]) - values((z - step)[rows]) for step in steps]
-        return np.asarray(np.stack(changes, axis=-1) / distance[rows][:, None, ended])
-
     # Secants, because the slopes of a surface say nothing of changes that are smaller than its
     # error.
     _, jacobian = emulation(z)
-    jacobian[:, :, ended] = secants(emulation.values, np.arange(len(z)))
+    jacobian[:, :, ended] = secants(emulation.values, z, distance, ended)
     at_end = shares_of_distance(data, emulation.error, z, jacobian, scale).max(axis=1) >= 0.9
     error = np.tile(emulation.error, (len(z), 1))
-    low, middle = np.quantile(z, [0.25, 0.5], axis=0)
-    depth = np.where(is_log, (middle - z) / np.maximum(middle - low, 1e-300), 0.0).max(axis=1)
-    rows = np.argsort(-depth)[:2]
-    rows = rows[depth[rows] > 6]
+    rows = low_outliers(z, is_log)
     if rows.size and not (likelihood.has_table or likelihood.calls_response):
         by_readings = 3 * data.readings.comparison_sd(0 * emulation.error)[rows]
         misfit = np.abs(runs(z[rows]) - data.readings.values[rows])
         error[rows] = np.fmax(error[rows], misfit - by_readings)
-        jacobian[rows[:, None], :, ended] = np.moveaxis(secants(runs, rows), -1, 1)
+        slopes = secants(runs, z[rows], distance[rows], ended)
+        jacobian[rows[:, None], :, ended] = np.moveaxis(slopes, -1, 1)
     shares = shares_of_distance(data, error, z, jacobian, scale).max(axis=1)
     if shares.max() <= 0.03:
         return []
-    density = partial(SpecimenPopulations(likelihood).log_likelihoods, draws.thetas)
-    tilts = np.zeros(len(z))
-    for step in steps:
-        low, high = (density(at[:, None], np.zeros((len(z), 1))) for at in (z - step, z + step))
-        is_finite = np.isfinite(low) & np.isfinite(high)
-        change = np.subtract(high, low, where=is_finite, out=np.zeros(low.shape))
-        tilts = np.maximum(tilts, shares * change.std(axis=0))
+    tilts = shares * log_density_changes(likelihood, draws.thetas, two_sides(z, distance, ended))
     worst = int(tilts.argmax())
     if not np.sqrt((tilts**2).sum()) > 0.1:
         return []
@@ -404,9 +390,49 @@ def _end_findings(
     return [Finding("emulator-error", text, "likelihood.md#emulator-error")]
 
 
+def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Floats, Floats]]:
+    """Return points half a distance, (n, d), below and above z in each of the columns."""
+    steps = [np.where(np.arange(z.shape[1]) == k, 0.5 * distance, 0.0) for k in columns]
+    return [(z - step, z + step) for step in steps]
+
+
+def secants(values: ArrayFunction, z: Floats, distance: Floats, columns: list[int]) -> Floats:
+    """Return slopes of values (n, m) over half a distance to both sides, (n, m, columns)."""
+    changes = [values(high) - values(low) for low, high in two_sides(z, distance, columns)]
+    return np.asarray(np.stack(changes, axis=-1) / distance[:, None, columns])
+
+
+def low_outliers(z: Floats, is_log: Bools) -> Indices:
+    """Return at most two rows of z, (n, d), that are far below the others in a logarithmic column.
+
+    They are more than six times as far below the median as the lower quartile.
+    """
+    low, middle = np.quantile(z, [0.25, 0.5], axis=0)
+    depth = np.where(is_log, (middle - z) / np.maximum(middle - low, 1e-300), 0.0).max(axis=1)
+    rows = np.argsort(-depth)[:2]
+    return rows[depth[rows] > 6]
+
+
+def log_density_changes(
+    likelihood: SpecimenLikelihood, thetas: Floats, sides: Sequence[tuple[Floats, Floats]]
+) -> Floats:
+    """Return the largest standard deviation over thetas of changes of log-densities, (n,).
+
+    The changes are those of the populations' log-densities between two points of each specimen.
+    """
+    density = partial(SpecimenPopulations(likelihood).log_likelihoods, thetas)
+    deviations = []
+    for points in sides:
+        low, high = (density(z[:, None], np.zeros((len(z), 1))) for z in points)
+        is_finite = np.isfinite(low) & np.isfinite(high)
+        change = np.subtract(high, low, where=is_finite, out=np.zeros(low.shape))
+        deviations.append(change.std(axis=0))
+    return np.max(deviations, axis=0)
+
+
 def _data_findings(
     likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings about outliers, and about rounded, censored and repeated exact readings.
 
     Outputs, (n, M), that are the same in all runs have no findings.
@@ -448,7 +474,7 @@ def log_shares(
 ) -> Floats:
     """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
     result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
-    for group, rows in likelihood.by_context:
+    for group, rows in rows_by_context(likelihood):
         parents = likelihood.parents(values, group, rows[:1])
         log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
         result[:, rows] = log_share[:, None]
@@ -481,7 +507,7 @@ class SpecimenPopulations:
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = variables_at(self.hyperparameters, thetas)
         free = ~likelihood.coordinates.is_condition
-        contexts = likelihood.by_group if smoothing is None else likelihood.by_context
+        contexts = likelihood.by_group if smoothing is None else rows_by_context(likelihood)
         for group, rows in contexts:
             parents = likelihood.parents(values, group, rows)
             if smoothing is None:
@@ -503,7 +529,7 @@ class SpecimenPopulations:
         """Return coordinates of specimens of the prior predictive population, (n, d)."""
         return PopulationDraws(self, self.hyperparameters.prior_thetas(2048, 0)).specimens(1)
 
-    def order(self) -> NDArray[np.intp]:
+    def order(self) -> Indices:
         """Return the coordinates without conditions: those of the least known spread first."""
         likelihood, coordinates = self.likelihood, self.likelihood.coordinates
         values = variables_at(self.hyperparameters, self.hyperparameters.prior_thetas(256, 0))

@@ -8,14 +8,14 @@ cross-validated error at the runs nearest to the roots of the specimens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats
+from prbayes._validate import Bools, Floats, Function
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -36,7 +36,7 @@ class OfTables:
     responses: tuple[Responses, ...]
 
     @classmethod
-    def of(cls, likelihood: SpecimenLikelihood, function: Callable[..., Any]) -> OfTables:
+    def of(cls, likelihood: SpecimenLikelihood, function: Function) -> OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:

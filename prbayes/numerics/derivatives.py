@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import ArrayFunction, Floats
 
 
 def cross(theta: Floats, step: Floats) -> Floats:
@@ -29,7 +29,7 @@ def slopes(values: Floats, step: Floats) -> Floats:
 
 
 def differences(
-    values: Callable[[Floats], Floats], step: Floats
+    values: ArrayFunction, step: Floats
 ) -> Callable[[Floats], tuple[float, Floats, int]]:
     """Return a function of theta that returns value, gradient by differences, and evaluations."""
 
@@ -62,13 +62,13 @@ def hessian_of(values: Floats, r: int) -> Floats:
     return hessian
 
 
-def second_differences(value: Callable[[Floats], Floats], r: int) -> Floats:
+def second_differences(value: ArrayFunction, r: int) -> Floats:
     """Return the Hessian at zero, (r, r), of ``value(x)``, (1, s, r) -> (s,)."""
     return hessian_of(value(stencil(r)[None]), r)
 
 
 def central_derivatives(
-    function: Callable[[Floats], Floats], thetas: Floats, steps: Floats
+    function: ArrayFunction, thetas: Floats, steps: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return values, gradients and Hessians at M points by central differences, in one call."""
     count, d = thetas.shape

@@ -102,6 +102,10 @@ class StudentMixture:
         tail = (nu + d) / 2 * np.log1p(self.squares(points) / nu)
         return np.asarray((np.log(self.shares) + constant - log_det)[:, None] - tail).T
 
+    def log_density(self, points: Floats) -> Floats:
+        """Return the log-density, (S,)."""
+        return np.asarray(logsumexp(self.log_densities(points), axis=1))
+
     def squares(self, points: Floats) -> Floats:
         """Return squared standardised distances from the centers, (M, S)."""
         deviations = points - self.centers[:, None]

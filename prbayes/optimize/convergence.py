@@ -20,8 +20,8 @@ from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import overlap
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import THETAS
+from prbayes.model.evaluator import Evaluator, compiled_objective
+from prbayes.model.parameters import THETAS, in_support
 from prbayes.numerics.derivatives import cross, differences
 from prbayes.optimize.objective import Minimisation, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
@@ -154,12 +154,12 @@ class Search:
         if gradient:
             # The response, or an inverse distribution function, may have no gradient.
             with suppress(NotImplementedError, NullTypeGradError):
-                exact = self.evaluator.objective(prior=self.settings.prior, gradient=True)
+                exact = compiled_objective(self.evaluator, prior=self.settings.prior, gradient=True)
 
         def values(thetas: Floats) -> Floats:
             if not self.settings.prior:
                 return self.evaluator.total(thetas, scales)  # which needs no compilation
-            single = self.evaluator.objective(prior=True, gradient=False)
+            single = compiled_objective(self.evaluator, prior=True, gradient=False)
             return np.array([float(single(theta, scales)[0]) for theta in thetas])
 
         def function(theta: Floats) -> tuple[float, Floats | None, int]:
@@ -464,8 +464,8 @@ class AreaGuide:
             area.of(*population) / area.scale
             for area, population in zip(self.areas, populations, strict=True)
         ]
-        in_support = self.evaluator.hyperparameters.in_support(thetas)
-        total = np.where(in_support, np.sum(areas, axis=0), np.inf)
+        is_possible = in_support(self.evaluator.hyperparameters, thetas)
+        total = np.where(is_possible, np.sum(areas, axis=0), np.inf)
         objective = np.zeros(len(thetas))
         for node, scale, population in zip(
             self.evaluator.nodes, self.scales, populations, strict=True

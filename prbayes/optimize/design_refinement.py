@@ -23,7 +23,7 @@ from prbayes.model.evaluator import (
     n_design_runs,
     shortcomings,
 )
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, in_support
 from prbayes.model.remedies import accepts
 from prbayes.optimize.convergence import (
     OVERLAP,
@@ -132,11 +132,11 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
         np.fill_diagonal(relative, np.where(np.diag(is_finite), np.diag(relative), 1.0))
         variances, axes = np.linalg.eigh(relative)
     else:
-        return np.asarray(fit.pilot[hyperparameters.in_support(fit.pilot)])
+        return np.asarray(fit.pilot[in_support(hyperparameters, fit.pilot)])
     sd = np.sqrt(np.clip(variances, 0, 1))
     z = np.random.default_rng(seed).standard_normal((THETAS, sd.size))
     thetas = fit.theta + ((z * sd) @ oriented(axes).T) * prior_sd
-    return np.asarray(thetas[hyperparameters.in_support(thetas)])
+    return np.asarray(thetas[in_support(hyperparameters, thetas)])
 
 
 def _cover(search: Search, fit: Fit, nearby: Floats) -> Restart:

@@ -18,7 +18,8 @@ import numpy as np
 import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
-from prbayes._validate import Bools, Floats
+from prbayes._stats import positive_scale
+from prbayes._validate import Bools, Floats, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -30,13 +31,14 @@ from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.model.evaluator import (
     Evaluator,
+    compiled_objective,
     only_through_prior,
     specimen_graphs,
     specimen_log_likelihoods,
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import Hyperparameters, variables_at
+from prbayes.model.parameters import Hyperparameters, unconstrained, variables_at
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import (
@@ -91,16 +93,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
             optima.append(_descend(objective, start, settings))
             if objective.count > settings.max_evaluations:
                 break
-        preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
-        # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
-        errors = [
-            max(preparation.points.difference, likelihood.options.half_difference)
-            for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
-        ]
-        is_supported = _supported(evaluator, optima)
-        if is_supported.any():
-            optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
-        modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+        modes, is_supported = supported_modes(evaluator, objective, optima)
         thetas = np.stack([mode.theta for mode in modes])
         # An emulator that stays wrong at another optimum than the best is no reason to refuse.
         is_last = round_ == MAX_ROUNDS
@@ -117,9 +110,10 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     else:
         log_prior = hyperparameters.log_prior(thetas)
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
+    preparations = map(prepared, evaluator.likelihoods)
     findings = [*spent, *(finding for p in preparations for finding in p.findings)]
-    n_known = len(modes) if is_supported.any() else 1  # the other modes are spurious
-    if not is_supported.any():
+    n_known = len(modes) if is_supported else 1  # the other modes are spurious
+    if not is_supported:
         findings += report(_UNSUPPORTED)
     findings += report(*_findings(evaluator, objective, modes[:n_known], weights[:n_known]))
     local_optima = tuple(
@@ -130,7 +124,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
     # The covariance is NaN at the edge of a support.
     is_jump = np.isnan(best.covariance).any()
-    is_converged = best.converged and not is_jump and bool(is_supported.any())
+    is_converged = best.converged and not is_jump and is_supported
     return Optimum(
         point=point,
         stderr=stderr,
@@ -182,6 +176,25 @@ def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
     return np.sqrt(variance) <= largest
 
 
+def supported_modes(
+    evaluator: Evaluator, objective: _Objective, optima: Sequence[Mode]
+) -> tuple[list[Mode], bool]:
+    """Return the distinct optima, best first, without spurious ones, and whether any is supported.
+
+    If all optima are spurious, none is left out.
+    """
+    # Monte Carlo errors of the points make ripples on a ridge, which are no barriers.
+    errors = [
+        max(prepared(likelihood).points.difference, likelihood.options.half_difference)
+        for likelihood in evaluator.likelihoods
+    ]
+    is_supported = _supported(evaluator, optima)
+    if is_supported.any():
+        optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
+    modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
+    return modes, bool(is_supported.any())
+
+
 def mode_weights(
     modes: list[Mode], log_prior: Floats | None = None, prior_sd: Floats | None = None
 ) -> Floats:
@@ -213,7 +226,7 @@ class _Objective:
     """Minus the log-likelihood or log-posterior, with a trace of its evaluations."""
 
     def __init__(self, evaluator: Evaluator, prior: bool) -> None:
-        self.function = evaluator.objective(prior=prior, gradient=True)
+        self.function = compiled_objective(evaluator, prior=prior, gradient=True)
         self.unit = evaluator.hyperparameters.prior_sd
         self.thetas: list[Floats] = []
         self.values: list[float] = []
@@ -233,7 +246,7 @@ class _Objective:
         self.values.append(value)
         return value, np.where(np.isfinite(gradient), gradient, 0.0)
 
-    def trace(self, steps: slice) -> dict[str, Floats]:
+    def trace(self, steps: slice) -> NamedArrays:
         """Return the points of one descent."""
         return {
             "theta": np.array(self.thetas[steps]),
@@ -246,7 +259,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     """Return the user's start, or likely points of the prior, and the number screened."""
     hyperparameters = evaluator.hyperparameters
     if settings.start is not None:
-        return [hyperparameters.unconstrained(settings.start)], 0
+        return [unconstrained(hyperparameters, settings.start)], 0
     n_screened = 1024
     thetas = hyperparameters.prior_points(n_screened, settings.random_seed)
     values = evaluator.total(thetas, np.empty(0))
@@ -388,14 +401,14 @@ def _values_beside(objective: _Objective, theta: Floats, shift: Floats) -> Float
     return np.array([objective(theta + shift)[0], objective(theta - shift)[0]])
 
 
-def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:
+def _distinct(optima: Sequence[Mode], objective: _Objective, error: float) -> list[Mode]:
     """Return the modes within 30 nats of the best optimum, best first.
 
     Optima closer than a hundredth of the prior's width are the same.
     """
     ordered = sorted((o for o in optima if np.isfinite(o.value)), key=lambda o: o.value)
     if not ordered:
-        return optima[:1]
+        return list(optima[:1])
     modes = ordered[:1]
     for optimum in ordered[1:]:
         if optimum.value > ordered[0].value + 30 or not optimum.converged:
@@ -763,7 +776,7 @@ class SpecimenRefits:
             factors /= count
             stated = likelihood.measurements[0].weights
             if stated is not None:  # the likelihood contains stated weights, and so do the factors
-                factors = factors / np.where(stated > 0, stated, 1.0)
+                factors = factors / positive_scale(stated)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, Findings, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
+    Function,
     Seed,
     flag,
     positive_integer,
@@ -58,6 +59,7 @@ from prbayes.inference.resampling import SETS
 from prbayes.model.cost import explained, kept
 from prbayes.model.evaluator import (
     Evaluator,
+    epsilons,
     n_design_runs,
     only_through_prior,
     shortcomings,
@@ -65,7 +67,7 @@ from prbayes.model.evaluator import (
     with_unchanged_runs,
 )
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS, Hyperparameters
+from prbayes.model.parameters import THETAS, Hyperparameters, unconstrained
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Result, Search, Trace, approach, minimise, settle
@@ -239,7 +241,7 @@ def minimize(
     model: pm.Model | None = None,
     *,
     start: dict[str, Any] | None = None,
-    method: str | Callable[..., Any] | None = None,
+    method: str | Function | None = None,
     options: Mapping[str, Any] | None = None,
     prior: bool = False,
     tolerance: float = 1e-6,
@@ -379,7 +381,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         scales = initial_scales(evaluator, prior=settings.prior)
         theta = hyperparameters.initial
         if settings.start is not None:
-            theta = hyperparameters.unconstrained(settings.start)
+            theta = unconstrained(hyperparameters, settings.start)
         elif not evaluator.responses_per_theta:
             points = hyperparameters.prior_points(THETAS, settings.random_seed)
             candidates = np.concatenate([theta[None], points])
@@ -465,10 +467,10 @@ def _fit(
     evaluator = search.evaluator
     fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
     problem.fits.append(fit)
-    is_unset = np.isnan(evaluator.epsilon)
+    is_unset = np.isnan(epsilons(evaluator))
     if is_unset.size > 1 and is_unset.any():
         noise = noise_floors(evaluator, fit.theta, SETS)
-        scales = np.where(is_unset, noise, evaluator.epsilon)
+        scales = np.where(is_unset, noise, epsilons(evaluator))
         fit = replace(minimise(search, fit.theta, scales, fit.trace), pilot=pilot)
         problem.fits.append(fit)
     return replace(fit, sampling=sampling_distribution(evaluator, fit.theta, fit.scales))
@@ -644,7 +646,7 @@ def optimum_findings(
     sampling: SamplingDistribution | None,
     optima: Sequence[LocalOptimum],
     design_error: float,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Report few specimens, the design's error, other optima, and identification."""
     findings: list[Finding] = []
     for node in evaluator.nodes:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator, has_other_terms
+from prbayes.model.evaluator import Evaluator, epsilons, has_other_terms
 
 # function of theta, (d,), that returns value, gradient (d,) or None, and number of evaluations
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
@@ -127,7 +127,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
         finite = values[np.isfinite(values)]
         if finite.size and np.ptp(finite) > 0:
             terms = "other likelihood terms or potentials"
-    epsilon = evaluator.epsilon
+    epsilon = epsilons(evaluator)
     if not terms and epsilon.size == 1:
         return np.ones(1)
     unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]

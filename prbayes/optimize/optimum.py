@@ -11,8 +11,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view, without_constructor
-from prbayes._finding import Finding, as_json
-from prbayes._validate import Floats
+from prbayes._finding import Findings, as_json
+from prbayes._validate import Floats, NamedArrays
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
 from prbayes.inference.checks.population import failing_share
@@ -114,7 +114,7 @@ class SearchRecord:
     n_screened: int = 0
     n_computed: int = 0
     seconds: float = 0.0
-    trace: dict[str, Floats] = field(default_factory=dict)
+    trace: NamedArrays = field(default_factory=dict)
     stopped: str = ""
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
@@ -198,9 +198,44 @@ def _html(optimum: Optimum) -> str:
     )
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class PointEstimate:
+    """An estimate of the hyperparameters of a model, with standard errors."""
+
+    point: dict[str, Any]
+    stderr: dict[str, Any]
+    theta: Floats
+    covariance: Floats
+    evaluator: Evaluator
+
+    @property
+    def model(self) -> pm.Model:
+        """The model."""
+        return self.evaluator.model
+
+    @property
+    def initvals(self) -> dict[str, Any]:
+        """The free variables at the optimum.
+
+        For ``pm.sample(initvals=optimum.initvals, init="adapt_diag")``, which starts every chain
+        there: PyMC's default jitter can move a chain into another mode.
+        """
+        return {str(rv.name): self.point[str(rv.name)] for rv in self.model.free_RVs}
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each number: its estimate and standard error."""
+        import pandas as pd
+
+        point = labelled(self.evaluator, self.point, {}).data_vars
+        stderr = labelled(self.evaluator, self.stderr, {}).data_vars
+        columns = ["hyperparameter", "estimate", "standard error"]
+        rows = _elements(point, stderr)
+        return pd.DataFrame(rows, columns=columns).set_index("hyperparameter")
+
+
 @without_constructor
 @dataclass(frozen=True, eq=False, repr=False)
-class Optimum:
+class Optimum(PointEstimate):
     """The result of `minimize`; numerical failure is a value in it, not an exception.
 
     Attributes
@@ -249,11 +284,6 @@ class Optimum:
     (True, ['mu'], ['mu'])
     """
 
-    point: dict[str, Any]
-    stderr: dict[str, Any]
-    theta: Floats
-    covariance: Floats
-    evaluator: Evaluator
     discrepancy: float
     discrepancies: dict[str, float]
     scales: dict[str, float]
@@ -261,7 +291,7 @@ class Optimum:
     search: SearchRecord
     design_error: float = np.nan
     local_optima: tuple[dict[str, Any], ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
 
     __repr__ = _text
     _repr_html_ = _html
@@ -275,20 +305,6 @@ class Optimum:
     def message(self) -> str:
         """How the minimisation ended."""
         return f"{self.search.result.value} {self.search.details}".strip()
-
-    @property
-    def model(self) -> pm.Model:
-        """The model."""
-        return self.evaluator.model
-
-    @property
-    def initvals(self) -> dict[str, Any]:
-        """The free variables at the optimum.
-
-        For ``pm.sample(initvals=optimum.initvals, init="adapt_diag")``, which starts every chain
-        there: PyMC's default jitter can move a chain into another mode.
-        """
-        return {str(rv.name): self.point[str(rv.name)] for rv in self.model.free_RVs}
 
     @property
     def failures(self) -> xr.Dataset:
@@ -319,16 +335,6 @@ class Optimum:
         require_minimiser(self, "sampling")
         scales = np.array(list(self.scales.values()))
         return SamplingDistribution.of(self.evaluator, self.theta, scales)
-
-    def to_dataframe(self) -> Any:
-        """Return a row for each number: its estimate and standard error."""
-        import pandas as pd
-
-        point = labelled(self.evaluator, self.point, {}).data_vars
-        stderr = labelled(self.evaluator, self.stderr, {}).data_vars
-        columns = ["hyperparameter", "estimate", "standard error"]
-        rows = _elements(point, stderr)
-        return pd.DataFrame(rows, columns=columns).set_index("hyperparameter")
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.

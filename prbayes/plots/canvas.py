@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from prbayes._validate import Floats, called, positive_integer, texts
+from prbayes._validate import Floats, Labels, called, positive_integer, texts
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
@@ -202,7 +202,7 @@ def counted_title(n: int, noun: str, **counts: Any) -> str:
     return f"{n} {noun}" + "".join(f", {m} {name}" for name, m in counts.items() if m)
 
 
-def named(name: str, labels: Mapping[str, str] | None) -> str:
+def named(name: str, labels: Labels | None) -> str:
     """Return an element's label, or its variable's with the index, or else its name."""
     labels = labels or {}
     if name in labels:
@@ -211,14 +211,14 @@ def named(name: str, labels: Mapping[str, str] | None) -> str:
     return labels.get(variable, variable) + name.removeprefix(variable)
 
 
-def with_label(name: str, unit: str, labels: Mapping[str, str] | None) -> str:
+def with_label(name: str, unit: str, labels: Labels | None) -> str:
     """Return the label that the user gave, or else the name with its unit."""
     label = named(name, labels)
     return with_unit(label, unit) if label == name else label
 
 
 def refuse_labels(
-    labels: Mapping[str, str] | None, shown: Iterable[str], *, evaluator: Evaluator | None = None
+    labels: Labels | None, shown: Iterable[str], *, evaluator: Evaluator | None = None
 ) -> None:
     """Raise if a label has an unknown name; without an evaluator only if no label is shown."""
     if not labels:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes._display import percentage
-from prbayes._validate import flag, wrong_type
+from prbayes._validate import Labels, flag, wrong_type
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -36,7 +35,7 @@ def plot_comparison(
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the estimate and interval of each result, a row per result, a panel per hyperparameter.

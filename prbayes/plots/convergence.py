@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import wrong_type
+from prbayes._validate import Labels, wrong_type
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
@@ -42,7 +41,7 @@ def plot_optimizer(
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the objective and the hyperparameters of an optimiser's evaluations.
@@ -136,7 +135,7 @@ def plot_stages(
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from prbayes._stats import cumulated, quantile
+from prbayes._stats import cumulated, positive_scale, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE, silverman
 
@@ -152,7 +152,7 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     center = w @ central
     deviations = central - center
     spread = np.sqrt(w @ deviations**2)
-    unit = np.where(spread > 0, spread, 1.0)
+    unit = positive_scale(spread)
     scaled = deviations / unit
     variances, vectors = np.linalg.eigh(scaled.T @ (w[:, None] * scaled))
     # Points on a line have no second axis. A short one gives them a region that is thinner than

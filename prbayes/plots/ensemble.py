@@ -15,6 +15,7 @@ from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Bools, Floats, positive_integer, wrong_type
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
+from prbayes.model.parameters import in_support, unconstrained
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import BLUE, fill
 from prbayes.plots.curves import pointwise_band
@@ -83,8 +84,10 @@ def read_result(
             draws = np.random.default_rng(0).multivariate_normal(
                 thetas[0], result.covariance, size=n_draws, method="eigh"
             )
-            in_support = evaluator.hyperparameters.in_support
-            ok = in_support(draws) if free else supported(evaluator, draws)
+            if free:
+                ok = in_support(evaluator.hyperparameters, draws)
+            else:
+                ok = supported(evaluator, draws)
             around = draws[ok] if ok.mean() > 0.5 else around
         return Ensemble(evaluator, thetas, around, "optimum", "standard error")
     if not free:
@@ -104,7 +107,7 @@ def supported(evaluator: Evaluator, thetas: Floats) -> Bools:
     out = np.zeros(len(thetas), dtype=bool)
     indices = np.flatnonzero(np.isfinite(thetas).all(axis=1))
     if indices.size:
-        indices = indices[evaluator.hyperparameters.in_support(thetas[indices])]
+        indices = indices[in_support(evaluator.hyperparameters, thetas[indices])]
     if not indices.size:
         return out
     ok = np.ones(indices.size, dtype=bool)
@@ -132,7 +135,7 @@ def read_before(
         return theta[:0], ""
     if isinstance(before, Mapping):
         try:
-            theta = evaluator.hyperparameters.unconstrained(dict(before))[None]
+            theta = unconstrained(evaluator.hyperparameters, dict(before))[None]
         except (KeyError, TypeError, ValueError) as error:
             raise type(error)(f"before: {error.args[0]}") from None
         name = "as given"

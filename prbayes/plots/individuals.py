@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, share
+from prbayes._validate import Floats, Labels, NamedArrays, called, share
 from prbayes.model.parameters import split_elements, stacked_draws
 from prbayes.plots.canvas import (
     BLUE,
@@ -37,7 +36,7 @@ def plot_individuals(
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
     prob: float = INTERVAL,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the inputs of each specimen, and its readings beside replicates of them.
@@ -157,10 +156,10 @@ def _draw_curve(axis: Axes, y: xr.DataArray, replicates: xr.DataArray, prob: flo
     axis.scatter(places, y, 12, color=ink(), label="measured", gid="observed", zorder=3)
 
 
-def _elements(data: xr.Dataset) -> dict[str, Floats]:
+def _elements(data: xr.Dataset) -> NamedArrays:
     """Return values by the names of elements, (P, n): P draws, or one of data, of n specimens."""
     draws = data if "chain" in data.dims else data.expand_dims(("chain", "draw"))
-    elements: dict[str, Floats] = {}
+    elements: NamedArrays = {}
     for name, values in stacked_draws(draws).items():
         n_draws, n = values.shape[:2]
         columns = values.values.reshape(n_draws, n, -1)

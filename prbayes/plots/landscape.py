@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, positive_integer, wrong_type
+from prbayes._validate import Floats, Labels, NamedArrays, positive_integer, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.model.parameters import optimum_elements, single_elements, split_elements
+from prbayes.model.parameters import in_support, optimum_elements, single_elements, split_elements
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import (
     BLUE,
@@ -47,7 +46,7 @@ def plot_landscape(
     coords: Coords | None = None,
     points: int | None = None,
     responses: int = 0,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the objective around the optimum over one or two hyperparameters.
@@ -262,7 +261,7 @@ def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:
     return evaluator.total(thetas, np.array(scales))
 
 
-def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+def free_elements(evaluator: Evaluator, thetas: Floats) -> NamedArrays:
     """Return the free variables' elements in the user's own units, shape (P,), by element name."""
     values = evaluator.hyperparameters.constrained(thetas)
     free = {str(rv.name): values[str(rv.name)] for rv in evaluator.model.free_RVs}
@@ -326,7 +325,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
             steps = np.linspace(center[name][0], end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
             ok = np.isfinite(thetas).all(axis=1)
-            ok[ok] = evaluator.hyperparameters.in_support(thetas[ok])
+            ok[ok] = in_support(evaluator.hyperparameters, thetas[ok])
             ends.append(end if ok.all() else float(steps[max(int(np.argmin(ok)) - 1, 0)]))
         axes.append(np.linspace(ends[0], ends[1], points))
 
@@ -341,7 +340,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     return Landscape(axes, heights.reshape(coordinates[0].shape), *marks)
 
 
-def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
+def _thetas_at(evaluator: Evaluator, elements: NamedArrays) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
     with np.errstate(all="ignore"):
         return thetas_at(evaluator, elements)

@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Labels
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
@@ -49,7 +49,7 @@ def plot_outputs(
     coords: Coords | None = None,
     before: Mapping[str, Any] | bool | None = None,
     n_draws: int | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw pairs of outputs of a simulator: measured specimens in the calibrated population.

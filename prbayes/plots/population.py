@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, share
+from prbayes._validate import Floats, Labels, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.margins import Margin, margins
@@ -41,7 +40,7 @@ def plot_population(
     coords: Coords | None = None,
     prob: float = INTERVAL,
     n_draws: int | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the calibrated population of each aleatory input, with its uncertainty.

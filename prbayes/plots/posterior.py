@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, share, wrong_type
+from prbayes._validate import Floats, Labels, NamedArrays, share, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
@@ -58,7 +58,7 @@ def plot_posterior(
     coords: Coords | None = None,
     prob: float = INTERVAL,
     backend: str | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
     """Draw the posterior of each hyperparameter against the optimum and the prior, by ArviZ.
@@ -146,7 +146,7 @@ def plot_posterior(
         best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
         errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
         shared &= set(best)
-    prior: dict[str, Floats] = {}
+    prior: NamedArrays = {}
     if evaluator is not None:
         # With 4000 draws the peak of a normal density has an error of 2%.
         thetas = evaluator.hyperparameters.prior_thetas(4000, 0)

@@ -10,7 +10,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL, distribution_function
-from prbayes._validate import share
+from prbayes._validate import Labels, share
 from prbayes.plots.canvas import (
     BLUE,
     check_options,
@@ -44,7 +44,7 @@ def plot_prediction(
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
     prob: float = INTERVAL,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the distribution functions of measured responses and of their prediction.

@@ -10,8 +10,8 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._stats import INTERVAL, distribution_function
-from prbayes._validate import Floats, flag, share
+from prbayes._stats import INTERVAL, distribution_function, positive_scale
+from prbayes._validate import Floats, Labels, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
@@ -66,7 +66,7 @@ def plot_responses(
     ecdf: bool = False,
     prob: float = INTERVAL,
     n_draws: int | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the responses before and after a calibration against the measured ones.
@@ -194,7 +194,7 @@ class _Drawing:
     start: str  # name of the population before the calibration
     prob: float
     text: str  # label of the responses
-    labels: Mapping[str, str] | None
+    labels: Labels | None
 
     def distribution(
         self,
@@ -260,7 +260,7 @@ class _Drawing:
             places = np.arange(len(outputs.labels), dtype=np.float64)
             finite = np.where(np.isfinite(observed), observed, np.nan)
             spread = np.nanstd(finite, axis=0)
-            center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
+            center, unit = np.nanmean(finite, axis=0), positive_scale(spread)
             _name_ticks(axis, places, outputs.names)
             y += ", standard deviations from the mean"
         order = np.argsort(places)
@@ -358,7 +358,7 @@ class Output:
         """The name without the group, because panels of groups share the range of their axis."""
         return self.name.replace(f"[{self.node.group}]", "", 1) if self.node.group else self.name
 
-    def text(self, labels: Mapping[str, str] | None) -> str:
+    def text(self, labels: Labels | None) -> str:
         """Return a label that was given, or the name with the unit."""
         labels = labels or {}
         outputs = self.node.outputs

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import wrong_type
+from prbayes._validate import Labels, wrong_type
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -30,7 +29,7 @@ def plot_sensitivity(
     *,
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the sensitivity indices of hyperparameters and inputs, a row per factor.

@@ -63,29 +63,19 @@ def importance_sample(
     prior: Prior | None = None,
 ) -> ImportanceSample:
     """Return ``size`` draws by importance sampling around modes and from the prior."""
-    modes = [*modes, *ridges(log_density, modes)]
-    masses = np.array([mode.log_mass for mode in modes])
-    # Bound the mixing weights from below, because the approximation may underestimate a mode's
-    # mass.
-    shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
-    proposal = StudentMixture(
-        np.stack([mode.mode for mode in modes]),
-        np.stack([np.linalg.cholesky(mode.covariance) for mode in modes]),
-        shares / shares.sum(),
-        options.degrees,
-    )
+    proposal = laplace_mixture([*modes, *ridges(log_density, modes)], options.degrees)
     points = proposal.draws(options.oversampling * size, seed)
     # Evaluate a few points first: they show whether the rest are worth the time.
     pilot = min(max(len(points) // 8, 512), len(points))
     log_p = log_density(points[:pilot])
-    log_ratio = log_p - logsumexp(proposal.log_densities(points[:pilot]), axis=1)
+    log_ratio = log_p - proposal.log_density(points[:pilot])
     weights = np.exp(log_ratio - logsumexp(log_ratio))
     is_poor = (weights**2).sum() * pilot > options.oversampling / options.effective
     if is_poor and options.rounds > 1:
         points = points[:pilot]
     elif pilot < len(points):
         log_p = np.concatenate([log_p, log_density(points[pilot:])])
-    proposals, n_prior = [(proposal, len(points))], 0
+    proposals, n_prior = [(proposal.log_density, len(points))], 0
     if prior is not None:
         # Draws of the prior cover ridges between the modes.
         n_prior = int(options.prior_share * len(points))
@@ -93,13 +83,10 @@ def importance_sample(
         points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
     rng = np.random.default_rng([seed, 1])
     for round_ in range(1, options.rounds + 1):
-        terms = [
-            logsumexp(mixture.log_densities(points), axis=1) + np.log(n / len(points))
-            for mixture, n in proposals
-        ]
-        if prior is not None and n_prior:
-            terms.append(prior[1](points) + np.log(n_prior / len(points)))
-        log_ratio = log_p - logsumexp(terms, axis=0)
+        densities = (
+            [*proposals, (prior[1], n_prior)] if prior is not None and n_prior else proposals
+        )
+        log_ratio = log_p - balance_heuristic(points, densities)
         sample = _resampled(points, log_p, log_ratio, size, seed, options)
         # Stop if there are too few effective points for the moments of a mixture.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
@@ -117,9 +104,29 @@ def importance_sample(
             new = np.concatenate([new, prior[0](n_added, seed + round_)])
         points = np.concatenate([points, new])
         log_p = np.concatenate([log_p, log_density(new)])
-        proposals.append((proposal, count - n_added))
+        proposals.append((proposal.log_density, count - n_added))
         n_prior += n_added
     return sample
+
+
+def laplace_mixture(modes: Sequence[Laplace], degrees: float) -> StudentMixture:
+    """Return a mixture of t distributions with the moments and masses of approximated modes."""
+    masses = np.array([mode.log_mass for mode in modes])
+    # Bound the mixing weights from below, because the approximation may underestimate a mode's
+    # mass.
+    shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
+    return StudentMixture(
+        np.stack([mode.mode for mode in modes]),
+        np.stack([np.linalg.cholesky(mode.covariance) for mode in modes]),
+        shares / shares.sum(),
+        degrees,
+    )
+
+
+def balance_heuristic(points: Floats, proposals: Sequence[tuple[LogDensity, int]]) -> Floats:
+    """Return the log-density, (n,), of all proposals, mixed by their numbers of points."""
+    terms = [log_density(points) + np.log(n / len(points)) for log_density, n in proposals]
+    return np.asarray(logsumexp(terms, axis=0))
 
 
 def _fitted_mixture(

@@ -11,7 +11,6 @@ import io
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,10 +19,19 @@ import pymc as pm
 import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._validate import Floats, called, positive_integer, real_array, share
-from prbayes.model.evaluator import Evaluator
+from prbayes._stats import positive_scale
+from prbayes._validate import (
+    Floats,
+    NamedArrays,
+    StrPath,
+    called,
+    positive_integer,
+    real_array,
+    share,
+)
+from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, in_support, value_shapes
 from prbayes.numerics.modes import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
@@ -50,7 +58,7 @@ _OPTIONS = KernelOptions()
 _STATE = ("stages", "beta", "log_marginal_likelihood", "iteration")
 
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
-State = tuple[dict[str, Floats], dict[str, Any]]  # arrays of particles, and a note for JSON
+State = tuple[NamedArrays, dict[str, Any]]  # arrays of particles, and a note for JSON
 
 
 class Particles(NamedTuple):
@@ -125,7 +133,7 @@ class BatchedKernel(SMC_KERNEL):
                 "which calibrates it"
             )
         self.variables = model.value_vars
-        shapes = self.evaluator.hyperparameters.shapes.items()
+        shapes = value_shapes(self.evaluator.hyperparameters).items()
         self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
         self.stages: Stages = {}
@@ -150,7 +158,7 @@ class BatchedKernel(SMC_KERNEL):
                 thetas, log_prior, self.log_likelihood(thetas), unknown, unknown.copy()
             )
         evaluation = self.evaluator(thetas)
-        log_likelihood = evaluation.log_likelihood(self.evaluator.epsilon)
+        log_likelihood = evaluation.log_likelihood(epsilons(self.evaluator))
         return Particles(
             thetas, evaluation.log_prior, log_likelihood, evaluation.discrepancies, evaluation.lost
         )
@@ -260,7 +268,7 @@ class BatchedKernel(SMC_KERNEL):
         note["evaluations"] = [node.bound.draws for node in self.evaluator.nodes]
         return self.particles._asdict(), note
 
-    def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
+    def restore(self, arrays: NamedArrays, note: dict[str, Any]) -> None:
         """Take over a state."""
         self._take(Particles(**arrays))
         for name in _STATE:
@@ -276,7 +284,7 @@ def correlation(start: Floats, end: Floats) -> float:
     a = start - start.mean(axis=0)
     b = end - end.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    correlations = np.abs((a * b).sum(axis=0)) / np.where(size > 0, size, 1.0)
+    correlations = np.abs((a * b).sum(axis=0)) / positive_scale(size)
     return float(np.mean(correlations))
 
 
@@ -289,13 +297,13 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
         )
     free_rvs = hyperparameters.model.free_RVs
     rv_shapes = {str(rv.name): event_shape(rv) for rv in free_rvs}
-    rv_names = dict(zip(hyperparameters.shapes, rv_shapes, strict=True))
+    rv_names = dict(zip(value_shapes(hyperparameters), rv_shapes, strict=True))
     is_complete = all(len({*pair} & set(start)) == 1 for pair in rv_names.items())
     if not is_complete or not set(start) <= {*rv_names, *rv_shapes}:
         raise KeyError(
             f"start: got {sorted(map(str, start))}, expected values for each of {sorted(rv_shapes)}"
         )
-    shapes = rv_shapes | hyperparameters.shapes
+    shapes = rv_shapes | value_shapes(hyperparameters)
     values = {name: real_array(value, f"start: {name}") for name, value in start.items()}
     for name, value in values.items():
         expected = (draws, *shapes[name])
@@ -314,13 +322,13 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
     with np.errstate(all="ignore"):  # because values outside the support are refused below
         thetas = hyperparameters.thetas_of(own_units)
     first = 0
-    for name, shape in hyperparameters.shapes.items():
+    for name, shape in value_shapes(hyperparameters).items():
         size = int(np.prod(shape, dtype=int))
         if rv_names[name] not in start:
             thetas[:, first : first + size] = values[name].reshape(draws, size)
         first += size
     finite = np.isfinite(thetas).all(axis=1)
-    outside = ~(finite & hyperparameters.in_support(np.where(finite[:, None], thetas, 0.0)))
+    outside = ~(finite & in_support(hyperparameters, np.where(finite[:, None], thetas, 0.0)))
     if outside.any():
         raise ValueError(
             f"start: got {int(outside.sum())} of {draws} points outside the support of the priors, "
@@ -341,13 +349,11 @@ class Checkpoint:
     raises StoreError and remains as it is.
     """
 
-    def __init__(
-        self, path: str | PathLike[str], problem: Identity, settings: dict[str, Any]
-    ) -> None:
+    def __init__(self, path: StrPath, problem: Identity, settings: dict[str, Any]) -> None:
         self.path = Path(path)
         self.problem = problem
         self.settings = dict(settings)
-        self.arrays: dict[str, Floats] = {}
+        self.arrays: NamedArrays = {}
         self.note: dict[str, Any] = {}
         self.digest = b""  # digest of the file as this run has read or written it last
         if self.path.exists():
@@ -355,7 +361,7 @@ class Checkpoint:
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = str(np.random.SeedSequence().entropy)
 
-    def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
+    def save(self, arrays: NamedArrays, note: dict[str, Any]) -> None:
         """Replace the file; it is safe on disk when this returns."""
         variables = {}
         for name, array in arrays.items():

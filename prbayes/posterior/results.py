@@ -11,8 +11,8 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import Finding
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, called, flag
+from prbayes._finding import Findings
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, NamedArrays, called, flag
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
     arviz_attributes,
@@ -31,7 +31,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
-from prbayes.model.parameters import log_prior_terms, variables_at
+from prbayes.model.parameters import log_prior_terms, value_shapes, variables_at
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import by_simulator, simulator_records
@@ -57,7 +57,7 @@ class Chains:
     # numbers `AT_BEST` by simulator.
     at_best: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
-    findings: tuple[Finding, ...] = ()  # findings about modes, which are logged already
+    findings: Findings = ()  # findings about modes, which are logged already
 
 
 def posterior_tree(
@@ -267,7 +267,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
 
 def _log_likelihood_totals(
     evaluator: Evaluator, rows: Floats, by_specimen: xr.Dataset | None
-) -> dict[str, Floats]:
+) -> NamedArrays:
     """Return the log-likelihood of all specimens by simulator at thetas, (S, d) -> (S,).
 
     The log-likelihoods ``by_specimen`` are summed if they have all draws. Of simulators that share
@@ -408,7 +408,7 @@ def as_multitrace(tree: xr.DataTree, evaluator: Evaluator) -> Any:
     from pymc.backends.base import MultiTrace
     from pymc.backends.ndarray import NDArray
 
-    shapes = evaluator.hyperparameters.shapes
+    shapes = value_shapes(evaluator.hyperparameters)
     ends = np.cumsum([int(np.prod(shape, dtype=int)) for shape in shapes.values()])[:-1]
     traces = []
     for chain, thetas in enumerate(np.asarray(tree["calibration"]["theta"])):

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.inference.resampling import SETS, aligned, groups, observable
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
@@ -31,7 +31,7 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator, coarser_evaluator, with_targets
+from prbayes.model.evaluator import Evaluator, coarser_evaluator, epsilons, with_targets
 from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import cross
@@ -149,7 +149,7 @@ class ResimulatedScores:
     """Scores of responses computed at each theta, of simulators that share specimens."""
 
     # index, unit and score function of each simulator
-    tables: tuple[tuple[int, Floats, Callable[[Floats], Floats]], ...]
+    tables: tuple[tuple[int, Floats, ArrayFunction], ...]
     mean: Floats  # (d,): mean of the observed specimens' scores
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)
@@ -289,7 +289,7 @@ def _minimised_on_population(
         responses, weights = evaluator.populations(point[None], k)
         targets.append(prepared_on_population(node.target, responses[0], weights[0]))
     prepared = with_targets(evaluator, targets)
-    unset = np.isnan(prepared.epsilon)
+    unset = np.isnan(epsilons(prepared))
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
     minimiser = move_inside(prepared, minimiser_near(prepared, point, scales), options)

@@ -12,7 +12,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, Findings, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.cost import designs_as_before, explained
@@ -159,7 +159,7 @@ def draw_posterior(
     settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
         chains = None
-        findings: tuple[Finding, ...] = ()
+        findings: Findings = ()
         for round_ in range(MAX_ROUNDS + 1):
             target = posterior_target(evaluator, optimum)
             modes = modes_of(target)

@@ -15,7 +15,14 @@ import xarray as xr
 from prbayes._display import Tree, View
 from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
-from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
+from prbayes._validate import (
+    NamedArrays,
+    Seed,
+    executes,
+    flag,
+    positive_integer,
+    seed_number,
+)
 from prbayes.inference.refits import summary_obstacle
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
@@ -237,7 +244,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
 
 
 # ranks, truths and standard deviations by variable, or an error message
-_Result = dict[str, Floats] | str
+_Result = NamedArrays | str
 
 
 def _analyse(
@@ -262,7 +269,7 @@ def _analyse(
     return results
 
 
-def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dict[str, Floats]:
+def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> NamedArrays:
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
     assert settings.random_seed is not None
     rng = np.random.default_rng([settings.random_seed, number])

@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from itertools import zip_longest
-from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
@@ -19,13 +18,23 @@ import xarray as xr
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
-from prbayes._finding import Finding, as_json, report
+from prbayes._finding import Finding, Findings, as_json, report
 from prbayes._progress import progress, shown
-from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes._validate import (
+    Floats,
+    Seed,
+    StrPath,
+    file_path,
+    flag,
+    positive_integer,
+    seed_number,
+    share,
+)
 from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
+    epsilons,
     is_current,
     missing_mass,
     n_design_runs,
@@ -84,7 +93,7 @@ def sample_smc(
     max_stages: int | None = None,
     max_seconds: float | None = None,
     max_runs: int | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: StrPath | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -260,7 +269,7 @@ class SamplingSettings:
     refine: bool = True
     start: Any = None
     max_stages: int | None = None
-    checkpoint: str | PathLike[str] | None = None
+    checkpoint: StrPath | None = None
     random_seed: int | None = 0
     progressbar: bool = False
     with_groups: bool = False  # whether the result has the groups of `arviz_groups`
@@ -304,7 +313,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
         )
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    epsilons = evaluator.epsilon
+    earlier = epsilons(evaluator)
     try:
         with designs_as_before(evaluator) as restore_designs:
             if kind is Likelihood.PSEUDO:
@@ -318,7 +327,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
                 restore_designs()
             return tree
     finally:
-        for node, value in zip(evaluator.nodes, epsilons, strict=True):
+        for node, value in zip(evaluator.nodes, earlier, strict=True):
             node.epsilon.set_value(np.asarray(value))
 
 
@@ -414,7 +423,7 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats) -> Floats:
     return lost
 
 
-def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
+def _lost_findings(evaluator: Evaluator, chains: Chains) -> Findings:
     """Report draws whose populations lack responses; raise if most draws, or the best, do."""
     lost = chains.lost
     assert lost is not None
@@ -478,11 +487,11 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
     """Return chains with log-likelihoods, and the error and missing mass at the best draw."""
     discrepancies = chains.discrepancies
     assert discrepancies is not None
-    kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+    kernels = np.asarray(log_kernel(discrepancies, epsilons(evaluator)))
     rows = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
     other_terms = evaluator.log_other(rows).reshape(kernels.shape[:2])
     chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
-    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
+    total = (discrepancies / epsilons(evaluator)).sum(axis=-1)
     best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
     at_best = {}
     try:

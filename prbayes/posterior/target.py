@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 from scipy.special import ndtri
 
-from prbayes._finding import Finding
+from prbayes._finding import Findings
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.inference.checks.prior import conflict_findings
@@ -39,6 +39,7 @@ from prbayes.model.evaluator import (
     TOLERABLE,
     Evaluator,
     coarser_evaluator,
+    epsilons,
     supports_each,
     with_targets,
 )
@@ -99,7 +100,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     if summary_obstacle(evaluator) is not None:
 
         def log_likelihood(thetas: Floats) -> Floats:
-            return evaluator(thetas).log_likelihood(evaluator.epsilon)
+            return evaluator(thetas).log_likelihood(epsilons(evaluator))
 
         prior_sd = evaluator.hyperparameters.prior_sd
         return Target(evaluator, log_likelihood, optima_of(optimum, evaluator), prior_sd)
@@ -155,7 +156,7 @@ def require_density(evaluator: Evaluator) -> None:
         )
 
 
-def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> tuple[Finding, ...]:
+def prior_conflicts(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Findings:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
     size = 4096
     comparable = [mode["comparable"] for mode in optimum.local_optima]
@@ -330,18 +331,12 @@ def refit_likelihood(
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
     start, *rest = continuation.coordinates(thetas)
-    continued = _continued(evaluator, continuation)
     has_several_outputs = any(node.target.event for node in evaluator.nodes)
     for _ in range(options.whitenings if has_several_outputs else 0):
-        # Metrics of several outputs are whitened by the population at the last minimiser.
-        targets = [node.target for node in evaluator.nodes]
-        for k, target in enumerate(targets):
-            if target.event:
-                responses, weights = continued.populations(start[None], k)
-                targets[k] = prepared_on_population(target, responses[0], weights[0])
-        evaluator = with_targets(evaluator, targets)
+        evaluator = whitened_at(evaluator, continuation, start)
         continued = _continued(evaluator, continuation)
         start = _at_minimiser(continued, start, scales, options).theta
+    continued = _continued(evaluator, continuation)
     sampling = _at_minimiser(continued, start, scales, options)
     inside = _moved_inside(sampling, options)
     is_linear = inside is not None
@@ -356,17 +351,12 @@ def refit_likelihood(
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
-    # The unit of an element is a prior standard deviation, or a hundred standard errors if these
-    # are less.
-    errors = np.sqrt(((sampling.axes * sampling.stderr) ** 2).sum(axis=1))
-    is_known = ~continuation.is_continued & (errors > 0)
-    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
     likelihood = RefitLikelihood(
         evaluator=evaluator,
         centers=tuple(centers),
         continuation=continuation,
         starts=continuation.within(np.array([center.theta for center in centers]), margin=0.05),
-        scale=units * evaluator.hyperparameters.prior_sd,
+        scale=element_units(sampling, continuation) * evaluator.hyperparameters.prior_sd,
         options=options,
     )
     r = sampling.stderr.size
@@ -396,6 +386,30 @@ def refit_likelihood(
             log_mixture=log_sum_exp(logs.T),
         )
     return likelihood
+
+
+def element_units(sampling: SamplingDistribution, continuation: Continuation) -> Floats:
+    """Return the unit of each element of theta, (d,), in prior standard deviations.
+
+    It is a prior standard deviation, or a hundred standard errors if these are less.
+    """
+    errors = np.sqrt(((sampling.axes * sampling.stderr) ** 2).sum(axis=1))
+    is_known = ~continuation.is_continued & (errors > 0)
+    return np.where(is_known, np.minimum(100 * errors, 1), 1.0)
+
+
+def whitened_at(evaluator: Evaluator, continuation: Continuation, x: Floats) -> Evaluator:
+    """Return an evaluator whose metrics of several outputs are whitened by the population at x.
+
+    These are coordinates of the continuation, (d,), such as the last minimiser.
+    """
+    continued = _continued(evaluator, continuation)
+    targets = [node.target for node in evaluator.nodes]
+    for k, target in enumerate(targets):
+        if target.event:
+            responses, weights = continued.populations(x[None], k)
+            targets[k] = prepared_on_population(target, responses[0], weights[0])
+    return with_targets(evaluator, targets)
 
 
 def near_statistics(statistics: Floats, r: int, noise: float) -> tuple[Floats, Bools]:

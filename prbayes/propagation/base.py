@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -20,8 +19,8 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding
-from prbayes._validate import Floats, Indices, flag, positive_integer, positive_number
+from prbayes._finding import Findings
+from prbayes._validate import Floats, Indices, StrPath, flag, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
@@ -122,11 +121,7 @@ class Bound(ABC):
     support_moves: bool = False
     # Largest accepted share, at an answer, of a population on points without response.
     max_lost: float = MAX_LOST
-    findings: tuple[Finding, ...] = ()  # findings about the data and the first responses
-    # Seed of the current sampler, and number of evaluations since it started. Both determine the
-    # random draws.
-    stream: int = 0
-    draws: int = 0
+    findings: Findings = ()  # findings about the data and the first responses
     # Shares without numbers of the populations in the last evaluation. They are NaN for invalid
     # populations, and for all populations if responses are stored.
     last_missing: Missing = Missing(np.array(np.nan), np.array(np.nan))
@@ -138,6 +133,9 @@ class Bound(ABC):
         self.inputs = inputs
         self.target = target
         self.responses = responses
+        # Seed of the current sampler, and number of evaluations since it started. Both determine
+        # the random draws.
+        self.stream, self.draws = 0, 0
         self.first_points: Sequence[Floats] = ()
         self.first_responses: Floats = np.empty(0)
         symbols = inputs.placeholders()
@@ -266,7 +264,7 @@ class Propagation(ABC):
     """How a population of inputs becomes responses, with options of calling the response."""
 
     executor: Executor | None = field(default=None, repr=False)
-    store: str | PathLike[str] | None = field(default=None, repr=False)
+    store: StrPath | None = field(default=None, repr=False)
     version: str | None = field(default=None, repr=False)
     on_failure: OnFailure = field(default=Abort(), repr=False)
     retry_failed: bool = field(default=False, repr=False)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 
+from prbayes._stats import positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices, Shape
 from prbayes.emulators.emulator import ROUGH_CANDIDATES, Emulator
 from prbayes.emulators.selection import TrainingRuns, weight_of_runs
@@ -290,7 +291,7 @@ class DesignEmulator:
             importance = importance / total
             spread = np.sqrt(importance @ (y - importance @ y) ** 2)
             error = np.sqrt(importance @ (left_out[has_prediction] - y) ** 2)
-            errors = error / np.where(spread > 0, spread, 1.0)
+            errors = error / positive_scale(spread)
         worst = int(errors.argmax())
         return replace(
             self, weights=weights, run_share=share, error=float(errors[worst]), worst_output=worst

@@ -22,7 +22,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from scipy.linalg import qr
 
-from prbayes._validate import Bools, Floats
+from prbayes._validate import ArrayFunction, Bools, Floats
 from prbayes.numerics.threads import one_thread
 from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
@@ -37,7 +37,7 @@ def _non_negative(x: Floats) -> Floats:
 # products of these functions are sufficient statistics as well. A function is not finite outside of
 # the support, if the support does not depend on parameters. That of the truncated normal does: the
 # graph of the density contains it.
-_FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
+_FAMILIES: dict[type, tuple[tuple[ArrayFunction, ...], bool]] = {
     type(pm.Normal.rv_op): ((np.positive,), True),
     type(pm.HalfNormal.rv_op): ((_non_negative,), True),
     type(pm.TruncatedNormal.rv_op): ((np.positive,), True),

@@ -17,7 +17,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, positive_integer
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, NamedArrays, positive_integer
 from prbayes.emulators.kriging import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Basis, Discrepancy, is_additive
@@ -469,7 +469,7 @@ class ReweightedBound(Bound):
                 parts.append(np.where(is_supported, values, np.inf))
         return np.concatenate(parts)
 
-    def support(self, params: Sequence[Any]) -> dict[str, Floats]:
+    def support(self, params: Sequence[Any]) -> NamedArrays:
         """Return how well the design supports the populations at given parents, shapes (k,).
 
         Returns

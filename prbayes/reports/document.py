@@ -8,7 +8,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,16 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import percentage
-from prbayes._validate import called, file_path, flag, folder_path, plain_text, wrong_type
+from prbayes._validate import (
+    Labels,
+    StrPath,
+    called,
+    file_path,
+    flag,
+    folder_path,
+    plain_text,
+    wrong_type,
+)
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.material import date_of, gather, versions_of
 from prbayes.reports.numbers import cells
@@ -131,7 +139,7 @@ class Report:
         decision: xr.Dataset | Mapping[str, xr.Dataset] | None = None,
         pictures: bool = True,
         validation: Mapping[str, tuple[Any, xr.DataArray]] | None = None,
-        labels: Mapping[str, str] | None = None,
+        labels: Labels | None = None,
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
@@ -191,14 +199,14 @@ class Report:
         sections = (*self.sections[:place], section, *self.sections[place:])
         return replace(self, sections=sections)
 
-    def to_html(self, path: str | PathLike[str]) -> Path:
+    def to_html(self, path: StrPath) -> Path:
         """Write one file with everything, for a browser and for print; return its path.
 
         A file of this name is replaced; it is kept if the new one cannot be written (`OSError`).
         """
         return _write(file_path(path, "path"), self._html(), {})
 
-    def to_markdown(self, folder: str | PathLike[str]) -> Path:
+    def to_markdown(self, folder: StrPath) -> Path:
         """Write ``report.md`` into a folder, with pictures beside it; return its path.
 
         Files of these names are replaced, all of them or none.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from subprocess import CalledProcessError
@@ -13,6 +13,7 @@ import pymc as pm
 
 from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
+from prbayes._validate import Function
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import variable_of
 from prbayes.plots.comparison import plot_comparison
@@ -36,7 +37,7 @@ _log = logging.getLogger("prbayes")
 class Illustration:
     """A picture that a report shows if it has the results for it."""
 
-    function: Callable[..., Any]  # function that returns a figure with ``savefig``
+    function: Function  # function that returns a figure with ``savefig``
     title: str
     alt: str
     caption: str = ""

@@ -13,7 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, texts, wrong_type
+from prbayes._validate import Floats, Labels, called, texts, wrong_type
 from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
@@ -77,7 +77,7 @@ class Material:
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
     validation: dict[str, Validation]  # responses of other specimens by condition
-    labels: Mapping[str, str]  # labels of variables, inputs, simulators and outputs, with units
+    labels: Labels  # labels of variables, inputs, simulators and outputs, with units
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -194,7 +194,7 @@ def gather(
     comparison: Any = None,
     decision: Any = None,
     validation: Any = None,
-    labels: Mapping[str, str] | None = None,
+    labels: Labels | None = None,
 ) -> Material:
     """Check results, and derive the missing ones."""
     optima = _by_label(optimum, "optimum")

@@ -14,6 +14,7 @@ import xarray as xr
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
+from prbayes._validate import Labels
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
     element_name,
@@ -130,9 +131,9 @@ class _ObjectiveTexts:
     is_named: bool  # whether its name depends on the metric
     sign: float  # factor of stored discrepancies
     # Titles of further columns with values of the results, by variable of the calibration.
-    columns: Mapping[str, str]
+    columns: Labels
     # Sentences on the width of the draws, by the sampler's adjustment.
-    adjustments: Mapping[str, str]
+    adjustments: Labels
 
 
 _DISCREPANCY = _ObjectiveTexts(

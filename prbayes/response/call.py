@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
-from prbayes._validate import NO_POPULATION, Bools, Floats, Indices, Shape, unmasked
+from prbayes._stats import positive_scale
+from prbayes._validate import NO_POPULATION, Bools, Floats, Function, Indices, Shape, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -38,8 +39,6 @@ from prbayes.response.store import Store, StoreError, add_digests, stored_digest
 from prbayes.response.variables import changed_names, listed, watched
 
 _log = logging.getLogger(__name__)
-
-type Function = Callable[..., Any]  # the user's response, or a part of it
 
 
 class scalar:  # noqa: N801 (reads as a function in a model)
@@ -623,7 +622,7 @@ def revealing_rows(values: Floats) -> Indices:
     is_nan = np.isnan(columns).any(axis=1)
     is_infinite = np.isinf(columns).any(axis=1) & ~is_nan
     size = np.abs(columns[finite]).max(axis=0, initial=0.0)
-    sums = (columns[finite] / np.where(size > 0, size, 1.0)).sum(axis=1)
+    sums = (columns[finite] / positive_scale(size)).sum(axis=1)
     order = finite[np.argsort(sums, kind="stable")]
     selected = [order[-1:], order[len(order) // 2 :][:1], order[:1]]
     selected += [np.flatnonzero(kind)[:1] for kind in (is_nan, is_infinite)]

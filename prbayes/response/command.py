@@ -18,19 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import called, flag, folder_path, positive_number, unmasked
+from prbayes._validate import StrPath, called, flag, folder_path, positive_number, unmasked
 from prbayes.response.call import scalar
 from prbayes.response.outputs import relabelled
 
 
 def command(
-    arguments: Sequence[str | PathLike[str]],
+    arguments: Sequence[StrPath],
     *,
     inputs: Sequence[str],
     read: Callable[[Path], Any],
-    write: Mapping[str, str | PathLike[str]] | None = None,
+    write: Mapping[str, StrPath] | None = None,
     timeout: float | None = None,
-    folder: str | PathLike[str] | None = None,
+    folder: StrPath | None = None,
     keep: bool = False,
 ) -> scalar:
     """Turn a program into a response: it runs once for each specimen, in a folder of the run.

@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
-from prbayes._validate import Floats, Indices, plain_text, real_array
+from prbayes._validate import Floats, Indices, NamedArrays, plain_text, real_array
 from prbayes.response.outputs import specimen_index
 
 
@@ -169,12 +169,12 @@ def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVar
 
 def known_covariates(
     name: str, covariates: Sequence[Any], size: int, rows: Indices | None
-) -> dict[str, Floats]:
+) -> NamedArrays:
     """Return the values of covariates for each specimen, (N,), by name.
 
     With frequencies, ``rows`` is the row of the observed values that each specimen comes from.
     """
-    result: dict[str, Floats] = {}
+    result: NamedArrays = {}
     for variable in covariates:
         label = str(variable.name)
         values = np.array(variable.owner.op.values)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._finding import Finding
-from prbayes._validate import Floats, called, real_array, unmasked
-from prbayes.response.call import Function, scalar, unwrapped
+from prbayes._finding import Finding, Findings
+from prbayes._validate import Floats, Function, called, real_array, unmasked
+from prbayes.response.call import scalar, unwrapped
 from prbayes.response.outputs import relabelled
 
 
@@ -240,7 +240,7 @@ class Corrected:
         return " to ".join(f"{end:g}" for end in ends)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> Findings:
         """A warning if the condition is outside the range of the data."""
         low = self.discrepancy.low
         high = self.discrepancy.high
@@ -287,6 +287,6 @@ def has_discrepancy(function: Function) -> bool:
     return isinstance(unwrapped(function), Corrected)
 
 
-def findings_of(function: Function) -> tuple[Finding, ...]:
+def findings_of(function: Function) -> Findings:
     """Return the warnings that a function declares for its users."""
     return tuple(getattr(unwrapped(function), "findings", ()))

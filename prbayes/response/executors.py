@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -30,7 +30,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from prbayes._finding import Finding, report
-from prbayes._validate import called, positive_number
+from prbayes._validate import Function, called, positive_number
 from prbayes.response.failures import ResponseError
 
 
@@ -254,7 +254,7 @@ class Pool:
                 "`if __name__ == '__main__':`"
             )
 
-    def submitted(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submitted(self, work: Function, *arguments: Any) -> Future[Any]:
         """Return a future of the work. Without an executor the work is done here, at once."""
         future: Future[Any] = Future()
         try:

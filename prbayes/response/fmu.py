@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from multiprocessing.util import Finalize
-from os import PathLike
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -32,6 +31,8 @@ from numpy.typing import ArrayLike
 
 from prbayes._validate import (
     Floats,
+    Labels,
+    StrPath,
     called,
     file_path,
     finite_number,
@@ -46,10 +47,10 @@ type Value = float | int | bool | str
 
 
 def fmu(
-    path: str | PathLike[str],
+    path: StrPath,
     *,
     inputs: Sequence[str],
-    outputs: Sequence[str] | Mapping[str, str],
+    outputs: Sequence[str] | Labels,
     parameters: Mapping[str, Value] | None = None,
     times: ArrayLike | None = None,
     start_time: float | None = None,

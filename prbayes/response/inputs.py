@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,15 @@ from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import NO_POPULATION, Indices, Shape, plain_text, real_array
+from prbayes._validate import (
+    NO_POPULATION,
+    Function,
+    Indices,
+    Labels,
+    Shape,
+    plain_text,
+    real_array,
+)
 from prbayes.response.compile import PLAIN, interpreted, vectorize_distributions
 from prbayes.response.condition import is_condition
 from prbayes.response.pymc_dims import (
@@ -311,7 +319,7 @@ def event_shape(dist: TensorVariable) -> Shape:
     return tuple(int(s) for s in draw.shape)
 
 
-def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
+def argument_names(inputs: Inputs, function: Function) -> list[str]:
     """Return a name for each input: that of its variable, or of the response's argument."""
     inner: Any = getattr(function, "function", function)  # the function inside prb.scalar
     declared = getattr(inner, "inputs", ())  # programs and units declare their inputs
@@ -330,13 +338,13 @@ def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
     return names
 
 
-def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
+def aleatory_names(inputs: Inputs, function: Function) -> list[str]:
     """Return a name for each aleatory input: of its distribution, or the response's argument."""
     names = argument_names(inputs, function)
     return [names[inputs.arguments.index(position)] for position in range(len(inputs.aleatory))]
 
 
-def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, str]) -> list[str]:
+def set_units(inputs: Inputs, function: Function, units: Labels) -> list[str]:
     """Store the units of inputs, or of their elements; return the names that have one."""
     names = aleatory_names(inputs, function)
     elements: list[str] = []

@@ -18,12 +18,11 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, Indices, Shape, called, executes, folder_path
+from prbayes._validate import Floats, Function, Indices, Shape, called, executes, folder_path
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
     CallSettings,
-    Function,
     Points,
     Tally,
     array_advice,

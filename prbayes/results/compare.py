@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, wrong_type
+from prbayes._validate import Floats, NamedArrays, called, wrong_type
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
@@ -313,7 +313,7 @@ def _scores(
     metrics: Sequence[Metric] | None,
     *,
     is_covered: bool,
-) -> dict[str, Floats]:
+) -> NamedArrays:
     """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
     evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:

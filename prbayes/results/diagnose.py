@@ -12,8 +12,9 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view, without_constructor
-from prbayes._finding import Finding, counted, from_json
-from prbayes._validate import Floats, wrong_type
+from prbayes._finding import Finding, Findings, counted, from_json
+from prbayes._stats import positive_scale
+from prbayes._validate import Floats, NamedArrays, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
@@ -35,8 +36,6 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
-from prbayes.model.simulator_with_data import unlabelled_specimens
-from prbayes.model.specimen_likelihood import all_simulators
 from prbayes.optimize.design_refinement import rough_emulators
 from prbayes.optimize.maximum_likelihood import specimen_refit_obstacle
 from prbayes.optimize.minimize import find_optimum
@@ -55,7 +54,7 @@ from prbayes.results.likelihood_checks import (
     check_conflict,
     check_draws,
     check_population,
-    check_tables,
+    check_simulators,
     emulator_remarks,
     separate_modes,
 )
@@ -66,6 +65,9 @@ from prbayes.results.products import model_of_product, one_posterior
 # thousand cases; the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, from 1500 to 4000
 # sets of each
 _NOISE = 11.0
+_NEEDS_MODEL = (
+    "The family of the population was not tested: that needs the model; pass the Optimum itself."
+)
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
 
@@ -99,9 +101,9 @@ class Diagnosis:
     ['few-specimens']
     """
 
-    findings: tuple[Finding, ...]
+    findings: Findings
     support: xr.Dataset = field(repr=False)
-    remarks: tuple[Finding, ...] = ()
+    remarks: Findings = ()
     untested: tuple[str, ...] = ()
 
     @property
@@ -205,14 +207,10 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     refuse_model(result, "diagnose: result")
     result = one_posterior(result, "diagnose")
     optimum = result if isinstance(result, Optimum) else None
-    tree = result.to_datatree() if isinstance(result, Optimum) else result
-    groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
-    if not groups & {"posterior", "optimum"}:
-        raise wrong_type(result, "diagnose: result", RESULT)
-    has_draws = "posterior" in groups
-    if has_draws:
-        _refuse_few_draws(tree)
-    calibration = tree["calibration"].to_dataset() if "calibration" in groups else xr.Dataset()
+    tree = _checked_tree(result)
+    has_draws = "posterior" in tree.children
+    has_calibration = "calibration" in tree.children
+    calibration = tree["calibration"].to_dataset() if has_calibration else xr.Dataset()
     if has_draws and not calibration:
         model = model_on_context(model, "prb.diagnose")
     if model is not None:
@@ -238,7 +236,6 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     findings = from_json(str(attrs.get("findings", "[]")))
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
-        checked += Checked(width_of_epsilon(tree, model))
         reason = "refits need an optimum; look at prb.diagnose of prb.minimize"
     else:
         checked = _check_convergence(attrs, findings)
@@ -257,18 +254,13 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
             maximum = find_optimum(evaluator, Minimisation())
             checked += check_population(maximum) + check_conflict(maximum, thetas)
     else:
-        text = "The family of the population was not tested: that needs the model; pass the "
-        checked += Checked(untested=(f"{text}Optimum itself.",))
+        checked += Checked(untested=(_NEEDS_MODEL,))
     if evaluator is not None:
-        checked += check_tables(evaluator)
-        checked += Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))
+        checked += check_simulators(evaluator)
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
-    # Only the log-likelihood by specimen stores this share.
-    failing = _stored_shares(calibration, "failing_share")
-    failed = _stored_shares(calibration, "failed_mass")
-    failures, harmless = _failure_findings(tree, lost | failing, failed | failing)
+    failures, harmless = _failure_findings(tree, calibration, lost)
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
     compared += [] if optimum is None else rough_emulators(optimum.evaluator)
     later = (*checked.findings, *failures, *_lost_mass(optimum, lost), *_unsupported(coverage))
@@ -280,17 +272,21 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     )
 
 
-def _refuse_few_draws(tree: xr.DataTree, fewest: int = 2) -> None:
-    """Raise for chains of one draw, which have no autocorrelation."""
-    n = tree["posterior"].sizes["draw"]
+def _checked_tree(result: object, fewest: int = 2) -> xr.DataTree:
+    """Return a result as a tree; raise for chains of one draw, which have no autocorrelation."""
+    tree = result.to_datatree() if isinstance(result, Optimum) else result
+    if not isinstance(tree, xr.DataTree) or not {"posterior", "optimum"} & set(tree.children):
+        raise wrong_type(result, "diagnose: result", RESULT)
+    n = tree["posterior"].sizes["draw"] if "posterior" in tree.children else fewest
     if n < fewest:
         raise ValueError(
             f"diagnose: result: got {counted(n, 'draw')} of each chain, expected at least "
             f"{fewest}; pass the result with all draws"
         )
+    return tree
 
 
-def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> tuple[Finding, ...]:
+def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> Findings:
     """Return findings without copies, and no later ones on a condition reported earlier.
 
     Two findings are about the same condition if they have the same code, and the same simulator
@@ -347,7 +343,7 @@ def _check_family(optimum: Optimum) -> Checked:
     if fitted is None or np.isnan(p_value):
         checked = Checked((*small_simulators(evaluator), *failures))
         return checked + _not_tested("the data are uninformative, or too few refits converge")
-    misfits: tuple[Finding, ...] = ()
+    misfits: Findings = ()
     ties, p_spread_out = "", np.nan
     if p_value < UNLIKELY:
         ties = rounding(evaluator)
@@ -391,7 +387,7 @@ def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
 
 
 def _failure_findings(
-    tree: xr.DataTree, lost: Mapping[str, float], failed: Mapping[str, float]
+    tree: xr.DataTree, calibration: xr.Dataset, lost: Mapping[str, float]
 ) -> tuple[list[Finding], list[Finding]]:
     """Return findings about failed responses that matter to the answer, and harmless ones."""
     findings: list[Finding] = []
@@ -399,6 +395,8 @@ def _failure_findings(
     if "failures" not in tree.children:
         return findings, harmless
     failures = tree["failures"].to_dataset()
+    # Only the log-likelihood by specimen stores this share.
+    failing = _stored_shares(calibration, "failing_share")
     names = failures["simulator"].values
     for name in dict.fromkeys(names.tolist()):
         rows = failures.isel(failure=np.flatnonzero(names == name))
@@ -411,9 +409,9 @@ def _failure_findings(
         replacement = rows["instead"].values[0]
         share = np.nan  # Finite replacements look like other responses: their share is unknown.
         if np.isnan(replacement):
-            share = lost.get(name, np.nan)
+            share = {**lost, **failing}.get(name, np.nan)
         elif np.isposinf(replacement):
-            share = failed.get(name, np.nan)
+            share = (_stored_shares(calibration, "failed_mass") | failing).get(name, np.nan)
         if share < SMALLEST_SHARE:
             text += "the calibrated populations have next to no specimens there."
             harmless.append(Finding("harmless-failures", text))
@@ -483,7 +481,7 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
     # Chains in different modes have a large R-hat anyway. For fewer draws ArviZ returns NaN.
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
-    findings += [*_repeated_draws(draws), *_particles_stuck(tree)]
+    findings += [*_repeated_draws(draws), *_particles_stuck(tree), *width_of_epsilon(tree, model)]
     return Checked(tuple(findings))
 
 
@@ -532,7 +530,7 @@ def _repeated_draws(draws: Floats) -> list[Finding]:
     for table in draws:
         size = np.abs(table).max(axis=0, initial=0.0)
         # Draws are equal if they differ by rounding alone; posteriors are far wider than that.
-        digits = np.round(table / np.where(size > 0, size, 1.0) / 1e-12)
+        digits = np.round(table / positive_scale(size) / 1e-12)
         counts.append(len(np.unique(digits, axis=0)))
     # A standard deviation from 50 different draws has an error of a tenth.
     expected = min(50, n_draws // 2)
@@ -583,7 +581,7 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
 
 # support of the populations of a result by each design, arrays of one shape, and what the design
 # requires: weight ESS, largest lost mass and number of points; by simulator
-_Coverage = dict[str, tuple[dict[str, Floats], tuple[float, float, int]]]
+_Coverage = dict[str, tuple[NamedArrays, tuple[float, float, int]]]
 
 
 def _computed_coverage(evaluator: Evaluator, thetas: Floats) -> _Coverage:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from prbayes._display import Tree, View
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes._validate import Floats, NamedArrays, Seed, positive_integer, seed_number
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
 from prbayes.model.parameters import element_name
@@ -191,7 +191,7 @@ def _shrinkage(values: Floats, population: Floats, *, is_log: bool) -> Floats:
 
 
 def _population(
-    likelihood: SpecimenLikelihood, points: dict[str, Floats], rng: np.random.Generator
+    likelihood: SpecimenLikelihood, points: NamedArrays, rng: np.random.Generator
 ) -> list[Floats]:
     """Return 256 specimens of each group from each population, by input, (P, n, *event)."""
     parts = []

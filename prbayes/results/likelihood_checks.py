@@ -17,7 +17,8 @@ import pytensor.tensor as pt
 import xarray as xr
 from scipy.special import softmax
 
-from prbayes._finding import Finding, counted
+from prbayes._finding import Finding, Findings, counted
+from prbayes._stats import positive_scale
 from prbayes._validate import Floats
 from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
@@ -32,7 +33,8 @@ from prbayes.inference.checks.population import (
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import element_names, variables_at
-from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators, arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import (
@@ -70,8 +72,8 @@ _OPTIONS = CheckOptions()
 class Checked:
     """What checks found, what they did not find, and which were not run."""
 
-    findings: tuple[Finding, ...] = ()
-    remarks: tuple[Finding, ...] = ()  # results of tests that found nothing, with their power
+    findings: Findings = ()
+    remarks: Findings = ()  # results of tests that found nothing, with their power
     untested: tuple[str, ...] = ()  # sentences on tests that were not run, with the reason
 
     def __add__(self, second: Checked) -> Checked:
@@ -110,11 +112,13 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
     return Checked(remarks=tuple(remarks))
 
 
-def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
-    """Report the error of the surface of each table of runs, as a finding from ``largest`` on.
+def check_simulators(evaluator: Evaluator) -> Checked:
+    """Report the error of the surface of each table of runs, and specimens without labels.
 
-    An error of a tenth of a standard deviation of the data widens populations by half a percent.
+    An error above a tenth of a standard deviation of the data, which widens populations by half a
+    percent, is a finding.
     """
+    largest = 0.1
     checked = Checked()
     for simulator in evaluator.simulators:
         table = simulator.responses.function
@@ -127,7 +131,7 @@ def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
             )
             report = (Finding("table-error", text, "runs.md#the-error-of-the-surface"),)
             checked += Checked(report) if share > largest else Checked(remarks=report)
-    return checked
+    return checked + Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))
 
 
 # -- population ------------------------------------------------------------------------------
@@ -326,12 +330,12 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
     return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
 
 
-def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
+def separate_modes(thetas: Floats, names: Sequence[str]) -> Findings:
     """Report chains whose means are farther apart than the chains are wide."""
     if len(thetas) < 2 or thetas.shape[1] < 4:
         return ()
     within = np.sqrt(thetas.var(axis=1).mean(axis=0))
-    separation = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
+    separation = np.ptp(thetas.mean(axis=1), axis=0) / positive_scale(within, np.inf)
     far = np.flatnonzero(separation > _OPTIONS.separation)
     if not far.size:
         return ()
@@ -347,7 +351,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
     )
 
 
-def influence(result: xr.DataTree) -> tuple[Finding, ...]:
+def influence(result: xr.DataTree) -> Findings:
     """Report specimens on which the posterior depends, by Pareto k of leave-one-out."""
     if "log_likelihood" not in result.children:
         return ()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._display import ShownArray, View
-from prbayes._finding import Finding, as_json, counted, from_json, report
+from prbayes._finding import Finding, Findings, as_json, counted, from_json, report
 from prbayes._progress import shown
-from prbayes._stats import reached
+from prbayes._stats import positive_scale, reached
 from prbayes._validate import (
     Floats,
+    Function,
     Indices,
+    NamedArrays,
     Seed,
+    StrPath,
     finite_number,
     flag,
     plain_text,
@@ -72,7 +74,7 @@ RESULT = (
 @locked
 def predict(
     result: Optimum | xr.DataTree,
-    response: Callable[..., Any],
+    response: Function,
     *inputs: Any,
     model: pm.Model | None = None,
     n_samples: int = 500,
@@ -82,7 +84,7 @@ def predict(
     at: Mapping[str, float] | None = None,
     name: str | None = None,
     executor: Executor | None = None,
-    store: str | PathLike[str] | None = None,
+    store: StrPath | None = None,
     version: str | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
@@ -314,7 +316,7 @@ def covariate_values(
     size: int,
     *,
     has_runs: bool,
-) -> dict[str, Floats]:
+) -> NamedArrays:
     """Return the values of each covariate in ``size`` populations, (size, 1).
 
     The values of a stated condition are those of N specimens, (size, N). With ``has_runs`` numbers
@@ -341,7 +343,7 @@ def covariate_values(
     return values
 
 
-def points_by_group(inputs: Inputs, points: dict[str, Floats]) -> list[dict[str, Floats]]:
+def points_by_group(inputs: Inputs, points: NamedArrays) -> list[NamedArrays]:
     """Return the variables of the populations of each group, or the only ones without groups."""
     if inputs.groups is None:
         return [points]
@@ -363,7 +365,7 @@ def _refuse_outside(
         )
 
 
-def _by_name(inputs: Inputs, conditions: Floats | None) -> dict[str, Floats]:
+def _by_name(inputs: Inputs, conditions: Floats | None) -> NamedArrays:
     """Return the values of conditions that are inputs, (N, C), by name."""
     if conditions is None:
         return {}
@@ -406,7 +408,7 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
 
 def populations_of(
     result: Any, model: pm.Model, draws: int, caller: str, copies: int = 1
-) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
+) -> tuple[NamedArrays, dict[str, NDArray[Any]]]:
     """Return variables, (k, *shape), at evenly thinned draws, and the coordinates of the draws.
 
     These are the free variables, and those that `pymc.do` or `pymc.observe` fixed. An optimum has
@@ -450,7 +452,7 @@ def thetas_of(result: Any, evaluator: Evaluator, draws: int, caller: str) -> Flo
     return evaluator.hyperparameters.thetas_of(values)
 
 
-def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:
+def width_of_epsilon(result: Any, model: pm.Model | None) -> Findings:
     """Report draws whose width is that of epsilon, from any sampler.
 
     Draws of a bootstrap, and of log-likelihoods with their default epsilon, are not reported.
@@ -496,7 +498,7 @@ class _Predicted:
 def _predicted(
     simulator: PopulationSimulator | None,
     responses: Responses,
-    points: dict[str, Floats],
+    points: NamedArrays,
     n: int,
     rng: np.random.Generator,
     conditions: Floats | None,
@@ -613,7 +615,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
         spread = np.full(error.shape, np.nan)
         if is_finite.any():
             spread = flat[is_finite].std(axis=0)
-        share = float(np.max(error / np.where(spread > 0, spread, np.inf)))
+        share = float(np.max(error / positive_scale(spread, np.inf)))
         if share > 0.05:
             text = (
                 f"{label}: the interpolant between runs has an error of {share:.0%} of the "
@@ -626,7 +628,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
 
 def known_outputs(
     simulators: Sequence[PopulationSimulator],
-    response: Callable[..., Any],
+    response: Function,
     inputs: Inputs | None = None,
 ) -> Outputs | None:
     """Return the outputs of a simulator's response, or None if only a run can show them.
@@ -645,9 +647,7 @@ def _vectors(inputs: Inputs) -> list[list[float]]:
     return [x.ravel().tolist() for x in inputs.arguments if isinstance(x, np.ndarray)]
 
 
-def known_scatter(
-    simulators: Sequence[PopulationSimulator], response: Callable[..., Any]
-) -> float | None:
+def known_scatter(simulators: Sequence[PopulationSimulator], response: Function) -> float | None:
     """Return the scatter that a response may have; None if it is random in a simulator."""
     nodes = (node for node in simulators if node.responses.function is response)
     return None if any(node.responses.scatter is None for node in nodes) else 0.01
@@ -673,7 +673,7 @@ def serving(
 def _resampled_responses(
     node: Node,
     responses: Responses,
-    points: dict[str, Floats],
+    points: NamedArrays,
     n: int,
     rng: np.random.Generator,
 ) -> _Predicted:

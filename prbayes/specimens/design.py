@@ -7,15 +7,13 @@ runs, and points of the prior where a specimen could lie.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
-from prbayes._validate import Floats
+from prbayes._validate import ArrayFunction, Bools, Floats, Indices
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
@@ -30,9 +28,10 @@ from prbayes.specimens.points import (
     likely_scale,
     likely_weights,
     normal_of,
+    residuals_of,
     typical_specimens,
 )
-from prbayes.specimens.proposals import Normal, Proposals
+from prbayes.specimens.proposals import Normal, Proposals, best_rows
 from prbayes.specimens.weighted_points import fit_normal
 
 
@@ -47,7 +46,7 @@ def most_runs(dimensions: int) -> int:
 
 
 # Coordinates (n, d) -> outputs (n, m), NaN where there is no response.
-type Run = Callable[[Floats], Floats]
+type Run = ArrayFunction
 
 
 def first_emulation(run: Run, data: SpecimenData) -> Emulation:
@@ -67,9 +66,8 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
         z[:, column] = values
     y = run(z)
     while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
-        more = data.inner[
-            np.random.default_rng([data.seed, len(z)]).integers(0, len(data.inner), n)
-        ]
+        rng = np.random.default_rng([data.seed, len(z)])
+        more = data.inner[rng.integers(0, len(data.inner), n)]
         z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
     surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
     rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
@@ -123,7 +121,7 @@ class Likely:
 
     def sample(
         self, count: int, rng: np.random.Generator, weights: Floats | None = None
-    ) -> tuple[Floats, NDArray[np.intp]]:
+    ) -> tuple[Floats, Indices]:
         """Return likely inputs, (count, d), and their specimens, which repeat only beyond N."""
         weights = self.weights if weights is None else weights
         n = len(weights)
@@ -222,8 +220,7 @@ def sequential_design(
         likely = Likely.of(data, emulation, population, batches)
         population = likely.population
         is_complete = batches >= enough or len(emulation.z) >= most
-        is_open = likely.proposals.is_open()
-        can_correct = not is_open and most_corrections(*data.known.shape) and likely.is_known()
+        can_correct = may_correct(data, likely) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it matters less, because the inputs are not known well.
         is_last = further >= (1 if has_fewer_readings else 2) or len(emulation.z) >= most
@@ -244,23 +241,31 @@ def sequential_design(
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
-                is_good = bool(may_be_rough) or len(emulation.z) >= most
+                is_good = may_be_rough or len(emulation.z) >= most
             if is_good:
                 return emulation, plausible.of_emulation(data, emulation)
         if len(emulation.z) >= most:
-            if not likely.proposals.is_open() and most_corrections(*data.known.shape):
+            if may_correct(data, likely):
                 emulation = corrected(run, data, emulation, population)
             if emulation.bias > data.options.bias:
                 require_accurate(data, emulation, likely)
             return emulation, Plausible.of(data, emulation, wider(population))
-        # A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and
-        # at most three times the first runs.
-        share = 2 if emulation.bias > 3 * data.options.bias else 4
-        growth = min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
-        count = max(data.options.sampled + 2, growth if previous is None else 0)
+        count = data.options.sampled + 2
+        if previous is None:
+            count = max(count, batch_size(data, emulation))
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def batch_size(data: SpecimenData, emulation: Emulation) -> int:
+    """Return the number of runs by which an emulation of no other data grows.
+
+    A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and at
+    most three times the first runs.
+    """
+    share = 2 if emulation.bias > 3 * data.options.bias else 4
+    return min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
 
 
 def wider(population: Normal) -> Normal:
@@ -312,7 +317,7 @@ def joined(
     emulation: Emulation,
     likely: Likely,
     sampled: Floats,
-    specimens: NDArray[np.intp],
+    specimens: Indices,
     possible: Floats,
     distant: Floats,
 ) -> Emulation:
@@ -322,18 +327,15 @@ def joined(
     a coarser error is allowed.
     """
     fresh = np.concatenate([sampled, possible, distant])
-    is_new = _is_new(emulation.z, fresh, likely.scale(data))
-    outputs, misfit = _compared(run, emulation, fresh, is_new)
+    grown, misfit, is_new = _compared(run, emulation, fresh, likely.scale(data))
     at_sampled, at_possible, _ = np.split(misfit, [len(sampled), len(sampled) + len(possible)])
     error, bias = error_and_bias(data, emulation, likely, sampled, specimens, at_sampled)
     bias = max(bias, _bias_of_possible(data, at_possible))
-    z, y = np.concatenate([emulation.z, fresh[is_new]]), np.concatenate([emulation.y, outputs])
-    rows = _near_population(data, z, likely.population)
-    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
+    grown, left_out = _refitted(data, grown, likely.population)
     if np.isfinite(bias):
         at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
         error = _improved(data, error, at_sampled)
-    return _with_bias_at_ends(data, Emulation(z, y, surface, error, bias), likely)
+    return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
 def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
@@ -350,7 +352,7 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
     return np.asarray(np.maximum(np.minimum(error, improved), floor))
 
 
-def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
+def _is_new(runs: Floats, z: Floats, scale: Floats) -> Bools:
     """Return which points (k, d) coincide with no run and with no earlier point, (k,)."""
     cells = np.round(np.concatenate([runs, z]) / (1e-4 * scale))
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -360,17 +362,30 @@ def _is_new(runs: Floats, z: Floats, scale: Floats) -> NDArray[np.bool_]:
 
 
 def _compared(
-    run: Run, emulation: Emulation, z: Floats, is_new: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
-    """Return outputs at new points, and the emulator's misfits, (k, m): zero at old points."""
+    run: Run, emulation: Emulation, z: Floats, scale: Floats
+) -> tuple[Emulation, Floats, Bools]:
+    """Return the emulation with runs at points, its misfits there, (k, m), and which are new, (k,).
+
+    Misfits are zero at old points. The surface is not fitted again.
+    """
+    is_new = _is_new(emulation.z, z, scale)
     misfit = np.zeros((len(z), emulation.y.shape[1]))
     outputs = run(z[is_new]) if is_new.any() else misfit[:0]
     misfit[is_new] = outputs - emulation.surface.values(z[is_new])
-    return outputs, misfit
+    return emulation.with_runs(z[is_new], outputs), misfit, is_new
 
 
-def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) -> float:
-    """Return misfits (n, m) at possible inputs as a bias that is too large above ``largest``.
+def _refitted(
+    data: SpecimenData, emulation: Emulation, population: Normal
+) -> tuple[Emulation, Floats]:
+    """Return the emulation with a surface through all of its runs, and left-out errors, (n, m)."""
+    z, y, rows = emulation.z, emulation.y, _near_population(data, emulation.z, population)
+    surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
+    return replace(emulation, surface=surface, offsets=None), left_out
+
+
+def _bias_of_possible(data: SpecimenData, misfit: Floats) -> float:
+    """Return misfits (n, m) at possible inputs as a bias that is too large above .1.
 
     The limit is in units of the data's spread and the readings' errors.
     """
@@ -380,7 +395,7 @@ def _bias_of_possible(data: SpecimenData, misfit: Floats, largest: float = 0.1) 
     scaled = np.clip(scaled[np.isfinite(scaled).all(axis=1)], -3.0, 3.0)
     if not len(scaled):
         return 0.0
-    return float(data.options.bias / largest * np.sqrt((scaled**2).mean(axis=0).max()))
+    return float(data.options.bias / 0.1 * np.sqrt((scaled**2).mean(axis=0).max()))
 
 
 def error_and_bias(
@@ -388,7 +403,7 @@ def error_and_bias(
     emulation: Emulation,
     likely: Likely,
     z: Floats,
-    specimens: NDArray[np.intp],
+    specimens: Indices,
     misfit: Floats,
 ) -> tuple[Floats, float]:
     """Return the error of the emulator, (m,), and the bias that it causes, from misfits (n, m)."""
@@ -400,7 +415,7 @@ def error_and_bias(
         2 * np.sqrt((misfit**2).mean(axis=0)), data.options.floor * data.readings.spread()
     )
     measured = replace(emulation, error=error)
-    residuals = data.residuals(measured, likely.population)
+    residuals = residuals_of(data, measured, likely.population)
     a = residuals.whitened(z)
     _, slopes = residuals.errors(specimens, a)
     sd = data.readings.comparison_sd(error)[specimens]
@@ -423,19 +438,17 @@ def error_and_bias(
     return error, float(max(bias, narrowing))
 
 
-def _with_bias_at_ends(
-    data: SpecimenData, emulation: Emulation, likely: Likely, largest: float = 0.1
-) -> Emulation:
+def _with_bias_at_ends(data: SpecimenData, emulation: Emulation, likely: Likely) -> Emulation:
     """Return the emulation with the bias of specimens near an end of the range of their inputs.
 
     A density may be infinite at the end, so that the error of an input is compared with its
-    distance from the end. The bias is too large above a share ``largest``.
+    distance from the end. The bias is too large above a share of .1.
     """
     if data.ends is None or np.isinf(data.ends).all():
         return emulation
     z = likely.best()
     share = shares_of_distance(data, emulation.error, z, emulation(z)[1])
-    at_ends = data.options.bias / largest * np.sqrt((share**2).mean(axis=0).max())
+    at_ends = data.options.bias / 0.1 * np.sqrt((share**2).mean(axis=0).max())
     return replace(emulation, bias=max(emulation.bias, float(at_ends)))
 
 
@@ -471,9 +484,7 @@ def shares_of_distance(
     return np.asarray(np.nan_to_num(np.clip(share, 0.0, 3.0)))
 
 
-def _near_population(
-    data: SpecimenData, z: Floats, population: Normal, far: float = 6.0
-) -> NDArray[np.bool_]:
+def _near_population(data: SpecimenData, z: Floats, population: Normal) -> Bools:
     """Return which runs are near a population, (n,), at least twice those of the first batch.
 
     A response that oscillates in the tails of a vague prior needs short lengths there alone.
@@ -481,7 +492,7 @@ def _near_population(
     a = np.linalg.solve(population.root, (z[:, data.free] - population.mean).T)
     distance = (a**2).sum(axis=0)
     least = 2 * first_runs(z.shape[1])
-    limit = max(far**2, float(np.sort(distance)[min(least, len(z)) - 1]))
+    limit = max(6.0**2, float(np.sort(distance)[min(least, len(z)) - 1]))
     return np.asarray(distance <= limit)
 
 
@@ -537,44 +548,42 @@ def audited(
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
     z = np.concatenate([sampled, candidates[rows], possible])
-    is_new = _is_new(emulation.z, z, likely.scale(data))
-    outputs, misfit = _compared(run, emulation, z, is_new)
+    grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
     weighted = np.sqrt(2 * stratum)[:, None] * at_audited
     audited_z = z[: len(specimens)]
     error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
-    bias = max(bias, _bias_of_possible(data, at_possible))
-    all_z, all_y = np.concatenate([emulation.z, z[is_new]]), np.concatenate([emulation.y, outputs])
-    bias = max(bias, emulation.bias)
+    bias = max(bias, _bias_of_possible(data, at_possible), emulation.bias)
     pooled = data.readings.relative_error
     if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
         # Eight runs may miss the places where the emulator is wrong, so that the new error is the
         # geometric mean of the stated and the measured one.
         measured = np.sqrt(((error / emulation.error) ** 2).mean())
         error = np.sqrt(min(measured, 1.0)) * emulation.error
-        emulation = replace(emulation, z=all_z, y=all_y, error=error, bias=bias)
-        return _with_bias_at_ends(data, emulation, likely)
-    used = _near_population(data, all_z, likely.population)
-    surface, left_out, _ = fit_surface(
-        all_z, all_y, data.readings, data.name, emulation.surface, used
-    )
+        return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
+    grown, left_out = _refitted(data, grown, likely.population)
     if bias <= 1.5 * data.options.bias:
         at_audited = left_out[len(emulation.z) :][: is_new[: len(specimens)].sum()]
         error = _improved(data, error, at_audited)
     else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)
-    return _with_bias_at_ends(data, Emulation(all_z, all_y, surface, error, bias), likely)
+    return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
-def is_rough(data: SpecimenData, emulation: Emulation, largest: float = 0.03) -> bool:
+def is_rough(data: SpecimenData, emulation: Emulation) -> bool:
     """Return whether the emulator's error is not small beside the scatter of the readings."""
-    return bool((data.readings.relative_error(emulation.error) > largest).any())
+    return bool((data.readings.relative_error(emulation.error) > 0.03).any())
 
 
 def most_corrections(specimens: int, dimensions: int) -> int:
     """Return the largest number of runs of corrections: three a specimen, none for many."""
     return 3 * specimens if 2 * specimens <= most_runs(dimensions) else 0
+
+
+def may_correct(data: SpecimenData, likely: Likely) -> bool:
+    """Return whether the readings determine the inputs of the specimens, and these are not many."""
+    return not likely.proposals.is_open() and most_corrections(*data.known.shape) > 0
 
 
 def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: Normal) -> Emulation:
@@ -593,17 +602,14 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         modes = likely.proposals.modes
         if seed == 0 and not likely.is_known():
             return uncorrected
-        order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
-        rows = order[np.unique(modes.specimen[order], return_index=True)[1]]
+        rows = best_rows(modes.specimen, modes.misfit + 0.05 * (modes.a**2).sum(axis=1))
         z = residuals.coordinates(modes.specimen[rows], modes.a[rows])
         outputs = run(z)
-        emulated = emulation.surface.values(z)
-        misfit = outputs - emulated - offsets[modes.specimen[rows]]
+        misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
         offsets[modes.specimen[rows]] += np.nan_to_num(misfit)
-        all_z, all_y = np.concatenate([emulation.z, z]), np.concatenate([emulation.y, outputs])
         error, bias = error_and_bias(data, emulation, likely, z, modes.specimen[rows], misfit)
         emulation = replace(
-            emulation, z=all_z, y=all_y, error=error, bias=bias, offsets=offsets.copy()
+            emulation.with_runs(z, outputs), error=error, bias=bias, offsets=offsets.copy()
         )
         if seed and not is_rough(data, emulation):
             break

@@ -5,21 +5,19 @@ No guard detects an error of the emulator that is smooth between the runs which 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.emulator import Emulator, fit_emulator
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 
-type Columns = NDArray[np.intp] | None
+type Columns = Indices | None
 
 
 class Surface(Protocol):
@@ -74,7 +72,7 @@ class CompressedSurface:
 class DifferencedResponse:
     """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
 
-    values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
+    values: ArrayFunction  # coordinates (k, d) -> outputs (k, m)
     step: float = 1e-5  # step of the differences, in units of the coordinates
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
@@ -123,6 +121,10 @@ class Emulation:
             return self.ends
         return np.stack([self.z.min(axis=0), self.z.max(axis=0)])
 
+    def with_runs(self, z: Floats, y: Floats) -> Emulation:
+        """Return the emulation with more runs, (k, d) and (k, m), and the same surface."""
+        return replace(self, z=np.concatenate([self.z, z]), y=np.concatenate([self.y, y]))
+
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
         values, jacobian = self.surface(z, columns)
@@ -137,15 +139,15 @@ class Emulation:
         values[self.fails(z)] = np.nan
         return values
 
-    def fails(self, z: Floats) -> NDArray[np.bool_]:
+    def fails(self, z: Floats) -> Bools:
         """Return where the nearest run has no finite response."""
         return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
 
-    def is_missing(self, z: Floats) -> NDArray[np.bool_]:
+    def is_missing(self, z: Floats) -> Bools:
         """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
         return self._of_nearest(np.isnan(self.y).any(axis=1), z)
 
-    def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
+    def _of_nearest(self, of_runs: Bools, z: Floats) -> Bools:
         """Return a property of the nearest run of each point."""
         if not of_runs.any():
             return np.zeros(len(z), dtype=bool)
@@ -169,8 +171,8 @@ def fit_surface(
     readings: Readings,
     name: str,
     previous: Any = None,
-    used: NDArray[np.bool_] | None = None,
-) -> tuple[CompressedSurface, Floats, NDArray[np.bool_]]:
+    used: Bools | None = None,
+) -> tuple[CompressedSurface, Floats, Bools]:
     """Return the emulator, left-out errors, (n, m), and which runs are near the data, (n,).
 
     Runs that are not ``used``, (n,), or without a response have NaN as their error. Runs that are
@@ -204,7 +206,7 @@ def fit_surface(
     return surface, left_out, is_near
 
 
-def near_readings(y: Floats, readings: Readings) -> NDArray[np.bool_]:
+def near_readings(y: Floats, readings: Readings) -> Bools:
     """Return which outputs (n, m) are within the range of the readings, or half of it away.
 
     If these are less than a quarter, the nearest quarter, and at least eight.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._finding import any_of
-from prbayes._stats import log_sum_exp
+from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.mixtures import normalised_weights
@@ -107,7 +107,7 @@ def points_by_mode(points: SpecimenPoints, modes: Modes) -> SpecimenPoints:
     weights = np.exp(points.log_a - np.where(np.isfinite(largest), largest, 0.0))
     of_mode = (slot[:, None] == np.arange(modes.table.shape[1])[:, None]) * weights[:, None]
     total = of_mode.sum(axis=2)
-    of_mode /= np.where(total > 0, total, 1.0)[:, :, None]
+    of_mode /= positive_scale(total)[:, :, None]
     with np.errstate(divide="ignore"):
         log_a = np.log(total) + largest
     mode = first[:, None] + np.arange(total.shape[1])
@@ -145,7 +145,7 @@ def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
     mean = sample.mean(axis=0)
     covariance = np.atleast_2d(np.cov(sample.T)) * inflation**2
     sd = np.sqrt(np.diagonal(covariance))
-    sd = np.where(sd > 0, sd, 1.0)
+    sd = positive_scale(sd)
     correlation = covariance / np.outer(sd, sd) + 1e-10 * np.eye(len(sd))
     return Normal(mean, sd[:, None] * np.linalg.cholesky(correlation))
 
@@ -206,35 +206,36 @@ class SpecimenData:
         order = np.argsort(np.abs((z - middle) / width).max(axis=1), kind="stable")
         return self.prior[order[: int(0.95 * len(order))]]
 
-    def residuals(self, emulation: Emulation, population: Normal) -> Residuals:
-        """Return the residuals of an emulator's outputs."""
-        readings, is_read = self.readings, self.readings.is_measured
-        relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
-        error = np.where(readings.is_relative, 0.0, readings.error)
-        error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
-        target = np.where(is_read, readings.values, 0.0)
-        if emulation.offsets is not None:
-            target = target - emulation.offsets
-        of_emulator = np.broadcast_to(emulation.error, target.shape)
-        columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
-        if 2 * count <= is_read.shape[1]:
-            columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
-            target, of_emulator, error, relative = (
-                np.take_along_axis(values, columns, axis=1)
-                for values in (target, of_emulator, error, relative)
-            )
-        return Residuals(
-            emulation,
-            target,
-            of_emulator,
-            error,
-            relative,
-            population,
-            self.known,
-            self.box,
-            self.order,
-            columns,
+
+def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -> Residuals:
+    """Return the residuals of an emulator's outputs."""
+    readings, is_read = data.readings, data.readings.is_measured
+    relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
+    error = np.where(readings.is_relative, 0.0, readings.error)
+    error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
+    target = np.where(is_read, readings.values, 0.0)
+    if emulation.offsets is not None:
+        target = target - emulation.offsets
+    of_emulator = np.broadcast_to(emulation.error, target.shape)
+    columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
+    if 2 * count <= is_read.shape[1]:
+        columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
+        target, of_emulator, error, relative = (
+            np.take_along_axis(values, columns, axis=1)
+            for values in (target, of_emulator, error, relative)
         )
+    return Residuals(
+        emulation,
+        target,
+        of_emulator,
+        error,
+        relative,
+        population,
+        data.known,
+        data.box,
+        data.order,
+        columns,
+    )
 
 
 def fit_proposals(
@@ -249,7 +250,7 @@ def fit_proposals(
     nearer to the specimen's readings than those of their neighbours; or at the modes of an
     ``earlier`` emulator in the same population.
     """
-    residuals = data.residuals(emulation, population)
+    residuals = residuals_of(data, emulation, population)
     # Candidates are not chosen by an output that a reading error dominates.
     target = np.where(data.readings.is_measured, data.readings.values, 0.0)
     if emulation.offsets is not None:
@@ -555,16 +556,16 @@ def _half_difference(
     return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf, np.inf)
 
 
-def typical_specimens(modes: Modes, n: int, far: float = 5.0, largest: float = 50.0) -> Bools:
+def typical_specimens(modes: Modes, n: int) -> Bools:
     """Return which specimens have no gross error, (n,), by the best mode of each.
 
-    An outlier is ``far`` robust standard deviations from the median, or no inputs reproduce it.
+    An outlier is five robust standard deviations from the median, or no inputs reproduce it.
     """
     best = modes.rows(best_rows(modes.specimen, modes.misfit))
     specimens, a, misfit = best.specimen, best.a, best.misfit
     away = np.abs(a - np.median(a, axis=0))
     sd = 1.4826 * np.median(away, axis=0)
-    is_outlier = (away > far * np.where(sd > 0, sd, np.inf)).any(axis=1) | (misfit > largest)
+    is_outlier = (away > 5.0 * positive_scale(sd, np.inf)).any(axis=1) | (misfit > 50.0)
     typical = np.ones(n, dtype=bool)
     if 2 * is_outlier.sum() < len(specimens):
         typical[specimens[is_outlier]] = False

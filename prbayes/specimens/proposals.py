@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ndtri, stdtrit
 
-from prbayes._stats import log_sum_exp
+from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.numerics.points import lattice, sobol
 from prbayes.numerics.threads import one_thread
@@ -554,7 +554,7 @@ def mixing_weights(modes: Modes, mass: Floats) -> Floats:
     """
     total = np.bincount(modes.specimen, mass)[modes.specimen]
     count = np.bincount(modes.specimen)[modes.specimen]
-    by_mass = np.where(total > 0, mass / np.where(total > 0, total, 1.0), 1 / count)
+    by_mass = np.where(total > 0, mass / positive_scale(total), 1 / count)
     return 0.9 * by_mass + 0.1 / count
 
 

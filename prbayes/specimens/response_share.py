@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import logsumexp, stdtrit
 
 from prbayes._finding import any_of
-from prbayes._validate import Floats
+from prbayes._validate import ArrayFunction, Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity
@@ -61,7 +61,7 @@ class ResponseShare:
 
 
 def response_share(
-    run: Callable[[Floats], Floats],
+    run: ArrayFunction,
     data: SpecimenData,
     emulation: Emulation,
     posterior: Callable[[ResponseShare | None], Any],

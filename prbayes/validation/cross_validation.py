@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from prbayes._display import Table, View
 from prbayes._finding import counted
 from prbayes._progress import shown
-from prbayes._stats import finite_sample, quantile
+from prbayes._stats import finite_sample, positive_scale, quantile
 from prbayes._validate import (
     Bools,
     Floats,
@@ -280,7 +280,7 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
         weights = weights / np.bincount(numbers)[rows]  # so that a specimen counts once
         logs = by_name[likelihood.measurements[-1].name][:, rows]
         if measurement.weights is not None:
-            factors = np.where(measurement.weights > 0, measurement.weights, 1.0)
+            factors = positive_scale(measurement.weights)
             logs = logs / factors[simulator.rows]
         total = weights.sum(axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):

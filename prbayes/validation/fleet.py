@@ -19,6 +19,7 @@ from prbayes._stats import reached
 from prbayes._validate import (
     Floats,
     Indices,
+    NamedArrays,
     Seed,
     Shape,
     called,
@@ -217,7 +218,7 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         )
 
 
-def _read_data(data: object, name: str, minimum: int, event: Shape) -> dict[str, Floats]:
+def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArrays:
     """Return the measured responses of each product, or raise."""
     if not isinstance(data, Mapping) or not data:
         raise TypeError(
@@ -293,7 +294,7 @@ class Fleet:
         areas = (test.statistic, test.critical_value, test.p_value)
         return Calibration(values, pareto_k, areas, finding)
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[dict[str, Floats], float]:
+    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float]:
         """Return draws of the hyperparameters, and Pareto k of importance sampling."""
         variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
         posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
@@ -345,7 +346,7 @@ class SpecimenFleet(Fleet):
         first = sum(sizes[: names.index(name)])
         return np.arange(first, first + len(self.observed[name]))
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[dict[str, Floats], float]:
+    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float]:
         """Return draws of the hyperparameters, and Pareto k of importance sampling."""
         # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)

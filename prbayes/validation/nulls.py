@@ -12,7 +12,6 @@ from concurrent.futures import Executor
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cache
 from importlib.resources import files
-from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +22,7 @@ from prbayes._validate import (
     AT_ONCE,
     Floats,
     Indices,
+    StrPath,
     called,
     positive_integer,
     positive_number,
@@ -390,7 +390,7 @@ class JointNull(Null):
     )
     replicates: int = 999
     executor: Executor | None = field(default=None, repr=False)
-    store: str | PathLike[str] | None = field(default=None, repr=False)
+    store: StrPath | None = field(default=None, repr=False)
     version: str | None = field(default=None, repr=False)
     random_seed: int = 0
 

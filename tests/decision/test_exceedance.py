@@ -20,8 +20,8 @@ from prbayes._validate import Floats
 from prbayes.decision.exceedance import rare_event, weighted_share
 from prbayes.decision.populations import (
     InverseTransform,
-    ResponseSample,
     probability_bounds,
+    share_error,
 )
 from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.response.inputs import read_inputs
@@ -98,7 +98,7 @@ def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
         emulated=lambda points: [],
         points=[],
     )
-    error = ResponseSample.share_error(sample, lambda y: y[:, None] > np.array([42.0, -1.0, 64.0]))
+    error = share_error(sample, lambda y: y[:, None] > np.array([42.0, -1.0, 64.0]))
     means = [(values[blocks == b] > 42).mean() for b in range(8)]
     # Of all points, and of none: one over their number.
     np.testing.assert_allclose(error, [np.std(means, ddof=1) / np.sqrt(8), 1 / 64, 1 / 64])

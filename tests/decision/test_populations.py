@@ -14,7 +14,12 @@ from decisions import OBSERVED, doubled, normal, optimum, posterior, same
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes.decision.populations import InverseTransform, Populations, output_column
+from prbayes.decision.populations import (
+    InverseTransform,
+    Populations,
+    checked_quantity,
+    output_column,
+)
 from prbayes.response.inputs import read_inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
@@ -47,7 +52,7 @@ def test_a_tail_of_few_points_is_reported_and_one_of_none_refused() -> None:
 
     def findings(response: Any, quantity: Any, **options: Any) -> Any:
         sample = found.sample(response, (x,), None)
-        return sample.checked_quantity(quantity(response, x, **options))[0]
+        return checked_quantity(sample, quantity(response, x, **options))[0]
 
     def scattered(x: Any) -> Any:
         return np.sin(1e4 * x)
@@ -88,7 +93,7 @@ def test_quantities_have_the_error_of_their_computation() -> None:
         ),
     ):
         (value,) = sample.evaluate(quantity.of, found.center[None])
-        _, error = sample.checked_quantity(quantity)
+        _, error = checked_quantity(sample, quantity)
         assert abs(value - expected) < 3 * error < 1.5
 
 
@@ -108,8 +113,8 @@ def test_lost_responses_are_refused() -> None:
         found.sample(lambda x: np.where(x > 1.0, np.nan, x), (x,), None)
     broken = found.sample(lambda x: np.where(x > 1.0, np.inf, x), (x,), None)
     with pytest.raises(ValueError, match=r"got specimens that failed \(\+inf\)"):
-        broken.checked_quantity(prb.decision.Mean(same, x))
-    broken.checked_quantity(prb.decision.Exceedance(same, x, limit=1.0))
+        checked_quantity(broken, prb.decision.Mean(same, x))
+    checked_quantity(broken, prb.decision.Exceedance(same, x, limit=1.0))
 
 
 def test_an_output_is_found_by_label_or_name() -> None:

@@ -13,7 +13,7 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.model.data_checks import check_failing_region
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.propagation.base import DesignError, responding_weights
 
 OBSERVED = np.random.default_rng(5).normal(10, 2, 40)  # mean 9.356, sd 1.648, from 6.54
@@ -73,14 +73,14 @@ def test_metrics_compare_the_specimens_with_a_response(metric: Any, propagation:
     evaluated = evaluator.discrepancies(thetas, 0)
     np.testing.assert_allclose(evaluated, expected, rtol=1e-9)
     if metric.symbolic:
-        graph = evaluator.objective(prior=False, gradient=False)
+        graph = compiled_objective(evaluator, prior=False, gradient=False)
         compiled = [graph(theta, np.ones(1))[0] for theta in thetas]
         np.testing.assert_allclose(compiled, expected, rtol=1e-9)
 
 
 def test_gradients_with_a_failing_region_are_those_of_differences() -> None:
     evaluator = Evaluator.of(model(7.0, prb.KullbackLeibler()))
-    objective = evaluator.objective(prior=False, gradient=True)
+    objective = compiled_objective(evaluator, prior=False, gradient=True)
     theta = np.array([9.3, 0.6])
     steps = 1e-5 * np.eye(2)
     upper, lower = (evaluator.discrepancies(theta + s * steps, 0) for s in (1, -1))

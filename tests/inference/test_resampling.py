@@ -24,7 +24,7 @@ from prbayes.inference.resampling import (
     siblings,
     simulated_sets,
 )
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.model.simulator_with_data import number_specimens
 from prbayes.numerics.derivatives import differences
 from prbayes.propagation.reweighted import designs_restored, same_points
@@ -336,13 +336,13 @@ def test_observing_is_the_model_of_other_data(name: str) -> None:
     assert other.n_responses == evaluator.n_responses == 256
     scales = np.array([0.3])
     value, gradient, _ = differences(lambda t: other.total(t, scales), np.full(2, 1e-4))(thetas[0])
-    exact, slope = built.objective(prior=False, gradient=True)(thetas[0], scales)
-    values = [value, *other.objective(prior=False, gradient=False)(thetas[0], scales)]
+    exact, slope = compiled_objective(built, prior=False, gradient=True)(thetas[0], scales)
+    values = [value, *compiled_objective(other, prior=False, gradient=False)(thetas[0], scales)]
     np.testing.assert_allclose(values, exact)
     np.testing.assert_allclose(gradient, slope, rtol=1e-3, atol=1e-3 * np.abs(slope).max())
     for prior, slopes in ((True, False), (False, True)):
         with pytest.raises(NotImplementedError):
-            other.objective(prior=prior, gradient=slopes)
+            compiled_objective(other, prior=prior, gradient=slopes)
     # Another number of observations drops the weights.
     fewer = evaluator.observing({"y": OBSERVED[:10]})
     np.testing.assert_allclose(fewer.nodes[0].target.weights, 0.1)
@@ -367,7 +367,7 @@ def test_batches_added_inside_are_undone() -> None:
     for key, value in evaluator.support(thetas)["y"].items():
         np.testing.assert_array_equal(value, support[key])
     # So is the graph that PyMC's samplers evaluate.
-    graph = evaluator.objective(prior=False, gradient=False)(thetas[0], np.ones(1))[0]
+    graph = compiled_objective(evaluator, prior=False, gradient=False)(thetas[0], np.ones(1))[0]
     np.testing.assert_allclose(graph, before[0, 0], rtol=1e-10)
     # Two designs of equal size are two designs: nothing of the first remains in the second.
     fresh = build(KL, sd=None)

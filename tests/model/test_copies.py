@@ -13,6 +13,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
+from prbayes.model.parameters import unconstrained
 
 Y = 2 * np.random.default_rng(0).normal(1.0, 0.3, 25)
 COPIES = [pm.do, pm.observe]
@@ -39,7 +40,7 @@ def original(metric: prb.Metric | None = None, **options: Any) -> tuple[pm.Model
 def log_likelihood(model: pm.Model, **point: float) -> Floats:
     """Return the log-likelihoods at values of the free variables."""
     evaluator = Evaluator.of(model)
-    theta = evaluator.hyperparameters.unconstrained(point)
+    theta = unconstrained(evaluator.hyperparameters, point)
     return specimen_log_likelihoods(evaluator, theta[None])["y"][0]
 
 

@@ -25,10 +25,12 @@ from prbayes.model.evaluator import (
     Requirement,
     Shortcoming,
     coarser_evaluator,
+    compiled_objective,
     is_current,
     shortcoming,
     supports_each,
 )
+from prbayes.model.parameters import unconstrained
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
 
@@ -159,7 +161,7 @@ def test_epistemic_variables_data_and_constants(
     evaluator = Evaluator.of(model)
     slopes = (1.0, -0.5)
     points = [{"mu": 2.0, "sigma": 0.5, "slope": s} for s in slopes]
-    thetas = np.array([evaluator.hyperparameters.unconstrained(point) for point in points])
+    thetas = np.array([unconstrained(evaluator.hyperparameters, point) for point in points])
     for level_value in (3.0, 4.0):
         model.set_data("level", level_value)
         populations = evaluator.populations(thetas, 0)
@@ -351,7 +353,7 @@ def test_an_evaluator_of_other_data_has_a_pickle() -> None:
         back = pickle.loads(pickle.dumps(original))
         np.testing.assert_array_equal(back(thetas).discrepancies, original(thetas).discrepancies)
         values = [
-            e.objective(prior=False, gradient=False)(thetas[0], np.ones(1))
+            compiled_objective(e, prior=False, gradient=False)(thetas[0], np.ones(1))
             for e in (back, original)
         ]
         assert values[0] == values[1]

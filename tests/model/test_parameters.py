@@ -15,6 +15,7 @@ from prbayes.model.parameters import (
     element_names,
     finite_draws,
     fixed_points,
+    in_support,
     optimum_elements,
     readable_elements,
     readable_variables,
@@ -22,6 +23,8 @@ from prbayes.model.parameters import (
     split_elements,
     stacked_draws,
     table_elements,
+    unconstrained,
+    value_shapes,
     variable_of,
 )
 
@@ -41,7 +44,7 @@ def hyperparameters() -> Hyperparameters:
 def test_names_and_shapes(hyperparameters: Hyperparameters) -> None:
     assert hyperparameters.names == ["mu[0]", "mu[1]", "sigma_log__"]
     assert hyperparameters.readable_names == ["mu[0]", "mu[1]", "sigma"]
-    assert hyperparameters.shapes == {"mu": (2,), "sigma_log__": ()}
+    assert value_shapes(hyperparameters) == {"mu": (2,), "sigma_log__": ()}
     np.testing.assert_allclose(hyperparameters.initial, [1.0, 5.0, np.log(3.0)])
     assert hyperparameters.size == 3
     with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
@@ -59,7 +62,7 @@ def test_the_log_prior_has_the_jacobian(hyperparameters: Hyperparameters) -> Non
     np.testing.assert_allclose(hyperparameters.log_prior(THETAS), normal + half, rtol=1e-7)
     with pm.Model() as model:
         pm.Uniform("u", 0, 1, default_transform=None)
-    is_inside = Hyperparameters.of(model).in_support(np.array([[0.5], [-0.1], [1.1]]))
+    is_inside = in_support(Hyperparameters.of(model), np.array([[0.5], [-0.1], [1.1]]))
     np.testing.assert_array_equal(is_inside, [True, False, False])
 
 
@@ -71,7 +74,7 @@ def test_constrained_values_and_back(hyperparameters: Hyperparameters) -> None:
     back = hyperparameters.thetas_of([values["mu"], values["sigma"]])
     np.testing.assert_allclose(back, THETAS, rtol=1e-12)
     point = {"mu": values["mu"][1], "sigma": values["sigma"][1]}
-    np.testing.assert_allclose(hyperparameters.unconstrained(point), THETAS[1])
+    np.testing.assert_allclose(unconstrained(hyperparameters, point), THETAS[1])
     with pm.Model() as model:
         factor = pm.LKJCorr("factor", n=2, eta=2)
         pm.Deterministic("correlation", factor @ factor.T)
@@ -94,7 +97,7 @@ def test_invalid_points_are_refused(
     hyperparameters: Hyperparameters, point: dict[str, object], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        hyperparameters.unconstrained(point)
+        unconstrained(hyperparameters, point)
 
 
 def test_draws_of_the_prior(hyperparameters: Hyperparameters) -> None:

@@ -26,7 +26,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.model.random_variable import Node, SimulatorRV, has_default_epsilon, nodes
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
@@ -362,7 +362,7 @@ def test_an_unset_epsilon_is_reported_with_the_density(caplog: pytest.LogCapture
     with caplog.at_level("DEBUG", "prbayes"):
         model.logp()
     assert [r.levelname for r in caplog.records if r.message.startswith(text)] == ["DEBUG"]
-    Evaluator.of(model).objective(prior=False, gradient=True)
+    compiled_objective(Evaluator.of(model), prior=False, gradient=True)
 
 
 def test_an_unset_epsilon_ends_the_compilation_of_nutpie() -> None:

@@ -21,7 +21,8 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, epsilons
+from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import Node, simulators
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
@@ -63,7 +64,7 @@ def reference(name: str) -> dict[str, tuple[float, float]]:
     axes = np.meshgrid(np.linspace(1.5, 2.5, 41), np.linspace(-1, 0.4, 41))
     grid = np.stack(axes, -1).reshape(-1, 2)
     terms = evaluator(grid)
-    logs = terms.log_prior + terms.log_likelihood(evaluator.epsilon)
+    logs = terms.log_prior + terms.log_likelihood(epsilons(evaluator))
     w = np.exp(logs - logs.max())
     w /= w.sum()
     result = {}
@@ -414,7 +415,7 @@ def test_simulators_of_one_response_share_the_runs_of_a_population(
 
 def test_another_constant_is_another_run() -> None:
     evaluator = Evaluator.of(two_of_one(prb.Resimulated(64), second=3.0)[0])
-    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.5})[None]
+    theta = unconstrained(evaluator.hyperparameters, {"mu": 2.0, "sigma": 0.5})[None]
     populations = [evaluator.populations(theta, k) for k in range(2)]
     means = [(values * weights).sum() for values, weights in populations]
     assert means[1] == pytest.approx(3 * means[0], rel=1e-9)

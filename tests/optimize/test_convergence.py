@@ -12,7 +12,7 @@ from normal_problem import OBSERVED, best, model, normal_model, pair
 from scipy import stats
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.numerics.derivatives import differences
 from prbayes.optimize.convergence import (
     Fit,
@@ -66,7 +66,9 @@ def test_the_tolerance_is_that_of_the_standardised_gradient() -> None:
     counts = []
     for tolerance in (1e-1, 1e-6):
         optimum = prb.minimize(model(), start={"mu": -1.0, "sigma": 1.5}, tolerance=tolerance)
-        gradient = evaluator.objective(prior=False, gradient=True)(optimum.theta, np.ones(1))[1]
+        gradient = compiled_objective(evaluator, prior=False, gradient=True)(
+            optimum.theta, np.ones(1)
+        )[1]
         assert np.abs(gradient * prior_sd).max() / size <= tolerance
         counts.append(optimum.search.n_evaluations)
     assert counts == sorted(counts)
@@ -75,7 +77,7 @@ def test_the_tolerance_is_that_of_the_standardised_gradient() -> None:
 def test_exact_and_differenced_gradients_agree() -> None:
     evaluator, scales = Evaluator.of(model()), np.array([0.7])
     theta = np.array([0.4, -0.3])
-    exact = evaluator.objective(prior=False, gradient=True)(theta, scales)
+    exact = compiled_objective(evaluator, prior=False, gradient=True)(theta, scales)
     by_differences = differences(lambda t: evaluator.total(t, scales), np.array([2e-4, 1e-4]))
     value, gradient, cost = by_differences(theta)
     assert cost == 5
@@ -89,7 +91,7 @@ def test_batches_and_the_compiled_objective_agree_with_other_terms() -> None:
         pm.Potential("limit", -((observed["sigma"] - 1.0) ** 2))
     evaluator, scales = Evaluator.of(observed), np.array([0.7])
     theta = np.array([0.4, -0.3])
-    compiled = evaluator.objective(prior=False, gradient=False)(theta, scales)[0]
+    compiled = compiled_objective(evaluator, prior=False, gradient=False)(theta, scales)[0]
     np.testing.assert_allclose(evaluator.total(theta[None], scales), [compiled], rtol=1e-12)
     point = evaluator.hyperparameters.constrained(theta[None])
     mu, sigma = point["mu"][0], point["sigma"][0]

@@ -20,7 +20,8 @@ from scipy.stats import binom, norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
+from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import nodes
 from prbayes.optimize import minimize as minimization
 from prbayes.optimize.convergence import Fit, Result, Search
@@ -615,9 +616,9 @@ def test_a_gradient_that_is_nan_is_differenced() -> None:
         data = values[values > 0][:40]
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=data, propagation=R256)
     evaluator, scales = Evaluator.of(model), np.ones(1)
-    theta = evaluator.hyperparameters.unconstrained({"mu": 0.9, "w": 1.4, "sd": 0.5})
+    theta = unconstrained(evaluator.hyperparameters, {"mu": 0.9, "w": 1.4, "sd": 0.5})
     prior_sd = evaluator.hyperparameters.prior_sd
-    value, gradient = evaluator.objective(prior=False, gradient=True)(theta, scales)
+    value, gradient = compiled_objective(evaluator, prior=False, gradient=True)(theta, scales)
     assert np.isfinite(value)
     assert np.isnan(gradient).any()
     search = Search(evaluator, prior_sd, Minimisation(max_evaluations=100))

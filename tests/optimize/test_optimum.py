@@ -14,6 +14,7 @@ import pytest
 import prbayes as prb
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 from prbayes.optimize.convergence import OVERLAP, stored_overlap
 from prbayes.optimize.local_optima import LocalOptimum
 from prbayes.optimize.minimize import optimum_findings
@@ -89,7 +90,7 @@ def test_a_covariance_is_shown_as_standard_deviations_and_correlations() -> None
     assert lines[1] == f"cov_corr[0,1] = {r:.4g} ± {r_error:.4g}"
     # And so is a mirror solution.
     point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
-    theta = optimum.evaluator.hyperparameters.unconstrained(point)
+    theta = unconstrained(optimum.evaluator.hyperparameters, point)
     mirror = LocalOptimum(theta, 0.1, comparable=True, better=False)
     (finding,) = optimum_findings(optimum.evaluator, None, (mirror,), 0.0)
     expected = (
@@ -182,8 +183,8 @@ def test_a_population_far_from_all_data_is_known_by_its_overlap(
     metric: prb.Metric, propagation: Any, far: bool
 ) -> None:
     evaluator = Evaluator.of(_normal(metric, propagation))
-    there = evaluator.hyperparameters.unconstrained({"mu": 6.0, "sigma": 0.3})
-    here = evaluator.hyperparameters.unconstrained({"mu": 0.5, "sigma": 0.4})
+    there = unconstrained(evaluator.hyperparameters, {"mu": 6.0, "sigma": 0.3})
+    here = unconstrained(evaluator.hyperparameters, {"mu": 0.5, "sigma": 0.4})
     assert (stored_overlap(evaluator, there) < OVERLAP) is far
     assert stored_overlap(evaluator, here) > OVERLAP
 

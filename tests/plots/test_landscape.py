@@ -12,6 +12,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 from prbayes.plots.landscape import (
     check_optimum,
     distinct_texts,
@@ -117,7 +118,7 @@ def test_the_landscape_has_the_objective_at_its_places(optimum: prb.Optimum) -> 
     assert evaluator.n_responses == before
     s, m = found.axes
     for i, j in ((4, 4), (2, 7), (7, 3)):
-        theta = evaluator.hyperparameters.unconstrained({"mu": m[j], "sigma": s[i]})
+        theta = unconstrained(evaluator.hyperparameters, {"mu": m[j], "sigma": s[i]})
         height = evaluator(theta[None]).discrepancies[0, 0]
         assert found.heights[i, j] == pytest.approx(height)
     np.testing.assert_allclose(found.optimum, [[optimum.point["sigma"], optimum.point["mu"]]])

@@ -14,6 +14,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.margins import margins, select_margins
+from prbayes.model.parameters import unconstrained
 from prbayes.plots.population import margin_densities
 from prbayes.propagation.base import Propagation
 
@@ -106,7 +107,7 @@ def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> 
     with pytest.raises(KeyError, match=r"got nothing, expected some of \['load\[0\]'"):
         select_margins(known, ["nothing"])
     points = ({"mu": [1, 3], "size": 1.0}, {"mu": [1.2, 2.5], "size": 1.5})
-    thetas = np.array([evaluator.hyperparameters.unconstrained(point) for point in points])
+    thetas = np.array([unconstrained(evaluator.hyperparameters, point) for point in points])
     before = evaluator.n_responses
     found = margin_densities(evaluator, known, thetas)
     assert evaluator.n_responses == before
@@ -130,7 +131,7 @@ def test_margins_without_a_density_of_their_own_are_drawn() -> None:
         prb.Simulator("y", lambda x, n: x + n, x, n, propagation=prb.Fresh(50), **given)
     evaluator = Evaluator.of(model)
     found = margin_densities(
-        evaluator, margins(evaluator), evaluator.hyperparameters.unconstrained({"mu": 3.0})[None]
+        evaluator, margins(evaluator), unconstrained(evaluator.hyperparameters, {"mu": 3.0})[None]
     )
     grid, y = found["x"]
     np.testing.assert_allclose(y[0], stats.norm.pdf(grid, 3, 1), atol=0.06)

@@ -12,7 +12,7 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information
 from prbayes.metrics.density import Histogram
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.random_variable import has_default_epsilon, nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -274,6 +274,6 @@ def test_set_epsilon_scales_the_log_density() -> None:
     for epsilon in (0.1, 0.4):
         prb.set_epsilon(model, {"y": epsilon})
         expected = -evaluation.discrepancies[:, 0] / epsilon
-        log_likelihood = evaluation.log_likelihood(evaluator.epsilon)
+        log_likelihood = evaluation.log_likelihood(epsilons(evaluator))
         np.testing.assert_allclose(log_likelihood, expected, rtol=1e-12)
     assert evaluation.discrepancies[0, 0] > evaluation.discrepancies[1, 0] > 0

@@ -13,7 +13,8 @@ import pytest
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
+from prbayes.model.parameters import unconstrained
 from prbayes.propagation.importance import MixtureSampler
 from prbayes.propagation.moving_support import (
     averaged_log_density,
@@ -121,8 +122,8 @@ def test_a_discrete_support_that_moves_is_refused() -> None:
 @pytest.mark.parametrize("metric", METRICS, ids=of_kind)
 def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Metric) -> None:
     evaluator = Evaluator.of(uniform(metric))
-    theta = evaluator.hyperparameters.unconstrained({"start": 2.013, "width": 3.05})
-    _, gradient = evaluator.objective(prior=False, gradient=True)(theta, np.ones(1))
+    theta = unconstrained(evaluator.hyperparameters, {"start": 2.013, "width": 3.05})
+    _, gradient = compiled_objective(evaluator, prior=False, gradient=True)(theta, np.ones(1))
     assert np.abs(gradient).min() > 1e-3
     step = 1e-6
     for i, unit in enumerate(np.eye(2)):
@@ -207,7 +208,7 @@ def test_nuts_agrees_with_itself_and_with_smc() -> None:
 def test_the_weights_follow_the_design_when_it_grows() -> None:
     model = uniform(prb.AreaMetric(), prb.Reweighted(64))
     evaluator = Evaluator.of(model)
-    theta = evaluator.hyperparameters.unconstrained({"start": 2.0, "width": 3.0})[None]
+    theta = unconstrained(evaluator.hyperparameters, {"start": 2.0, "width": 3.0})[None]
     prb.refine(model, thetas=np.array([[2.0, np.log(3.0)]]))
     values, weights = evaluator.populations(theta, 0)
     assert float(weights[0] @ values[0]) == pytest.approx(3.5, abs=0.02)

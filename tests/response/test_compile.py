@@ -17,7 +17,7 @@ from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.subtensor import Subtensor
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.response import compile as compilation
 from prbayes.response.compile import (
     compile_batched,
@@ -230,7 +230,7 @@ def test_the_objective_of_other_data_is_not_compiled_again(
             prb.Simulator("y", np.positive, x, metric=metric, observed=y)
         evaluator = Evaluator.of(model)
         before = len(compilations)
-        value, _ = evaluator.objective(prior=False, gradient=True)(theta, scales)
+        value, _ = compiled_objective(evaluator, prior=False, gradient=True)(theta, scales)
         added.append(len(compilations) - before)
         np.testing.assert_allclose(value, evaluator.total(theta[None], scales)[0], rtol=1e-9)
     assert added == [1, 0]

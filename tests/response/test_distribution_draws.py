@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.distributions import CASES, Case
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, value_shapes
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.distributions import (
     PopulationSampler,
@@ -90,7 +90,7 @@ def _assert_prior(case: Case, h: Any, expected: Any, *, has_density: bool) -> No
     thetas = hyperparameters.thetas_of([draws[:2]])
     with interpreted():
         logp = model.compile_logp(mode="FAST_COMPILE")
-    ((value, shape),) = hyperparameters.shapes.items()
+    ((value, shape),) = value_shapes(hyperparameters).items()
     right = [logp({value: theta.reshape(shape)}) for theta in thetas]
     np.testing.assert_allclose(hyperparameters.log_prior(thetas), right, rtol=1e-6)
 

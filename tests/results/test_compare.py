@@ -12,6 +12,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import unconstrained
 
 DATA = np.random.default_rng(1).normal([1.0, 3.0], 0.5, (40, 2))
 AREA = prb.AreaMetric()
@@ -193,7 +194,7 @@ def test_scores_of_each_result_under_every_metric() -> None:
     # A metric that the model does not have, at the posterior mean.
     mean = {k: idata()["posterior"][k].mean(("chain", "draw")).values for k in ("mean", "sigma")}
     evaluator = optimum().evaluator
-    theta = evaluator.hyperparameters.unconstrained(mean)
+    theta = unconstrained(evaluator.hyperparameters, mean)
     expected = prb.ProbabilityResidual().against(DATA[:, 0])(*evaluator.populations(theta[None], 0))
     np.testing.assert_allclose(table["first ProbabilityResidual"].sel(result="ABC"), expected)
     few = prb.compare(results, model=model(), metrics=[prb.ProbabilityResidual(scale_base=1)])

@@ -350,7 +350,9 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     )
     tree = xr.DataTree.from_dict({"failures": failures})
     lost = {"y": share if np.isnan(value) else 0.0}
-    findings, harmless = _failure_findings(tree, lost, {"y": share if value == np.inf else 0.0})
+    failed = ("simulator", [share if value == np.inf else 0.0])
+    calibration = xr.Dataset({"failed_mass": failed}, coords={"simulator": ["y"]})
+    findings, harmless = _failure_findings(tree, calibration, lost)
     # A finite number in place of a failed response looks like any other.
     expected = ([], ["harmless-failures"]) if share < 0.1 and value else (["failed-responses"], [])
     assert ([f.code for f in findings], [f.code for f in harmless]) == expected

@@ -17,7 +17,7 @@ from prbayes.inference.asymptotics import (
     unidentified_directions,
 )
 from prbayes.model.evaluator import Evaluator, only_through_prior
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, value_shapes
 from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import cross
 from prbayes.response.discrepancy import has_discrepancy
@@ -142,7 +142,7 @@ def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indic
         return np.arange(0), np.arange(0)
     inputs, model = node.bound.inputs, evaluator.model
     *arguments, coefficients = range(len(inputs.arguments))
-    shapes = evaluator.hyperparameters.shapes.values()
+    shapes = value_shapes(evaluator.hyperparameters).values()
     sizes = [int(np.prod(shape, dtype=int)) for shape in shapes]
     above = []
     for numbers in ([coefficients], arguments):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._finding import Finding
-from prbayes._stats import quantile
+from prbayes._stats import positive_scale, quantile
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local, single_output_parts
 from prbayes.inference.checks.sample_size import elements_above
@@ -155,7 +155,7 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
     for outputs, members in parts.items():
         axes = np.array([p.projection.direction for p in members if p.projection is not None])
         size = np.abs(axes).max(axis=0)
-        size = np.where(size > 0, size, 1.0)
+        size = positive_scale(size)
         m = int(np.linalg.matrix_rank(axes / size))
         n = members[0].target.n_effective
         enough = sufficient_specimens(m)
@@ -195,7 +195,7 @@ def refit_bias(fitted: FittedSets) -> list[Finding]:
         return []
     center = fitted.sampling.thetas(fitted.center[None])[0]
     spread = thetas.std(axis=0)
-    spread = np.where(spread > 0, spread, np.inf)
+    spread = positive_scale(spread, np.inf)
     shift = (thetas.mean(axis=0) - center) / spread
     worst = int(np.abs(shift).argmax())
     # The standard error of the mean of 200 refits is .07 standard deviations.
@@ -252,7 +252,7 @@ def smoothing_bias(
         stderr = np.sqrt((axes**2).sum(axis=1))
         # The bias is proportional to the kernel's variance, so that half the width removes three
         # quarters of it.
-        bias = np.abs(shift) / np.where(stderr > 0, stderr, np.inf) / (3 / 4)
+        bias = np.abs(shift) / positive_scale(stderr, np.inf) / (3 / 4)
         # With a bias of half a standard error 89 % intervals cover 85 %.
         if bias.max() > 0.5:
             findings.append(_smoothing_finding(evaluator, k, bias))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
-from prbayes._finding import Finding
+from prbayes._finding import Finding, Findings
 from prbayes._stats import adjusted_p_values, upper_p_values
 from prbayes._validate import Floats
 from prbayes.model.emulated import EmulatedSimulator
@@ -130,7 +130,7 @@ def power_text(n: int, inputs: int = 1, outputs: int = 1) -> str:
 
 def population_findings(
     test: PopulationTest, labels: Sequence[str], threshold: float = 0.05
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return the finding ``population-misfit`` if the p-value is at most the threshold.
 
     The finding lists causes, because the best-fitting one is often wrong: skewness is taken for
@@ -148,7 +148,7 @@ def population_findings(
     return (Finding("population-misfit", text, "likelihood.md#population-misfit"),)
 
 
-def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
+def failing_region_findings(evaluator: Evaluator, theta: Floats) -> Findings:
     """Report populations in which at least .25 specimens are expected to have no response; no run.
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
@@ -179,7 +179,7 @@ def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Findin
     return tuple(findings)
 
 
-def replaced_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
+def replaced_findings(evaluator: Evaluator, theta: Floats) -> Findings:
     """Report populations that rest on finite numbers in place of responses that failed.
 
     The share is the weight of stored responses that were replaced. For the log-likelihood by

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._finding import Finding
+from prbayes._finding import Finding, Findings
 from prbayes._validate import Bools, Floats
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored
@@ -148,7 +148,7 @@ def conflict_findings(
     standard_error: Floats,
     posterior_mean: Floats,
     predictive: Floats,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return a finding ``prior-conflict`` of each hyperparameter in conflict.
 
     With a wide prior a conflict is certain to be seen and costs nothing (pulls of .1 to .6 standard
