@@ -179,7 +179,7 @@ def bad_values(name: str, annotation: str) -> tuple[Any, ...]:
     elif "int" in kinds or "float" in kinds:
         bad = COUNT if "int" in kinds else FLOAT
     else:
-        bad = (3, None) if "str" in kinds else (3, "a", None)
+        bad = (3, None) if {"str", "StrPath"} & set(kinds) else (3, "a", None)
     bad = (*bad, *BY_NAME.get(name, ()))
     return tuple(v for v in bad if v is not None or "None" not in annotation)
 

@@ -25,7 +25,7 @@ PRIOR_SD = np.array([2.0, 0.5])
 
 def nearby(local: Local | None, covariance: Any, ridge: Any = None) -> Any:
     """Return thetas around a fit at (1, -1) with a sampling distribution."""
-    hyperparameters = SimpleNamespace(prior_sd=PRIOR_SD, in_support=lambda t: np.ones(len(t), bool))
+    hyperparameters = SimpleNamespace(prior_sd=PRIOR_SD, log_prior=lambda t: np.zeros(len(t)))
     evaluator: Any = SimpleNamespace(hyperparameters=hyperparameters, reweighted={})
     sampling = None if local is None else SimpleNamespace(local=local)
     fit: Any = SimpleNamespace(
