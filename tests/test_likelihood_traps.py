@@ -756,7 +756,7 @@ def model_with_end(family: str, end: float, response: Any = np.positive, **given
 
 @pytest.mark.parametrize(
     ("family", "end"),
-    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("kumaraswamy", 1.0), ("gamma", 0.0)],
+    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("gamma", 0.0)],
 )
 def test_an_exact_reading_at_an_end_is_refused_by_its_row(family: str, end: float) -> None:
     with pytest.raises(prb.propagation.DesignError, match="exact reading of specimen 12 whose"):
@@ -802,7 +802,7 @@ def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None
         assert means[0] == pytest.approx(means[1], rel=0.02)
 
 
-@pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("weibull", 1e-7), ("gamma", 1e-7)])
+@pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("weibull", 1e-7), ("gamma", 1e-5)])
 def test_readings_as_small_as_the_error_of_the_emulator_are_reported(
     family: str, end: float, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -204,7 +204,7 @@ def find_modes(
     change = change if residuals.columns is None else change[residuals.columns]
     soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
     a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
-    a, value, e, slopes = _minimised(residuals, specimen, a, precision, 100, scale)
+    a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
     misfit = (e**2).sum(axis=1) / 2
     # Modes far from the reference population are kept, because another population may be likely.
     least = _lowest(specimen, np.where(np.isfinite(value), misfit, np.inf), n)
