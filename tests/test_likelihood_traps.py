@@ -756,7 +756,7 @@ def model_with_end(family: str, end: float, response: Any = np.positive, **given
 
 @pytest.mark.parametrize(
     ("family", "end"),
-    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("gamma", 0.0)],
+    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("kumaraswamy", 1.0), ("gamma", 0.0)],
 )
 def test_an_exact_reading_at_an_end_is_refused_by_its_row(family: str, end: float) -> None:
     with pytest.raises(prb.propagation.DesignError, match="exact reading of specimen 12 whose"):

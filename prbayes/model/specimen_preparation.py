@@ -352,6 +352,8 @@ def _end_findings(
     likelihood, coordinates = runs.likelihood, runs.likelihood.coordinates
     weights = likely_weights(data, points, normal_of(draws.specimens()[:, data.free]))
     z = points.z[np.arange(len(weights)), weights.argmax(axis=1)]
+    # Inputs at an end are moved inside, because slopes and densities are not defined there.
+    z = np.clip(z, coordinates.ends[0] + 1e-12, coordinates.ends[1] - 1e-12)
     is_log = coordinates.is_log & ~coordinates.is_condition
     scale = np.where(is_log, 1 / coordinates.half_width, np.inf)
     distance = np.minimum(np.min(np.abs(coordinates.ends[:, None] - z), axis=0), scale)
