@@ -336,3 +336,13 @@ def test_the_joint_null_rejects_data_that_the_family_cannot_follow() -> None:
     optimum = prb.minimize(model, starts=0)
     predicted = prb.predict(optimum, same, x, random_seed=1)
     assert prb.area_test(data, predicted, null=joint(optimum, 99)).rejected
+
+
+@pytest.mark.parametrize(("n", "replicates"), [(1000, 9999), (1001, 999)])
+def test_many_values_have_fewer_replicates_by_default(n: int, replicates: int) -> None:
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((20, 50))
+    observed = rng.standard_normal(n)
+    test = prb.area_test(observed, predicted, progressbar=False)
+    null = prb.validation.PosteriorNull(replicates)
+    assert test.p_value == prb.area_test(observed, predicted, null=null, progressbar=False).p_value
