@@ -161,19 +161,28 @@ _UNSUPPORTED = Finding(
 )
 
 
-def _supported(evaluator: Evaluator, optima: Sequence[Mode]) -> Bools:
-    """Return which optima have a log-likelihood with a Monte Carlo error of at most half a nat.
-
-    A larger error shows a spurious maximum: a population that is narrower than the distances
-    between points can have most of its density at a few points. With many specimens the limit is a
-    tenth of a nat for each, in quadrature. The error for rounded readings is .06 nats a specimen.
-    """
-    size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
-    largest = max(0.5, 0.1 * float(np.sqrt(size)))
+def _monte_carlo_errors(evaluator: Evaluator, optima: Sequence[Mode]) -> Floats:
+    """Return the Monte Carlo error of the log-likelihood at each optimum, in nats."""
     thetas = np.stack([optimum.theta for optimum in optima])
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
-    return np.sqrt(variance) <= largest
+    return np.asarray(np.sqrt(variance))
+
+
+def _supported(values: Floats, errors: Floats, n_specimens: int) -> Bools:
+    """Return which optima, (M,), are not spurious, from their values and Monte Carlo errors.
+
+    A log-likelihood with a Monte Carlo error of more than half a nat shows a spurious maximum: a
+    population that is narrower than the distances between points can have most of its density at a
+    few points. With many specimens the limit is a tenth of a nat for each, in quadrature. The error
+    for rounded readings is .06 nats a specimen. A maximum is too high rather than too low: so the
+    best optimum is the best after two errors are subtracted, and what seems better is left out.
+    """
+    is_known = errors <= max(0.5, 0.1 * float(np.sqrt(n_specimens)))
+    if not is_known.any():
+        return is_known
+    best = np.argmin(np.where(is_known, values + 2 * errors, np.inf))
+    return is_known & (values >= values[best])
 
 
 def supported_modes(
@@ -188,7 +197,9 @@ def supported_modes(
         max(prepared(likelihood).points.difference, likelihood.options.half_difference)
         for likelihood in evaluator.likelihoods
     ]
-    is_supported = _supported(evaluator, optima)
+    values = np.array([optimum.value for optimum in optima])
+    size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+    is_supported = _supported(values, _monte_carlo_errors(evaluator, optima), size)
     if is_supported.any():
         optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))

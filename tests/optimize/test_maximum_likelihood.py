@@ -22,6 +22,7 @@ from prbayes.optimize.maximum_likelihood import (
     Mode,
     _Objective,
     _signed_root,
+    _supported,
     _too_small_errors,
     mode_weights,
     share_mode,
@@ -370,12 +371,29 @@ def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(
 ) -> None:
     monkeypatch.setattr(
         "prbayes.optimize.maximum_likelihood._supported",
-        lambda _, optima: np.zeros(len(optima), bool),
+        lambda values, *_: np.zeros(len(values), bool),
     )
     for model in (normal_model(), folded_model()):  # one mode, and two
         optimum = fit(model)
         assert not optimum.converged
         assert optimum.findings[0].code == "narrow-population"
+
+
+@pytest.mark.parametrize(
+    ("values", "errors", "n_specimens", "supported"),
+    [
+        ([31.0, 30.4, 31.2], [0.0, 0.5, 0.2], 30, [True, False, True]),  # better by its error alone
+        ([31.0, 29.9], [0.0, 0.5], 30, [True, True]),
+        ([31.0, 25.0], [0.0, 1.0], 30, [True, False]),  # not known
+        ([31.0, 25.0], [0.0, 1.0], 100, [True, True]),
+        ([31.0, 25.0], [1.0, 1.0], 30, [False, False]),
+    ],
+)
+def test_an_optimum_that_is_best_by_the_error_of_its_points_is_spurious(
+    values: list[float], errors: list[float], n_specimens: int, supported: list[bool]
+) -> None:
+    got = _supported(np.array(values), np.array(errors), n_specimens)
+    assert got.tolist() == supported
 
 
 def test_the_signed_root_is_that_of_the_normal_likelihood_ratio() -> None:
