@@ -5,6 +5,8 @@ Run: uv run python -m benchmarks.pages
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -21,6 +23,7 @@ from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
 
 DOCS = Path(__file__).parents[1] / "docs"
+SCOREBOARD = DOCS / "appendix/scoreboard.csv"
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md")])
 Row = Iterable[str]
 
@@ -599,9 +602,14 @@ def _matrix(key: str, several: bool) -> Iterator[Row]:
     return scoreboard.matrix(found("scoreboard"), key, several)
 
 
-def _scoreboard(problem: str) -> Iterator[Row]:
-    """Yield a problem of the scoreboard."""
-    return scoreboard.rows(found("scoreboard"), problem)
+def scoreboard_file() -> str:
+    """Return all rows of the scoreboard as comma-separated values."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("problem", *scoreboard.COLUMNS))
+    for problem in PROBLEMS:
+        writer.writerows([problem, *row] for row in scoreboard.rows(found("scoreboard"), problem))
+    return text.getvalue()
 
 
 # Where the rows of each table are from; the first two lines of it are the page's.
@@ -706,8 +714,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scoreboard, cannot": lambda: scoreboard.cannot(found("scoreboard")),
     "scoreboard, yields": scoreboard.yields,
 }
-for _name in PROBLEMS:
-    TABLES[f"scoreboard, {_name}"] = partial(_scoreboard, _name)
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
 )
@@ -728,6 +734,7 @@ def main() -> None:
     for path in PAGES:
         page = path.read_text(encoding="utf-8")
         path.write_text(written(page), encoding="utf-8")
+    SCOREBOARD.write_text(scoreboard_file(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ def test_tables_are_those_of_the_benchmarks() -> None:
     texts = {path.stem: path.read_text(encoding="utf-8") for path in pages.PAGES}
     outdated = [name for name, text in texts.items() if pages.written(text) != text]
     assert not outdated, "run python -m benchmarks.pages"
+    assert pages.SCOREBOARD.read_text(encoding="utf-8") == pages.scoreboard_file()
 
 
 def test_files_that_pages_name_exist() -> None:

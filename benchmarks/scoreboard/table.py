@@ -28,6 +28,18 @@ from benchmarks.scoreboard.study import STORE
 _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
 _TENSION = tension_304l.PROBLEM.name
 _COSTS = ("data sets", "failures", "runs", "cpu")
+# of the rows of a problem
+COLUMNS = (
+    "specimens",
+    "method",
+    "bias",
+    "worst rms",
+    "width",
+    "coverage",
+    "runs",
+    "CPU s",
+    "data sets",
+)
 # In the order of the page: by what a rival is, and prbayes first because the page is its own.
 RIVALS = (
     "prbayes likelihood",
