@@ -118,22 +118,6 @@ def test_the_readme_links_to_files() -> None:
     assert not [link for link in links if not (ROOT / link).exists()]
 
 
-@pytest.mark.long
-def test_the_readme_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    code, said = re.findall(r"```(?:python|text)\n(.*?)```", README, re.DOTALL)[:2]
-    exec(compile(code, "README.md", "exec"), {})
-    printed = capsys.readouterr().out
-    numbers = [
-        [float(number) for number in re.findall(r"\d+\.\d+", text)] for text in (printed, said)
-    ]
-    assert len(numbers[0]) == 16
-    # Other processors round differently, and 0.165 is 0.16 or 0.17.
-    np.testing.assert_allclose(*numbers, atol=0.0101)
-    assert [line.split()[:1] for line in printed.splitlines()] == [
-        line.split()[:1] for line in said.splitlines()
-    ]
-
-
 @pytest.mark.parametrize("path", sorted((ROOT / "examples" / "notebooks").glob("*.ipynb")))
 def test_notebooks_are_kept_without_results(path: Path) -> None:
     """They are executed by .ci/notebooks; results of some machine would be noise in their history.

@@ -237,7 +237,7 @@ def plan(
 
 def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
     """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
-    page = "likelihood.md#several-modes"
+    page = "likelihood_findings.md#several-modes"
     if isinstance(populations.result, Optimum):
         return tuple(f for f in populations.result.findings if f.code == "second-mode")
     if len(modes) == 1:

@@ -219,7 +219,7 @@ def population_misfit(
             "family. Pass values with more digits, or remove copies; prb.LogLikelihood() takes "
             "rounded=."
         )
-        return [Finding("rounded-data", text, "likelihood.md#rounded-data")]
+        return [Finding("rounded-data", text, "likelihood_findings.md#rounded-data")]
     if with_prior:
         text = (
             f"The data are farther from the population at this optimum than {1 - p_value:.1%} of "

@@ -448,7 +448,7 @@ def data_findings(
                     f"{limit:.6g}, expected fewer without a limit of measurement; pass "
                     f"censored={argument.format(limit)} if they lie beyond it, or leave out copies."
                 )
-                findings.append(Finding("censored-data", text, "likelihood.md#censored-data"))
+                findings.append(Finding("censored-data", text, "likelihood_findings.md#censored-data"))
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
     if rounded_outputs:
         findings.insert(0, _rounding_finding(rounded_outputs, largest_step))
@@ -466,7 +466,7 @@ def _repeats_finding(groups: Sequence[Sequence[int]]) -> Finding:
         "expected different ones; leave out copies, pass specimens= and error= for repeated "
         "readings, or rounded= for coarse ones."
     )
-    return Finding("identical-specimens", text, "likelihood.md#identical-specimens")
+    return Finding("identical-specimens", text, "likelihood_findings.md#identical-specimens")
 
 
 def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: float) -> Finding:
@@ -479,7 +479,7 @@ def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: floa
         f"{max(shares):.3g} standard deviations), expected exact values, or a step of at most "
         f"{largest:g} standard deviations; pass rounded={argument}."
     )
-    return Finding("rounded-data", text, "likelihood.md#rounded-data")
+    return Finding("rounded-data", text, "likelihood_findings.md#rounded-data")
 
 
 # Checks of the runs, for the log-likelihood by specimen.
@@ -638,7 +638,7 @@ def misfit_findings(
             "readings; pass prb.LogLikelihood(error=...) with its standard deviation, or "
             "gross_errors=True for single specimens, or look at the order of the outputs, the "
             "response and the priors.",
-            "likelihood.md#readings-that-no-inputs-reproduce",
+            "likelihood_findings.md#readings-that-no-inputs-reproduce",
         )
     ]
 
@@ -666,7 +666,7 @@ def repeat_findings(name: str, repeats: Repeats) -> list[Finding]:
             "times the error (root mean square of the worst output), expected about once; correct "
             "the readings, pass prb.LogLikelihood(error=...) with their standard deviation, or an "
             "unknown one as a variable, or gross_errors=True for single specimens.",
-            "likelihood.md#readings-that-no-inputs-reproduce",
+            "likelihood_findings.md#readings-that-no-inputs-reproduce",
         )
     ]
 
@@ -693,6 +693,6 @@ def emulator_findings(
             f"readings, expected at most {largest}: the response has a pole, a jump or a kink "
             "in the range of the priors, or more detail than the runs; posterior means may be off "
             f"by more than .1 standard deviations: {any_of('narrow the priors', *remedies())}.",
-            "likelihood.md#emulator-error",
+            "likelihood_findings.md#emulator-error",
         )
     ]

@@ -389,7 +389,7 @@ def _end_findings(
         f"{tilts[worst]:.1g} standard deviations or more; pass "
         "metric=prb.LogLikelihood(error=...) with the error of the readings."
     )
-    return [Finding("emulator-error", text, "likelihood.md#emulator-error")]
+    return [Finding("emulator-error", text, "likelihood_findings.md#emulator-error")]
 
 
 def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Floats, Floats]]:

@@ -157,7 +157,7 @@ _UNSUPPORTED = Finding(
     "The likelihood is largest for a population that is narrower than the distances between the "
     "points of the specimens, where its value is not known to half a nat: the data do not bound "
     "the spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
-    "likelihood.md#narrow-population",
+    "likelihood_findings.md#narrow-population",
 )
 
 
@@ -486,7 +486,7 @@ def _findings(
                 "The likelihood jumps at the optimum, where the end of an input's support meets a "
                 "specimen, so that its curvature gives no standard errors. Sample with "
                 "prb.sample_smc.",
-                "likelihood.md#moving-supports",
+                "likelihood_findings.md#moving-supports",
             )
         )
     names = np.array(evaluator.hyperparameters.readable_names)
@@ -504,7 +504,7 @@ def _findings(
                 "not-identified",
                 f"The data do not identify {', '.join(flat)}; values at the optimum are arbitrary, "
                 "and the posterior keeps the prior there.",
-                "likelihood.md#identification",
+                "likelihood_findings.md#identification",
             )
         )
     second_modes = [(m, w) for m, w in zip(modes[1:], weights[1:], strict=True) if w >= 0.01]
@@ -515,7 +515,7 @@ def _findings(
                 f"A second optimum at {point_text(evaluator, mode.theta)} has {weight:.0%} of the "
                 "posterior's mass; NUTS chains may stay in the mode where they start; "
                 "prb.sample_smc samples both.",
-                "likelihood.md#several-modes",
+                "likelihood_findings.md#several-modes",
             )
         )
     is_too_small = _too_small_errors(evaluator.hyperparameters, objective, best)
@@ -527,7 +527,7 @@ def _findings(
                 f"The likelihood of {', '.join(too_small)} is more than three times as wide as "
                 "the standard error: values four standard errors from the optimum are nearly as "
                 "likely. Report intervals of prb.sample.",
-                "likelihood.md#flat-likelihood",
+                "likelihood_findings.md#flat-likelihood",
             )
         )
     return findings

@@ -346,7 +346,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> Findings:
             f"The means of the chains differ by {listed} within-chain standard deviations: the "
             "chains are in different modes, and their number of draws is not the mass of a mode; "
             "sample with prb.sample_smc, which weighs the modes.",
-            "likelihood.md#chains-in-different-modes",
+            "likelihood_findings.md#chains-in-different-modes",
         ),
     )
 
@@ -376,7 +376,7 @@ def influence(result: xr.DataTree) -> Findings:
                     f"{k.size} specimens (indices {listed}; largest {k.max():.2f}): the posterior "
                     "depends on them, and az.loo is not reliable; look at these specimens, or use "
                     "prb.cross_validate.",
-                    "likelihood.md#leave-one-out",
+                    "likelihood_findings.md#leave-one-out",
                 )
             )
     return tuple(findings)

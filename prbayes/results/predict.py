@@ -622,7 +622,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
                 "standard deviation of the predicted responses; pass stored=False, which computes "
                 "the response at new specimens."
             )
-            report(Finding("rough-prediction", text, "likelihood.md#predictions"))
+            report(Finding("rough-prediction", text, "likelihood_findings.md#predictions"))
     return missing
 
 

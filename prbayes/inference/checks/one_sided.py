@@ -64,7 +64,7 @@ def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
 def end_and_bound_findings(
     ends: list[PriorEnd],
     bounds: Sequence[OneSidedBound],
-    page: str = "likelihood.md#end-of-a-prior",
+    page: str = "likelihood_findings.md#end-of-a-prior",
 ) -> tuple[list[Finding], set[str]]:
     """Report ends of priors, and bounds of the other hyperparameters; return the names as well."""
     names = {end.name for end in ends}

@@ -145,7 +145,7 @@ def population_findings(
         "compare skewed families, two-part families, gross_errors=True, and a limit beyond "
         "which no specimen was measured."
     )
-    return (Finding("population-misfit", text, "likelihood.md#population-misfit"),)
+    return (Finding("population-misfit", text, "likelihood_findings.md#population-misfit"),)
 
 
 def failing_region_findings(evaluator: Evaluator, theta: Floats) -> Findings:
@@ -175,7 +175,7 @@ def failing_region_findings(evaluator: Evaluator, theta: Floats) -> Findings:
             f"{simulator.name}: got no finite response for {share:.1%} of the population, "
             f"expected less than {lost / n:.1%}: {meaning}."
         )
-        findings.append(Finding("failing-region", text, "likelihood.md#failing-region"))
+        findings.append(Finding("failing-region", text, "likelihood_findings.md#failing-region"))
     return tuple(findings)
 
 

@@ -108,7 +108,7 @@ def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
 
 
 def prior_end_findings(
-    ends: list[PriorEnd], page: str = "likelihood.md#end-of-a-prior"
+    ends: list[PriorEnd], page: str = "likelihood_findings.md#end-of-a-prior"
 ) -> list[Finding]:
     """Report ends of priors in one finding."""
     if not ends:
@@ -180,5 +180,5 @@ def conflict_findings(
             f"posterior mean to {posterior_mean[j]:.3g}, {pulls[j]:.1f} standard errors "
             f"from the data, expected at most {pull:g}; check the units and the prior, or widen it."
         )
-        findings.append(Finding("prior-conflict", text, "likelihood.md#prior-conflict"))
+        findings.append(Finding("prior-conflict", text, "likelihood_findings.md#prior-conflict"))
     return tuple(findings)
