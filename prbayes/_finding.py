@@ -28,13 +28,13 @@ class Finding:
     text : str
         One or two sentences for the reader: got, expected, what to do.
     page : str, optional
-        Documentation page with details and the heading, such as ``"likelihood_findings.md#rounded-data"``.
+        Documentation page with details and the heading, such as ``"my_data.md#outliers"``.
         A constant: tests check that page and heading exist, and that `help` shows the section.
 
     Examples
     --------
     >>> from prbayes._finding import Finding
-    >>> finding = Finding("rounded-data", "The data are rounded.", "likelihood_findings.md#rounded-data")
+    >>> finding = Finding("rounded-data", "The data are rounded.", "my_data.md#outliers")
     >>> print(finding)
     The data are rounded; see prb.help("rounded-data").
     """
@@ -162,7 +162,7 @@ def _page(name: str) -> str:
 
 
 def _section(link: str) -> str:
-    """Return the section of a page that a link such as ``"likelihood_findings.md#rounded-data"`` names."""
+    """Return the section of a page that a link such as ``"my_data.md#outliers"`` names."""
     name, _, anchor = link.partition("#")
     text = _page(name)
     headings = list(re.finditer(r"^(##+) (.+)$", text, re.MULTILINE))

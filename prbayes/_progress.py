@@ -108,7 +108,7 @@ def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str
     write = lines()
     is_settled = _hidden.get() or not live()  # whether the bar is shown, or never will be
 
-    def advance(n: int, note: str) -> None:
+    def update(n: int, note: str) -> None:
         nonlocal completed, is_settled
         completed += n
         bar.update(task, advance=n, note=note)
@@ -123,7 +123,7 @@ def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str
                 _log.debug("%s: no second progress bar", name)
 
     try:
-        yield advance
+        yield update
     finally:
         if bar.live.is_started:  # stopping a hidden bar would print a line
             bar.stop()

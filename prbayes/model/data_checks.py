@@ -448,7 +448,9 @@ def data_findings(
                     f"{limit:.6g}, expected fewer without a limit of measurement; pass "
                     f"censored={argument.format(limit)} if they lie beyond it, or leave out copies."
                 )
-                findings.append(Finding("censored-data", text, "likelihood_findings.md#censored-data"))
+                findings.append(
+                    Finding("censored-data", text, "likelihood_findings.md#censored-data")
+                )
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
     if rounded_outputs:
         findings.insert(0, _rounding_finding(rounded_outputs, largest_step))

@@ -35,7 +35,7 @@ def audited_evaluator(
     ``place``, and leaves the model as it was. The rest of the work needs no response.
     """
     try:
-        records = {old: _audited_likelihood(old, thetas, is_last) for old in evaluator.likelihoods}
+        records = {old: audited_likelihood(old, thetas, is_last) for old in evaluator.likelihoods}
         for new in records.values():
             prepared(new)
     except BudgetError as spent:
@@ -53,7 +53,7 @@ def audited_evaluator(
     return Evaluator.of(evaluator.model), ()
 
 
-def _audited_likelihood(
+def audited_likelihood(
     likelihood: SpecimenLikelihood, thetas: Floats, is_last: bool
 ) -> SpecimenLikelihood:
     """Return a likelihood with runs where its emulator is wrong, the same if it is right.
@@ -66,18 +66,13 @@ def _audited_likelihood(
     is_open = preparation.proposals.is_open()
     if likelihood.calls_response or emulation.offsets is not None or is_open:
         return likelihood
-
-    def uncertainty(z: Floats) -> Floats:
-        """Return predictive standard deviations relative to the stated error, (n,)."""
-        return (np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1)
-
     runs = likelihood.options.sampled
     points = preparation.points.z
     points = points[:, :: 4 if points.shape[1] >= 16 else 1]  # a mode has eight points or one
-    if (uncertainty(points.reshape(-1, points.shape[2])) <= 1.0).all():
+    if (_uncertainty(emulation, points.reshape(-1, points.shape[2])) <= 1.0).all():
         return likelihood
     z = _likely_inputs(likelihood, thetas)
-    ratio = uncertainty(z)
+    ratio = _uncertainty(emulation, z)
     possible, ratio = z[ratio > 1.0], ratio[ratio > 1.0]
     share = len(possible) / len(z)
     if share < 0.005:
@@ -113,6 +108,11 @@ def _audited_likelihood(
     # The first record identifies the problem, because every use of the model has it at first.
     result.cache["first"] = likelihood.cache.get("first", likelihood)
     return result
+
+
+def _uncertainty(emulation: Emulation, z: Floats) -> Floats:
+    """Return predictive standard deviations relative to the stated error, (n,)."""
+    return np.asarray((np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1))
 
 
 def audit_points(

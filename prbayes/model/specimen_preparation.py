@@ -58,11 +58,15 @@ from prbayes.specimens.design import (
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
 from prbayes.specimens.points import (
     Draws,
+    Plausible,
     SpecimenData,
     SpecimenPoints,
     draw_points,
+    fit_proposals,
+    likely_scale,
     likely_weights,
     normal_of,
+    of_all_specimens,
     specimen_points,
 )
 from prbayes.specimens.proposals import Proposals
@@ -108,6 +112,64 @@ def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> Specim
     result = replace(likelihood)
     result.cache["preparation"] = replace(preparation, points=points)
     return result
+
+
+def with_specimens(
+    likelihood: SpecimenLikelihood, observed: Floats, thetas: Floats
+) -> tuple[SpecimenLikelihood, SpecimenLikelihood]:
+    """Return the likelihood with further specimens, and that of these alone; no run is needed.
+
+    Points of the specimens, whose readings are ``observed``, suffice at draws, (S, p).
+    """
+    (measurement,) = likelihood.measurements
+    preparation = prepared(likelihood)
+    together = np.concatenate([measurement.observed, observed])
+    results = []
+    for values in (together, observed):
+        result = likelihood.observing({measurement.name: values})
+        results.append(_of_same_populations(result, likelihood))
+    joint, added = results
+    data, reference = specimen_data(added), preparation.proposals.residuals.population
+    proposals = fit_proposals(data, preparation.emulation, reference)
+    count = data.options.points * proposals.modes.table.shape[1]
+    if proposals.is_open():
+        count = max(count, preparation.points.log_a.shape[1] // 2)
+    rows = np.linspace(0, len(thetas) - 1, 256).round().astype(int)
+    draws = PopulationDraws(SpecimenPopulations(added), thetas[rows])
+    first = draw_points(data, proposals, 2 * count, data.seed)
+    scale = likely_scale(data, first, preparation.emulation.error)
+    points, proposals = Plausible(draws, proposals, first, scale, count).agreeing(data)
+    gross_errors = measurement.gross_errors is not False
+    misfits = misfit_findings(
+        likelihood.name,
+        added.readings,
+        proposals.modes,
+        preparation.emulation.error,
+        gross_errors=gross_errors,
+    )
+    added.cache["preparation"] = replace(
+        preparation, points=points, proposals=proposals, findings=tuple(misfits)
+    )
+    joint.cache["preparation"] = replace(
+        preparation, points=of_all_specimens(preparation.points, points)
+    )
+    return joint, added
+
+
+def with_emulator(likelihood: SpecimenLikelihood, other: SpecimenLikelihood) -> SpecimenLikelihood:
+    """Return the likelihood without points, with the shared emulator of another one."""
+    result = replace(likelihood, shared_emulation=other.shared_emulation)
+    return _of_same_populations(result, likelihood)
+
+
+def _of_same_populations(
+    likelihood: SpecimenLikelihood, other: SpecimenLikelihood
+) -> SpecimenLikelihood:
+    """Give a likelihood what does not depend on the specimens: coordinates, compiled functions."""
+    vars(likelihood).update(density=other.density, coordinates=other.coordinates)
+    if "hyperparameters" in other.cache:
+        likelihood.cache["hyperparameters"] = other.cache["hyperparameters"]
+    return likelihood
 
 
 def is_prepared(likelihood: SpecimenLikelihood) -> bool:

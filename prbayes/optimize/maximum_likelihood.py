@@ -178,11 +178,11 @@ def _supported(values: Floats, errors: Floats, n_specimens: int) -> Bools:
     for rounded readings is .06 nats a specimen. A maximum is too high rather than too low: so the
     best optimum is the best after two errors are subtracted, and what seems better is left out.
     """
-    is_known = errors <= max(0.5, 0.1 * float(np.sqrt(n_specimens)))
+    is_known: Bools = errors <= max(0.5, 0.1 * float(np.sqrt(n_specimens)))
     if not is_known.any():
         return is_known
     best = np.argmin(np.where(is_known, values + 2 * errors, np.inf))
-    return is_known & (values >= values[best])
+    return np.asarray(is_known & (values >= values[best]))
 
 
 def supported_modes(

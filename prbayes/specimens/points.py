@@ -96,6 +96,32 @@ def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
     )
 
 
+def of_all_specimens(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
+    """Return points of the specimens of both; the smaller number is filled up without mass.
+
+    Modes are numbered within each part.
+    """
+    count = max(first.log_a.shape[1], second.log_a.shape[1])
+
+    def together(name: str) -> Any:
+        parts = [getattr(points, name) for points in (first, second)]
+        wide = [v[:, np.minimum(np.arange(count), v.shape[1] - 1)] for v in parts]
+        return np.concatenate(wide)
+
+    sizes = [points.log_a.shape[1] for points in (first, second)]
+    is_point = np.arange(count) < np.repeat(sizes, [len(first.z), len(second.z)])[:, None]
+    return SpecimenPoints(
+        z=together("z"),
+        outputs=together("outputs"),
+        log_a=np.where(is_point, together("log_a"), -np.inf),
+        log_proposal=np.where(is_point, together("log_proposal"), np.inf),
+        n_roots=np.concatenate([first.n_roots, second.n_roots]),
+        mode=together("mode"),
+        difference=float(np.hypot(first.difference, second.difference)),
+        is_exact=first.is_exact and second.is_exact,
+    )
+
+
 def points_by_mode(points: SpecimenPoints, modes: Modes) -> SpecimenPoints:
     """Return one point for each mode of a specimen: the weighted mean of its points.
 
