@@ -243,26 +243,10 @@ def sizes() -> Iterator[Row]:
     """Yield the area test's size."""
     table = summary("validity")
     for n0, n in product((15, 30, 100), (10, 20, 50)):
-        cells = [
-            short(table[f"size/{n0}"][f"{n}/{null}"][level], 3)
-            for null in ("default", "best fit")
-            for level in ("0.01", "0.05", "0.1")
-        ]
+        row = table[f"size/{n0}"]
+        cells = [short(row[f"{n}/default"][level], 3) for level in ("0.01", "0.05", "0.1")]
         cells[1] = f"**{cells[1]}**"
-        yield [str(n0), str(n), *cells]
-
-
-def sizes_through() -> Iterator[Row]:
-    """Yield the area test's size, through the whole package."""
-    table = summary("validity")
-    nulls = {
-        "optimum taken as exact, fresh data": "optimum, ExactModel",
-        "`JointNull`, the calibration's own data": "own data, JointNull",
-        "`ExactModel`, the calibration's own data": "own data, ExactModel",
-    }
-    for n0, (label, null) in product(("15", "30"), nulls.items()):
-        shares = table[f"pipeline/{n0}"][null].values()
-        yield [n0, label, *(short(value, 3) for value in shares)]
+        yield [str(n0), str(n), *cells, short(row[f"{n}/best fit"]["0.05"], 3)]
 
 
 def sizes_of_outputs() -> Iterator[Row]:
@@ -277,7 +261,7 @@ def sizes_of_outputs() -> Iterator[Row]:
     }
     for name, label in labels.items():
         shares = [short(value, 3) for value in table["outputs/matching"][name].values()]
-        yield [label, *shares, short(table["outputs/Jeffreys"][name]["0.05"], 3)]
+        yield [label, *shares]
 
 
 def power() -> Iterator[Row]:
@@ -641,7 +625,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "saddlepoint": saddlepoint,
     "saddlepoint_refits": saddlepoint_refits,
     "size": sizes,
-    "size, through prbayes": sizes_through,
     "size, several outputs": sizes_of_outputs,
     "power": power,
     "case study, Sobol points": case_study,
