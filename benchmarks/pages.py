@@ -295,31 +295,6 @@ def _failed(cell: Any) -> str:
     return f" ({count})" if count else ""
 
 
-def evaluations() -> Iterator[Row]:
-    """Yield evaluations in the paper's case study."""
-    from benchmarks.paper_case1 import SIZES, collect
-    from benchmarks.systems import SYSTEMS
-
-    fits = found("paper_case1")["rows"]
-    for system, method in product(SYSTEMS, ("NM 0.001", "BFGS")):
-        cells = []
-        for metric in METRICS:
-            rows = [row for n in SIZES for row in fits[f"sobol/{system}/{n}/{metric}"]]
-            every = collect(rows, system, method)
-            cells.append(f"{np.median(every[:, 2]):.0f}" + _failed(every))
-        yield [system, method.replace("NM", "Nelder-Mead,"), *cells]
-
-
-def scale_factor() -> Iterator[Row]:
-    """Yield evaluations by the paper's scale factor."""
-    for name, row in single("scale_factor").items():
-        maximum, *case = name.split("/")
-        if "raw" not in case:
-            continue
-        cells = [f"{n}" if error < 0.01 else f"{n} ({error:.2g})" for n, error in row]
-        yield [f"{float(maximum):g}", *case[:-1], *cells]
-
-
 def landscapes() -> Iterator[Row]:
     """Yield convexity and arrival."""
     for system, metrics in single("landscapes").items():
@@ -628,8 +603,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "size, several outputs": sizes_of_outputs,
     "power": power,
     "case study, Sobol points": case_study,
-    "case study, evaluations": evaluations,
-    "scale factor": scale_factor,
     "partial pooling": partial_pooling,
     "small groups": small_groups,
     "measurement error": measurement_error,
