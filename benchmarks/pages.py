@@ -295,15 +295,6 @@ def _failed(cell: Any) -> str:
     return f" ({count})" if count else ""
 
 
-def landscapes() -> Iterator[Row]:
-    """Yield convexity and arrival."""
-    for system, metrics in single("landscapes").items():
-        for metric, row in metrics.items():
-            shares = (f"{row[key]:.1%}" for key in ("convex", "flat", "arrive"))
-            guided = f"{row['arrive_guided']:.1%}", f"{row['evaluations_guided']:.0f}"
-            yield [system, metric, *shares, f"{row['evaluations']:.0f}", *guided]
-
-
 _ENOUGH = 20  # data sets of a cell that is shown
 
 
@@ -337,7 +328,7 @@ def speed() -> Iterator[Row]:
 
 
 def scale() -> Iterator[Row]:
-    """Yield time and memory of the largest problems."""
+    """Yield time and memory of the largest problems, by PR."""
     from benchmarks.scale import SIZES, THETAS
 
     after = {"n resimulated": "one theta", "n reweighted": "one theta, after set-up"}
@@ -349,17 +340,17 @@ def scale() -> Iterator[Row]:
     }
     for cell, row in single("scale").items():
         kind, metric, *size = cell.split("/")
-        if kind in ("tasks", "specimens"):
+        if kind in ("tasks", "specimens") or metric != "PR":
             continue
         n = int(size[0])
         if n < max(SIZES[kind]):
             continue
         name = f"`{names[kind].format(n)}`"
         if kind in after:
-            what, seconds = f"{name}, {after[kind]}, {metric}", row["s"] / THETAS
+            what, seconds = f"{name}, {after[kind]}", row["s"] / THETAS
         else:
             responses = f"{row['responses']:_} responses"
-            what = f"{name}, {n:_} particles sampled, {metric}, {responses}"
+            what = f"{name}, {n:_} particles sampled, {responses}"
             seconds = row["sampling s"]
         digits = 1 if seconds >= 1 else 3 if seconds < 0.05 else 2
         yield [what.replace("_", " "), f"{seconds:.{digits}f} s", f"{row['MiB']:.0f} MiB"]
@@ -406,6 +397,8 @@ def at_a_fold() -> Iterator[Row]:
 
     table = summary("at_a_fold")
     for metric in COMPARED:
+        if metric.startswith("KLD, 0.5"):
+            continue
         rows = [table[f"{r}/{n}/{metric}"] for r, n in product(RESPONSES, (50, 200))]
         yield [metric, *(f"{short(row['mu'])} / {short(row['sigma'])}" for row in rows)]
 
@@ -608,7 +601,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "readings, coverage": partial(coverage_of, "readings_coverage"),
     "covariates": partial(coverage_of, "covariates"),
     "metric prices": metric_prices,
-    "landscapes": landscapes,
     "joint, errors": joint,
     "scale": scale,
     "between runs": between_runs,
