@@ -96,7 +96,7 @@ def test_help_explains_every_code_in_plain_markdown(code: str) -> None:
 def test_help_ends_with_the_sections_of_the_pages() -> None:
     text = prb.help("second-mode")
     headings = re.findall(r"^##+ .+$", text, re.MULTILINE)
-    assert headings == ["### Several modes", "## Two answers"]
+    assert headings == ["## Several modes", "## Two answers"]
     assert "laplace" in text.lower()
     assert "mirror_optimum" in text  # code is shown, assertions of the page are not
     assert "assert" not in text

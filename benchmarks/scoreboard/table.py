@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
-from benchmarks.scoreboard.problems import PROBLEMS, tension_304l
+from benchmarks.scoreboard.problems import PROBLEMS
 from benchmarks.scoreboard.score import score
 from benchmarks.scoreboard.study import STORE
 
 _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
-_TENSION = tension_304l.PROBLEM.name
 _COSTS = ("data sets", "failures", "runs", "cpu")
 # of the rows of a problem
 COLUMNS = (
@@ -97,13 +96,13 @@ def size_of(sizes: dict[str, Any]) -> str:
     return max(sizes, key=lambda size: (len(sizes[size]), int(size)))
 
 
-def matrix(found: dict[str, Any], key: str, several: bool) -> Iterator[list[str]]:
-    """Yield a row of a rival over problems of one output or several: the worst figure of each."""
+def matrix(found: dict[str, Any], several: bool) -> Iterator[list[str]]:
+    """Yield a row of a rival over problems of one output or several: worst error and worst width."""
     names = [name for name in found if (np.ndim(_observed(name)) > 1) == several]
     columns = [found[name][size_of(found[name])] for name in names]
     yield ["*specimens*", *(size_of(found[name]) for name in names)]
     for rival in RIVALS:
-        row = [_summary(column.get(rival), key) for column in columns]
+        row = [_summary(column.get(rival)) for column in columns]
         if any(row):
             yield [rival, *row]
 
@@ -113,15 +112,17 @@ def _observed(name: str) -> Any:
     return problem.data(problem.sizes[0], 0)
 
 
-def _summary(one: dict[str, Any] | None, key: str) -> str:
+def _summary(one: dict[str, Any] | None) -> str:
+    """Return error and width with the number of data sets; the error alone of a method without width."""
     if one is None:
         return ""
     if "cannot" in one:
         return "cannot"
-    value = worst(one, key)
-    if value is None:
-        return "fails" if one["failures"] else "one number"
-    return f"{_plain(value)} ({one['data sets'] - one['failures']})"
+    error, width = worst(one, "rms"), worst(one, "width")
+    if error is None:
+        return "fails"
+    shown = _plain(error) if width is None else f"{_plain(error)}, {_plain(width)}"
+    return f"{shown} ({one['data sets'] - one['failures']})"
 
 
 def rows(found: dict[str, Any], problem: str) -> Iterator[list[str]]:
@@ -155,26 +156,6 @@ def _short(value: float | None) -> str:
 def _figures(one: dict[str, Any], key: str) -> str:
     values = [value[key] for value in hyperparameters(one)]
     return ", ".join(_plain(value) for value in values if value is not None)
-
-
-def yields() -> Iterator[list[str]]:
-    """Yield each rival's predictive standard deviation of the yield of 304L, in ksi."""
-    by_rival = {one["rival"]: one["rows"] for one in stored(STORE) if one["problem"] == _TENSION}
-    for rival in RIVALS:
-        for row in by_rival.get(rival, []):
-            if "error" not in row:
-                yield [rival, f"{row['values'][tension_304l.PREDICTIVE]['mean']:.2f}"]
-
-
-def cannot(found: dict[str, Any]) -> Iterator[list[str]]:
-    """Yield who cannot say a problem, and why."""
-    reasons: dict[tuple[str, str], list[str]] = {}
-    for problem, sizes in found.items():
-        for rival, one in sizes[size_of(sizes)].items():
-            if "cannot" in one:
-                reasons.setdefault((rival, one["cannot"]), []).append(problem)
-    for (rival, reason), problems in reasons.items():
-        yield [rival, "; ".join(problems), reason]
 
 
 def main() -> None:

@@ -404,7 +404,7 @@ def test_a_rival_that_cannot_says_why_in_its_cell(tmp_path: Path) -> None:
         study.study(rival, linear.PROBLEM, [20], 2, tmp_path)
     found = table.scores(tmp_path)
     assert found["linear"]["20"]["two"]["data sets"] == 2
-    assert list(table.cannot(found)) == [["one", "linear", "one output only"]]
+    assert found["linear"]["20"]["one"] == {"cannot": "one output only"}
 
 
 def _cell(*values: tuple[float, float | None], sets: int = 1, failures: int = 0) -> dict[str, Any]:
@@ -428,14 +428,12 @@ def test_the_tables_tell_the_worst_hyperparameter() -> None:
             "50": {"prbayes PR": _cell((0.7, 1.0), sets=20)},
         }
     }
-    errors = dict(table.matrix(found, "rms", several=False))
-    assert errors["prbayes PR"] == ".50 (2)"
-    assert errors["*specimens*"] == "20"
-    assert errors["stock PyMC"] == "cannot"
-    assert errors["sbi"] == "fails"
-    assert "pyABC adaptive" not in errors, "it was not run"
-    widths = dict(table.matrix(found, "width", several=False))
-    assert (widths["prbayes PR"], widths["mud"]) == (".50 (2)", "one number")
+    cells = dict(table.matrix(found, several=False))
+    assert (cells["prbayes PR"], cells["mud"]) == (".50, .50 (2)", ".30 (1)")
+    assert cells["*specimens*"] == "20"
+    assert cells["stock PyMC"] == "cannot"
+    assert cells["sbi"] == "fails"
+    assert "pyABC adaptive" not in cells, "it was not run"
     told = list(table.rows(found, "linear"))
     assert [row[:2] for row in told] == [
         ["20", "prbayes PR"], ["20", "sbi"], ["20", "mud"], ["50", "prbayes PR"]
