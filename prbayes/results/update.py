@@ -105,9 +105,9 @@ def update(
     latest = likelihood.cache.get("updated")
     evaluator = with_unchanged_runs(latest or Evaluator.of(model))
     thetas = thetas_of(result, evaluator, 1024, caller)
-    before = _of_result(likelihood, latest, result, thetas, caller)
+    earlier = _of_result(likelihood, latest, result, thetas, caller)
     identity = identity_from_attributes(result["posterior"].attrs)
-    require_same(identity, identity_of(_evaluator(evaluator, before)), caller)
+    require_same(identity, identity_of(_evaluator(evaluator, earlier)), caller)
     new = real_array(observed, f"{caller}: observed").astype(float)
     event = likelihood.measurements[0].event
     if new.shape[1:] != event or not new.size:
@@ -115,10 +115,10 @@ def update(
             f"{caller}: observed: got shape {new.shape}, expected {('n', *event)}, in the form of "
             "the simulator's observed values"
         )
-    after, unlike = _extended(before, new, thetas, caller)
-    updated = likelihood.cache["updated"] = _evaluator(evaluator, after)
-    findings = (*prepared(after).findings, *report(*unlike))
-    after.cache["preparation"] = replace(prepared(after), findings=findings)
+    extended, unlike = _extended(earlier, new, thetas, caller)
+    updated = likelihood.cache["updated"] = _evaluator(evaluator, extended)
+    findings = (*prepared(extended).findings, *report(*unlike))
+    extended.cache["preparation"] = replace(prepared(extended), findings=findings)
     posterior = result["posterior"]
     settings = SamplingSettings(
         draws=posterior.sizes["draw"],
