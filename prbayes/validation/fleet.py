@@ -39,9 +39,9 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
-from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
+from prbayes.posterior.sample import draw_posterior, importance_chains
 from prbayes.posterior.smc import SamplingSettings
-from prbayes.posterior.target import specimen_target
+from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
