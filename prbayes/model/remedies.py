@@ -6,12 +6,14 @@ A remedy is tried by the checks that would refuse it, and named only if they let
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from pytensor.graph.traversal import ancestors
 
 from prbayes._finding import any_of
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.divergence import ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
@@ -89,7 +91,7 @@ def remedies_of(likelihood: SpecimenLikelihood) -> tuple[str, str]:
     everywhere = f" in {likelihood.name}" if len(likelihood.measurements) > 1 else ""
     metric += everywhere if metric else ""
     if likelihood.has_table:
-        return "add the runs that prb.propose_runs(model) returns", metric
+        return table_advice(likelihood), metric
     if likelihood.calls_response:
         return "", metric
     runs = "ask for more first runs with propagation=prb.Reweighted(n)"
@@ -97,6 +99,13 @@ def remedies_of(likelihood: SpecimenLikelihood) -> tuple[str, str]:
         f"{runs}, use propagation=prb.Resimulated(){everywhere}, with 10,000 runs and more",
         metric,
     )
+
+
+def table_advice(likelihood: SpecimenLikelihood) -> str:
+    """Return advice on the runs of tables: to correct one that is an outlier, or to add runs."""
+    tables = [cast(Runs, m.responses.function) for m in likelihood.measurements]
+    advice = [table.outlier_advice() for table in tables]
+    return next(filter(None, advice), "add the runs that prb.propose_runs(model) returns")
 
 
 def _metric_of(measurement: Measurement) -> str:

@@ -225,22 +225,25 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         data = specimen_data(likelihood)
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
+
+        def posterior(share: ResponseShare | None) -> PopulationDraws:
+            if share is not None and likelihood.inputs.conditions:
+                raise DesignError(
+                    f"{likelihood.name}: got NaN from the response for a share of the population "
+                    "that is not negligible, expected a response of all specimens with "
+                    "prb.response.condition, since that share depends on the condition; return a "
+                    "number there, such as the limit of the measurement, or inf if they fail"
+                )
+            populations = SpecimenPopulations(likelihood)
+            return populations.posterior(points.z, points.log_a, share=share)
+
         refined, share = response_share(
             # Calls of a table's surface do not count as runs.
             OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
             data,
             first.emulation,
-            lambda share: SpecimenPopulations(likelihood).posterior(
-                points.z, points.log_a, share=share
-            ),
+            posterior,
         )
-        if share is not None and likelihood.inputs.conditions:
-            raise DesignError(
-                f"{likelihood.name}: got NaN from the response for a share of the specimens that "
-                "is not negligible, expected a response of all specimens with "
-                "prb.response.condition, since the share depends on the condition; return a "
-                "number there, such as the limit of the measurement, or narrow the priors"
-            )
         if refined is not first.emulation and not likelihood.has_table:
             # The refined emulator is accurate beside the region where runs fail, so that points of
             # specimens there are on the right side of its boundary.
@@ -701,8 +704,9 @@ class SpecimenPopulations:
         label = specimen if labels is None else labels[specimen]
         raise ValueError(
             f"{self.likelihood.name}: got no population of the prior that reaches the inputs of "
-            f"specimen {label}, expected one at least; look at the priors and at the data's units, "
-            "and pass prb.LogLikelihood(error=...) if readings have an error"
+            f"specimen {label}, expected one at least; look at the priors, the data's units "
+            "and responses that are NaN, and pass prb.LogLikelihood(error=...) if readings have an "
+            "error"
         )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from prbayes._validate import Bools, Floats, Function
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
+from prbayes.model.remedies import table_advice
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import unlimited
 from prbayes.response.response import Responses
@@ -187,8 +188,7 @@ def _require_accurate(
         f"{likelihood.name}: got a surface through {len(emulation.z)} runs with a cross-validated "
         f"error of {share / 2:.2g} standard deviations of the readings, which would shift a mean "
         f"or standard deviation of an input by {shift} posterior standard deviations, "
-        f"expected at most {data.options.bias}; prb.propose_runs(model) returns a table of runs "
-        "to add near the specimens"
+        f"expected at most {data.options.bias}; {table_advice(likelihood)}"
     )
 
 

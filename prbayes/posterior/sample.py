@@ -20,11 +20,12 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_audit import audited_evaluator
-from prbayes.numerics.modes import Laplace, distinct_modes, laplace
+from prbayes.numerics.modes import Laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.optimum import Optimum, point_text
+from prbayes.optimize.optimum import Optimum
 from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
+from prbayes.posterior.mode_masses import has_valley, modes_finding
 from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.saddlepoint import score_obstacle
 from prbayes.posterior.smc import (
@@ -34,7 +35,7 @@ from prbayes.posterior.smc import (
     required_optimum,
     result_of,
 )
-from prbayes.posterior.target import Target, posterior_target
+from prbayes.posterior.target import Target, modes_of, posterior_target
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -66,7 +67,8 @@ def sample(
     specimens (PR, the Kullback-Leibler divergence), else of refits of synthetic data sets.
 
     If the posterior has several modes, the difference of the discrepancy between their optima is
-    part of the estimate, and the finding ``second-mode`` has the share of the draws near each.
+    part of the estimate, and the finding ``second-mode`` has the share of the draws near each. The
+    draws of sequential Monte Carlo are resampled to the masses of the modes by bridge sampling.
 
     Parameters
     ----------
@@ -201,56 +203,17 @@ def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[F
     thetas = draws.reshape(-1, draws.shape[-1])
     separate: list[Laplace] = []
     for mode in sorted(modes, key=lambda mode: -mode.log_mass):
-        if all(_has_valley(target, mode.mode, better.mode) for better in separate):
+        if all(has_valley(target.log_posterior, mode.mode, x.mode) for x in separate):
             separate.append(mode)
     factors = [np.linalg.inv(np.linalg.cholesky(mode.covariance)) for mode in separate]
     pairs = zip(separate, factors, strict=True)
     distances = [np.linalg.norm((thetas - mode.mode) @ root.T, axis=1) for mode, root in pairs]
     shares = np.bincount(np.argmin(distances, axis=0), minlength=len(separate)) / len(thetas)
-    parts = [
-        f"{share:.0%} near {point_text(target.evaluator, mode.mode)}"
-        for mode, share in zip(separate, shares, strict=True)
-        if share >= 0.01
-    ]
-    if len(parts) < 2:
-        return []
     # Refits gave twelve pairs of mirror populations, with equal masses, shares of .47 to .59.
     is_uncertain = target.evaluator.nodes and score_obstacle(target.evaluator) is not None
     error = " (uncertain by .1, because they rest on refits)" if is_uncertain else ""
-    text = (
-        f"The posterior has {len(parts)} modes, with shares of the draws{error}: "
-        f"{'; '.join(parts)}. "
-        "Means and standard deviations over all draws describe none of them; report each, or state "
-        "a prior that excludes the others."
-    )
-    return [Finding("second-mode", text, "optimum_or_abc.md#two-answers")]
-
-
-def _has_valley(target: Target, a: Floats, b: Floats) -> bool:
-    """Return whether the log-density falls by one below both modes on the line between them."""
-    line = a + np.linspace(0, 1, 21)[:, None] * (b - a)
-    heights = target.log_posterior(line)
-    return bool(heights.min() < min(heights[0], heights[-1]) - 1)
-
-
-def modes_of(target: Target) -> list[Laplace] | None:
-    """Return Laplace approximations of the modes, None if the density jumps at a start."""
-    starts = target.starts
-    try:
-        if len(starts) > 1:
-            # Continue once from starts that are on the way to the same mode.
-            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
-            starts = np.stack([mode.mode for mode in distinct_modes(rough)])
-        candidates = laplace(target.log_posterior, starts, target.scale)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    highest = max(mode.log_mass for mode in candidates)
-    modes = [
-        mode
-        for i, mode in enumerate(distinct_modes(candidates))
-        if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
-    ]
-    return modes or None  # None, because populations that shrink to a point have no mass
+    places = np.array([mode.mode for mode in separate])
+    return modes_finding(target.evaluator, places, shares, error)
 
 
 def importance_chains(

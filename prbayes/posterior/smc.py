@@ -53,6 +53,7 @@ from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
+from prbayes.posterior.mode_masses import bridged_modes, modes_finding
 from prbayes.posterior.results import (
     AT_BEST,
     Chains,
@@ -63,7 +64,14 @@ from prbayes.posterior.results import (
     selected,
     share_of_lossy,
 )
-from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
+from prbayes.posterior.target import (
+    Target,
+    estimate_target,
+    modes_of,
+    prior_conflicts,
+    require_density,
+    specimen_target,
+)
 from prbayes.propagation.base import Missing, discrepancy_error
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
@@ -99,9 +107,10 @@ def sample_smc(
 ) -> xr.DataTree:
     r"""Draw from the posterior by sequential Monte Carlo from the prior.
 
-    It samples the same posterior as `sample`, also with several modes. With ``adjustment=None`` it
-    samples the pseudo-posterior of approximate Bayesian computation, whose density is proportional
-    to the prior times :math:`\exp(-\sum_k d_k / \epsilon_k)`.
+    It samples the same posterior as `sample`, also with several modes, whose masses are those of
+    bridge sampling. With ``adjustment=None`` it samples the pseudo-posterior of approximate
+    Bayesian computation, whose density is proportional to the prior times
+    :math:`\exp(-\sum_k d_k / \epsilon_k)`. There small modes have too few draws.
 
     Parameters
     ----------
@@ -533,10 +542,11 @@ def _chains_on_designs(
             refinements.append(checkpoint.arrays[f"refined{round_}_thetas"])
             refine_at(evaluator, refinements[-1])
             continue
-        log_likelihood = None
+        target, log_likelihood = None, None
         if settings.kind(evaluator) is Likelihood.ESTIMATE:
             assert optimum is not None
-            log_likelihood = estimate_target(evaluator, optimum).log_likelihood
+            target = estimate_target(evaluator, optimum)
+            log_likelihood = target.log_likelihood
         chains = run_chains(
             evaluator, settings, children, log_likelihood, starts, checkpoint, refinements
         )
@@ -553,9 +563,29 @@ def _chains_on_designs(
             break
         refinements.append(thetas)
         _log.info("sampling again on the refined design")
+    if settings.kind(evaluator) is Likelihood.PSEUDO:
+        return chains
+    target = target or specimen_target(evaluator, optimum)
+    chains = _with_bridged_modes(target, chains, np.random.default_rng(seeds))
     if log_likelihood is None:
         return chains
+    rows = chains.thetas.reshape(rows.shape)
     return replace(chains, log_likelihood=log_likelihood(rows).reshape(chains.thetas.shape[:2]))
+
+
+def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator) -> Chains:
+    """Return draws that are resampled to the masses of their modes, and report these."""
+    hyperparameters = target.evaluator.hyperparameters
+    draws = chains.thetas.reshape(-1, hyperparameters.size)
+    modes = bridged_modes(
+        target.log_posterior, draws, hyperparameters.prior_sd, modes_of(target) or [], rng
+    )
+    if modes is None:
+        return chains
+    error = f" (standard error {modes.errors.max():.1g})"
+    finding = modes_finding(target.evaluator, modes.places, modes.shares, error)
+    thetas = modes.draws.reshape(chains.thetas.shape)
+    return replace(chains, thetas=thetas, findings=report(*finding))
 
 
 def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats]:

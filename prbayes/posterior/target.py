@@ -44,7 +44,7 @@ from prbayes.model.evaluator import (
     with_targets,
 )
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.modes import LogDensity, far_apart, laplace
+from prbayes.numerics.modes import Laplace, LogDensity, distinct_modes, far_apart, laplace
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, element_order, optima_of
@@ -115,6 +115,26 @@ def posterior_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
         return specimen_target(evaluator, optimum)
     assert optimum is not None
     return estimate_target(evaluator, optimum)
+
+
+def modes_of(target: Target) -> list[Laplace] | None:
+    """Return Laplace approximations of the modes, None if the density jumps at a start."""
+    starts = target.starts
+    try:
+        if len(starts) > 1:
+            # Continue once from starts that are on the way to the same mode.
+            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
+            starts = np.stack([mode.mode for mode in distinct_modes(rough)])
+        candidates = laplace(target.log_posterior, starts, target.scale)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    highest = max(mode.log_mass for mode in candidates)
+    modes = [
+        mode
+        for i, mode in enumerate(distinct_modes(candidates))
+        if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
+    ]
+    return modes or None  # None, because populations that shrink to a point have no mass
 
 
 def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:

@@ -127,8 +127,14 @@ def check_simulators(evaluator: Evaluator) -> Checked:
             text = (
                 f"{simulator.name}: its responses are those of a surface through {len(table)} "
                 f"runs, with a cross-validated error of {share:.2g} standard deviations of the "
-                f"observed responses{'' if share <= largest else f', expected at most {largest}'}."
+                "observed responses"
             )
+            if share > largest:
+                advice = (
+                    table.outlier_advice() or "add the runs that prb.propose_runs(model) returns"
+                )
+                text += f", expected at most {largest}; {advice}"
+            text += "."
             report = (Finding("table-error", text, "runs.md#the-error-of-the-surface"),)
             checked += Checked(report) if share > largest else Checked(remarks=report)
     return checked + Checked(tuple(unlabelled_specimens(all_simulators(evaluator.model))))

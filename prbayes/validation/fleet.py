@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from prbayes._display import Tree, View
-from prbayes._finding import Finding, counted, report
+from prbayes._finding import Finding, counted, from_json, report
 from prbayes._progress import progress, shown
 from prbayes._stats import reached
 from prbayes._validate import (
@@ -30,6 +30,7 @@ from prbayes._validate import (
     seed_number,
     share,
 )
+from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
@@ -39,9 +40,9 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
-from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
+from prbayes.posterior.sample import draw_posterior, importance_chains, mode_findings
 from prbayes.posterior.smc import SamplingSettings
-from prbayes.posterior.target import specimen_target
+from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
@@ -95,9 +96,10 @@ def calibrate_each(
         ArviZ's summary or forest plot; NaN for products that failed. Group ``observed_data``: the
         data, with rows of NaN after the last specimen of a product. ``each.sel(product="A")`` has
         both of one product, for all functions that take a result. Group ``products``, by product:
-        ``pareto_k`` of importance sampling (NaN for another
-        sampler), ``finding`` (why it failed, or which specimens no inputs reproduce; else an empty
-        text), and with ``validation`` the ``statistic``, ``critical_value``, ``p_value`` and
+        ``pareto_k`` of importance sampling (NaN for another sampler), ``finding`` (why it failed,
+        which specimens no inputs reproduce, populations without a response, or modes of the
+        posterior; else an empty text), and with ``validation`` the ``statistic``,
+        ``critical_value``, ``p_value`` and
         ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
 
     Raises
@@ -283,8 +285,8 @@ class Fleet:
         """Return the posterior and the validity test of one product."""
         evaluator = self._evaluator(name)
         with designs_restored(evaluator.reweighted.values()):
-            values, pareto_k = self._posterior(evaluator)
-            finding = " ".join(map(_misfit, evaluator.likelihoods))
+            values, pareto_k, texts = self._posterior(evaluator)
+            finding = " ".join(filter(None, [*map(_misfit, evaluator.likelihoods), *texts]))
             if name not in self.further:
                 return Calibration(values, pareto_k, finding=finding)
             test = area_test(
@@ -294,12 +296,14 @@ class Fleet:
         areas = (test.statistic, test.critical_value, test.p_value)
         return Calibration(values, pareto_k, areas, finding)
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float]:
-        """Return draws of the hyperparameters, and Pareto k of importance sampling."""
+    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float, list[str]]:
+        """Return draws of the hyperparameters, Pareto k of importance sampling, and findings."""
         variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
         posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
         pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
-        return {name: posterior[name].values[0] for name in variables}, pareto_k
+        codes = ("lost-mass", "second-mode")
+        texts = [f.text for f in from_json(posterior.attrs["findings"]) if f.code in codes]
+        return {name: posterior[name].values[0] for name in variables}, pareto_k, texts
 
     def _evaluator(self, name: str) -> Evaluator:
         """Return the evaluator of a product's data."""
@@ -346,17 +350,19 @@ class SpecimenFleet(Fleet):
         first = sum(sizes[: names.index(name)])
         return np.arange(first, first + len(self.observed[name]))
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float]:
-        """Return draws of the hyperparameters, and Pareto k of importance sampling."""
+    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float, list[str]]:
+        """Return draws of the hyperparameters, Pareto k of importance sampling, and findings."""
         # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
         modes = modes_of(target)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
-        if chains is None:
+        if modes is None or chains is None:
             return super()._posterior(evaluator)
+        refuse_lost_specimens(evaluator, chains.thetas[0].mean(axis=0))
+        texts = [f.text for f in mode_findings(target, modes, chains.thetas)]
         values = evaluator.hyperparameters.constrained(chains.thetas[0])
         variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
-        return {name: values[name] for name in variables}, chains.sampler["pareto_k"]
+        return {name: values[name] for name in variables}, chains.sampler["pareto_k"], texts
 
     def _evaluator(self, name: str) -> Evaluator:
         """Return the evaluator of a product's data."""

@@ -167,3 +167,23 @@ def test_inputs_that_determine_no_surface_are_named(make: Any, kind: str) -> Non
     )
     with pytest.raises(ValueError, match=message):
         make({"a": a, "c": c}, a)
+
+
+@pytest.mark.parametrize("output", [0, 1])
+def test_the_run_that_causes_the_error_is_named(output: int) -> None:
+    x = np.random.default_rng(0).uniform(-1, 2, (60, 2))
+    y = np.stack([x[:, 0] + 0.2 * x[:, 1] ** 2, 100 * np.exp(x[:, 1])], axis=1)
+    inputs = {"a": x[:, 0], "b": x[:, 1]}
+    assert prb.Runs(inputs, y).outlier_advice() == ""
+    y[17, output] += 0.05 * y[:, output].std()
+    advice = prb.Runs(inputs, y).outlier_advice()
+    assert advice.startswith(
+        f"correct or leave out row 17 of the table (counted from 0; a = {x[17, 0]:.4g}"
+    )
+
+
+def test_errors_of_many_runs_are_those_of_no_single_run() -> None:
+    rng = np.random.default_rng(1)
+    x = np.linspace(-3, 5, 40)
+    for y in (np.abs(x - 1.07), x + rng.normal(0, 0.1, 40), 1 / (x - 1.07), np.sin(9 * x)):
+        assert prb.Runs({"x": x}, y).outlier_advice() == ""

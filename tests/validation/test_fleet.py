@@ -1,5 +1,6 @@
 """Products of a fleet have the posteriors that they have alone."""
 
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -114,6 +115,36 @@ def test_a_product_that_no_inputs_reproduce_is_a_finding_of_its_own() -> None:
     findings = table["finding"].values.tolist()
     assert findings[:3] == ["", "", ""]
     assert "reproduce the readings of 18 of 18 specimens" in findings[3]
+
+
+def nan_below(x: Any) -> Any:
+    return np.where(x < 0.3, np.nan, 2 * x)
+
+
+@pytest.mark.parametrize("metric", [None, prb.KullbackLeibler()])
+def test_a_product_with_lost_mass_is_refused_as_alone(metric: prb.Metric | None) -> None:
+    x = np.random.default_rng(1).normal(0, 0.3, (3, 12))
+    data = {"right": 2 * (x[0] + 2), "lossy": 2 * np.sort(x[1] + 0.5)[-9:], "also": 2 * (x[2] + 2)}
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", 1.2, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", nan_below, inputs, observed=data["lossy"], metric=metric)
+    fleet = prb.calibrate_each(data, model=model, draws=100, **QUIET)
+    first, lossy, last = fleet["products"]["finding"].values.tolist()
+    assert first == last == ""
+    with pytest.raises(RuntimeError, match="lost mass") as alone:
+        prb.sample(100, model=model, **QUIET)
+    pattern = r"\d+\.\d%"  # the shares differ by the runs
+    assert re.sub(pattern, "", lossy) == "lossy: " + re.sub(pattern, "", str(alone.value))
+
+
+def test_modes_of_a_product_are_reported() -> None:
+    x = np.random.default_rng(2).normal(1.5, 0.3, (2, 12))
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", 0, 1.5), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", np.square, inputs, observed=x[0] ** 2)
+    fleet = prb.calibrate_each({"A": x[0] ** 2, "B": x[1] ** 2}, model=model, draws=100, **QUIET)
+    for text in fleet["products"]["finding"].values:
+        assert "The posterior has 2 modes" in text
 
 
 def test_a_failure_leaves_the_other_products(monkeypatch: pytest.MonkeyPatch) -> None:
