@@ -174,31 +174,6 @@ class Runs(Shown):
         errors = np.quantile(np.abs(residuals), 0.9, axis=0)
         return float((errors / positive_scale(sd, np.inf)).max())
 
-    def outlier_advice(self) -> str:
-        """Return advice on the run that causes most of the error; empty if no single run does.
-
-        Without it the root mean square of the left-out errors of the others is less than a fifth.
-        """
-        values = self.responses.reshape(len(self), -1)
-        scale = positive_scale(np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0))
-        errors = np.abs(self.error.residuals.reshape(values.shape)) / scale
-        row = int(np.nanargmax(errors.max(axis=1)))
-        is_kept = np.arange(len(self)) != row
-        domain, points = self.surrogate.domain, self.points[is_kept]
-        others = RunTable(domain, points, self.responses[is_kept], self.outputs)
-        refitted = Surrogate.of_table("Runs", others).error.residuals
-        refitted = refitted.reshape(values[is_kept].shape) / scale
-        share = float(np.sqrt(np.nanmean(refitted**2) / np.nanmean(errors[is_kept] ** 2)))
-        if not share < 0.2:
-            return ""
-        names = [*self.columns, *self.outputs]
-        pairs = zip(names, [*self.points[row], *values[row]], strict=True)
-        numbers = ", ".join(f"{name} = {value:.4g}" for name, value in list(pairs)[:4])
-        return (
-            f"correct or leave out row {row} of the table (counted from 0; {numbers}), without "
-            f"which this error is {max(share, 0.01):.0%} of that at the other runs"
-        )
-
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""
         expected = self.surrogate.domain.sizes
@@ -263,3 +238,29 @@ def left_out_nearby(runs: Runs, *inputs: ArrayLike) -> Any:
     columns, batch = surrogate.domain.columns(inputs)
     residuals = surrogate._surface.nearby(surrogate.error.residuals, columns)[:, 0]
     return with_output_labels(surrogate, residuals, batch)
+
+
+def outlier_advice(runs: Runs) -> str:
+    """Return advice on the run that causes most of the error; empty if no single run does.
+
+    Without it the root mean square of the left-out errors of the others is less than a fifth.
+    """
+    values = runs.responses.reshape(len(runs), -1)
+    scale = positive_scale(np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0))
+    errors = np.abs(runs.error.residuals.reshape(values.shape)) / scale
+    row = int(np.nanargmax(errors.max(axis=1)))
+    is_kept = np.arange(len(runs)) != row
+    domain, points = runs.surrogate.domain, runs.points[is_kept]
+    reduced = RunTable(domain, points, runs.responses[is_kept], runs.outputs)
+    refitted = Surrogate.of_table("Runs", reduced).error.residuals
+    refitted = refitted.reshape(values[is_kept].shape) / scale
+    share = float(np.sqrt(np.nanmean(refitted**2) / np.nanmean(errors[is_kept] ** 2)))
+    if not share < 0.2:
+        return ""
+    names = [*runs.columns, *runs.outputs]
+    pairs = zip(names, [*runs.points[row], *values[row]], strict=True)
+    numbers = ", ".join(f"{name} = {value:.4g}" for name, value in list(pairs)[:4])
+    return (
+        f"correct or leave out row {row} of the table (counted from 0; {numbers}), without "
+        f"which this error is {max(share, 0.01):.0%} of that at the other runs"
+    )

@@ -13,7 +13,7 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._finding import any_of
 from prbayes._validate import Floats
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.divergence import ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
@@ -104,7 +104,7 @@ def remedies_of(likelihood: SpecimenLikelihood) -> tuple[str, str]:
 def table_advice(likelihood: SpecimenLikelihood) -> str:
     """Return advice on the runs of tables: to correct one that is an outlier, or to add runs."""
     tables = [cast(Runs, m.responses.function) for m in likelihood.measurements]
-    advice = [table.outlier_advice() for table in tables]
+    advice = map(outlier_advice, tables)
     return next(filter(None, advice), "add the runs that prb.propose_runs(model) returns")
 
 

@@ -231,8 +231,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                 raise DesignError(
                     f"{likelihood.name}: got NaN from the response for a share of the population "
                     "that is not negligible, expected a response of all specimens with "
-                    "prb.response.condition, since that share depends on the condition; return a "
-                    "number there, such as the limit of the measurement, or inf if they fail"
+                    "prb.response.condition, since that share depends on the condition; return "
+                    "inf there if these specimens fail, or a number beside all readings"
                 )
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)

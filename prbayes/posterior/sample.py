@@ -27,7 +27,6 @@ from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
 from prbayes.posterior.mode_masses import has_valley, modes_finding
 from prbayes.posterior.results import Chains, require_selection, selected
-from prbayes.posterior.saddlepoint import score_obstacle
 from prbayes.posterior.smc import (
     Likelihood,
     SamplingSettings,
@@ -209,10 +208,9 @@ def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[F
     pairs = zip(separate, factors, strict=True)
     distances = [np.linalg.norm((thetas - mode.mode) @ root.T, axis=1) for mode, root in pairs]
     shares = np.bincount(np.argmin(distances, axis=0), minlength=len(separate)) / len(thetas)
-    # Refits gave twelve pairs of mirror populations, with equal masses, shares of .47 to .59.
-    is_uncertain = target.evaluator.nodes and score_obstacle(target.evaluator) is not None
-    error = " (uncertain by .1, because they rest on refits)" if is_uncertain else ""
     places = np.array([mode.mode for mode in separate])
+    largest = target.errors_of_shares(places, shares).max()
+    error = f" (standard error {largest:.1g}, because they rest on refits)" if largest else ""
     return modes_finding(target.evaluator, places, shares, error)
 
 

@@ -74,6 +74,20 @@ class Target:
     log_likelihood: LogDensity  # sum of all terms except the priors
     starts: Floats  # (M, d): points near the modes
     scale: Floats  # (d,): unit of each element for `laplace`
+    # log-likelihoods, each without a block of the synthetic data sets; none without refits
+    without_blocks: Sequence[LogDensity] = ()
+
+    def errors_of_shares(self, modes: Floats, shares: Floats) -> Floats:
+        """Return jackknife standard errors, (M,), of shares of modes, (M, d), because of refits.
+
+        Without a block of the data sets a share changes as the density at its mode does.
+        """
+        if not self.without_blocks:
+            return np.zeros(len(shares))
+        changes = np.array([block(modes) for block in self.without_blocks])
+        weights = shares * np.exp(changes - changes.mean(axis=0))
+        replicates = weights / weights.sum(axis=1, keepdims=True)
+        return np.asarray(np.sqrt((len(changes) - 1) * replicates.var(axis=0)))
 
     def log_posterior(self, thetas: Floats) -> Floats:
         """Return the unnormalised log-density, (S, d) -> (S,); -inf where it is not known."""
@@ -144,7 +158,10 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale)
+    blocks: list[LogDensity] = []
+    if isinstance(likelihood, RefitLikelihood) and likelihood.counts:
+        blocks = [likelihood.without_block(block, 8).log_likelihood for block in range(8)]
+    return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale, blocks)
 
 
 def require_density(evaluator: Evaluator) -> None:
@@ -163,16 +180,17 @@ def require_density(evaluator: Evaluator) -> None:
     for node in evaluator.nodes:
         if node.bound.random:
             reason = "its discrepancy is random"
-            expected = "prb.Reweighted() or prb.Resimulated()"
+            expected, scale = "prb.Reweighted() or prb.Resimulated()", " and epsilon="
         elif obstacle is not None and not node.bound.stored:
             reason = obstacle
-            expected = "prb.Reweighted(), whose stored responses can be refitted"
+            expected, scale = "prb.Reweighted(), whose stored responses can be refitted", ""
         else:
             continue
         raise ValueError(
             f"{node.name}: propagation: got {type(node.propagation).__name__}, with which the "
             f"distribution of the estimate is not known ({reason}); expected {expected}, or "
-            "prb.sample_smc with adjustment=None, whose draws are as wide as epsilon makes them"
+            f"prb.sample_smc with adjustment=None{scale}, whose draws are as wide as epsilon "
+            "makes them"
         )
 
 
@@ -256,6 +274,17 @@ class RefitLikelihood:
     estimates: Floats = field(default_factory=lambda: np.empty((0, 0)))
     is_near: Bools = field(default_factory=lambda: np.empty(0, dtype=bool))
     log_mixture: Floats = field(default_factory=lambda: np.empty(0))
+
+    def without_block(self, block: int, number: int) -> RefitLikelihood:
+        """Return the likelihood without one of a number of blocks of the synthetic data sets."""
+        is_kept = np.arange(len(self.is_near)) % number != block
+        return replace(
+            self,
+            counts=tuple(count[is_kept] for count in self.counts),
+            estimates=self.estimates[is_kept[self.is_near]],
+            is_near=self.is_near[is_kept],
+            log_mixture=self.log_mixture[is_kept],
+        )
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:

@@ -20,7 +20,7 @@ from scipy.special import softmax
 from prbayes._finding import Finding, Findings, counted
 from prbayes._stats import positive_scale
 from prbayes._validate import Floats
-from prbayes.emulators.runs import Runs
+from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -131,7 +131,7 @@ def check_simulators(evaluator: Evaluator) -> Checked:
             )
             if share > largest:
                 advice = (
-                    table.outlier_advice() or "add the runs that prb.propose_runs(model) returns"
+                    outlier_advice(table) or "add the runs that prb.propose_runs(model) returns"
                 )
                 text += f", expected at most {largest}; {advice}"
             text += "."

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -264,3 +265,164 @@ def test_an_array_with_a_number_of_each_specimen_is_a_condition() -> None:
     text = re.search(r"prb\.response\.condition\(.*?\)", str(caught.value))
     assert text is not None
     fit(eval(text.group(), {"prb": prb, "values": LOADS}))
+
+
+# -- remedies of refusals that come with the runs, or with a result --
+
+# A call of a small model with options, of the response, of the simulator or of the function in
+# question; the regular expression of the advice in the refusal; the options that follow it.
+type Use = Callable[..., Any]
+SETTINGS: Mapping[str, Any] = {"progressbar": False, "random_seed": 1}
+AT_LEAST = 0.72 + np.abs(DATA - 0.72)
+
+
+def below(value: float) -> Callable[..., Any]:
+    """Return the input, times the load if there is one, with a value where it is below .7."""
+
+    def response(x: Any, load: Any = 1.0) -> Any:
+        return np.where(x < 0.7, value, x * load)
+
+    return response
+
+
+LOSSY = below(np.nan)
+
+
+def model_of(*inputs: Callable[[], Any], response: Any = np.positive, **options: Any) -> pm.Model:
+    with pm.Model() as model:
+        settings = {"observed": AT_LEAST, "progressbar": False, **options}
+        prb.Simulator("y", response, *[make() for make in inputs], **settings)
+    return model
+
+
+def sampled(*inputs: Callable[[], Any], function: Any = prb.sample, **options: Any) -> Any:
+    keywords = {k: options.pop(k) for k in ("epsilon", "adjustment") if k in options}
+    return function(100, model=model_of(*inputs, **options), **keywords, **SETTINGS)
+
+
+def table(without: int | None = None) -> Any:
+    """Sample with a table of runs, row 20 of which is wrong."""
+    x = np.linspace(-3, 5, 40)
+    y = x + 0.5 * (np.arange(40) == 20)
+    is_kept = np.arange(40) != (-1 if without is None else without)
+    return sampled(population, response=prb.Runs({"x": x[is_kept]}, y[is_kept]))
+
+
+def product(select: str = "fleet") -> Any:
+    """Return the table of a population from a fleet, or from a product of it."""
+    model = model_of(population)
+    fleet = prb.calibrate_each({"A": DATA, "B": DATA + 1}, model=model, draws=50, progressbar=False)
+    return prb.population(eval(select, {"fleet": fleet}), model=model, n_draws=50)
+
+
+def fleet_of(response: Any = LOSSY, **options: Any) -> None:
+    """Return the findings of products; raise for the first one that is refused."""
+    data = {"A": AT_LEAST + 1, "B": AT_LEAST, "C": AT_LEAST + 1}
+    model = model_of(population, response=response, **options)
+    fleet = prb.calibrate_each(data, model=model, draws=50, progressbar=False)
+    if fleet["products"]["finding"].values[1]:
+        raise DesignError(str(fleet["products"]["finding"].values[1]))
+
+
+def joined(**options: Any) -> None:
+    """Build two simulators of the same specimens with labels by an index."""
+    index = [f"s{i}" for i in range(20)]
+    options = options or {"dims": "specimen"}
+    with pm.Model(coords={"specimen": index}):
+        x = population()
+        for name in "yz":
+            prb.Simulator(name, np.positive, x, observed=DATA, **options)
+
+
+def kernel(call: str = "None") -> Any:
+    model = model_of(population, metric=PR)
+    eval(call, {"prb": prb, "model": model})
+    with model:
+        return prb.posterior.BatchedKernel(20)
+
+
+LOST = r"return \+inf for specimens that fail, or pass a larger max_lost, as in "
+LOST += r"propagation=prb\.Reweighted\(n, max_lost=\.\.\.\)"
+LARGER = {"propagation": prb.Reweighted(max_lost=0.5)}
+USED: Mapping[str, tuple[Use, Mapping[str, Any], str, list[dict[str, Any]]]] = {
+    "lost mass": (
+        partial(sampled, population),
+        {"response": LOSSY},
+        LOST,
+        [{"response": below(np.inf)}, LARGER],
+    ),
+    "lost mass, labels": (
+        partial(sampled, population, specimens=np.arange(20)),
+        {"response": LOSSY},
+        LOST,
+        [{"response": below(np.inf)}, LARGER],
+    ),
+    "lost mass, fleet": (fleet_of, {}, LOST, [{"response": below(np.inf)}, LARGER]),
+    "lost mass, metric": (
+        partial(sampled, population, metric=PR),
+        {"response": LOSSY},
+        r"return \+inf for specimens that fail, narrow the priors, or raise max_lost",
+        [{"response": below(np.inf)}, {"propagation": prb.Reweighted(max_lost=0.9)}],
+    ),
+    "no response under a condition": (
+        partial(sampled, population, load),
+        {"response": LOSSY, "observed": AT_LEAST * LOADS},
+        "return inf there if these specimens fail, or a number beside all readings",
+        [{"response": below(0.0)}, {"response": below(np.inf)}],
+    ),
+    "an outlier of a table": (table, {}, "or leave out row 20 ", [{"without": 20}]),
+    "epsilon of a likelihood": (
+        partial(sampled, population, function=prb.sample_smc),
+        {"epsilon": 0.1},
+        "leave epsilon= out, or pass adjustment=None with a metric",
+        [{"epsilon": None}, {"adjustment": None, "metric": PR}],
+    ),
+    "random responses": (
+        partial(sampled, population, metric=PR),
+        {"propagation": prb.Fresh(64)},
+        r"expected prb\.Reweighted\(\) or prb\.Resimulated\(\), or prb\.sample_smc with "
+        "adjustment=None and epsilon=",
+        [
+            {"propagation": prb.Reweighted()},
+            {"propagation": prb.Resimulated(256)},
+            {"function": prb.sample_smc, "adjustment": None, "epsilon": 0.05},
+        ],
+    ),
+    "refits need stored responses": (
+        partial(sampled, population, metric=AREA),
+        {"propagation": prb.Resimulated(256)},
+        r"expected prb\.Reweighted\(\), whose .*, or prb\.sample_smc with adjustment=None",
+        [
+            {"propagation": prb.Reweighted()},
+            {"function": prb.sample_smc, "adjustment": None},
+        ],
+    ),
+    "a fleet is no single result": (
+        product,
+        {},
+        r"fleet\.sel\(product='A'\)",
+        [{"select": "fleet.sel(product='A')"}],
+    ),
+    "equal labels": (
+        joined,
+        {},
+        r"pass specimens=\[str\(label\) for label in index\] to both and leave dims= out",
+        [{"specimens": [f"s{i}" for i in range(20)]}],
+    ),
+    "no epsilon": (
+        kernel,
+        {},
+        r"prb\.set_epsilon\(model, prb\.calibrate_epsilon\(prb\.minimize\(model\)\)\)",
+        [{"call": "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model)))"}],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", USED)
+def test_each_remedy_gets_past_the_refusal_of_a_use(case: str) -> None:
+    use, options, advice, remedies = USED[case]
+    with pytest.raises((TypeError, ValueError, RuntimeError)) as caught:
+        use(**options)
+    assert re.search(advice, str(caught.value)), str(caught.value)
+    for remedy in remedies:
+        use(**options | remedy)
