@@ -23,6 +23,51 @@ def effective_sample_size(weights: Floats) -> Floats:
     return 1 / (weights**2).sum(axis=-1)
 
 
+def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
+    """Return smoothed log weights that sum to one, (..., n), and the shape k of their tail, (...).
+
+    The largest weights are replaced by quantiles of a generalised Pareto distribution [1]_, which
+    is fitted as by Zhang and Stephens [2]_. The shape is NaN, and nothing is replaced, if a quarter
+    of the tail is equal.
+
+    References
+    ----------
+    .. [1] Vehtari, A., D. Simpson, A. Gelman, Y. Yao and J. Gabry (2024), Pareto smoothed
+       importance sampling, J. Mach. Learn. Res. 25(72), 1-58.
+    .. [2] Zhang, J. and M. A. Stephens (2009), A new and efficient estimation method for the
+       generalized Pareto distribution, Technometrics 51(3), 316-325, doi:10.1198/tech.2009.08017.
+    """
+    shape, size = log_w.shape[:-1], log_w.shape[-1]
+    result = (log_w - log_w.max(axis=-1, keepdims=True)).reshape(-1, size)
+    n = int(3 * np.sqrt(size)) if size > 225 else size // 5
+    order = np.argpartition(result, size - n - 1, axis=1)[:, size - n - 1 :]
+    tail = np.take_along_axis(result, order, axis=1)
+    ascending = np.argsort(tail, axis=1)
+    order = np.take_along_axis(order, ascending, axis=1)[:, 1:]
+    tail = np.exp(np.take_along_axis(tail, ascending, axis=1))
+    cutoff, tail = tail[:, :1], tail[:, 1:] - tail[:, :1]
+    with np.errstate(all="ignore"):
+        # Profile likelihoods of candidates b = -k / sigma, (rows, m).
+        m = 30 + int(np.sqrt(n))
+        quarter, largest = tail[:, int(n / 4 + 0.5) - 1, None], tail[:, -1:]
+        b = (1 - np.sqrt(m / (np.arange(m) + 0.5))) / (3 * quarter) + 1 / largest
+        k = np.log(1 - b[:, :, None] * tail[:, None]).mean(axis=2)
+        profile = n * (np.log(-b / k) - k - 1)
+        weights = normalised_weights(profile)
+        weights[weights < 10 * np.finfo(float).eps] = 0.0
+        b = (b * weights).sum(axis=1, keepdims=True) / weights.sum(axis=1, keepdims=True)
+        k = np.log1p(-b * tail).mean(axis=1, keepdims=True)
+        sigma = -k / b
+        k = (n * k + 5) / (n + 10)  # a weak prior with the mean .5
+        log_p = np.log1p(-(np.arange(n) + 0.5) / n)
+        smoothed = np.log(cutoff + sigma * np.expm1(-k * log_p) / k)
+    k[quarter <= tail[:, :1]] = np.nan
+    rows = np.flatnonzero(np.isfinite(smoothed).all(axis=1) & np.isfinite(k[:, 0]))
+    result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)
+    result -= logsumexp(result, axis=1, keepdims=True)
+    return result.reshape(log_w.shape), k.reshape(shape)
+
+
 def student_vectors(u: Floats, degrees: float) -> Floats:
     """Return vectors of a standard t distribution, (n, d), from uniform numbers, (n, d + 1)."""
     radius = np.sqrt(degrees / chdtri(degrees, u[:, -1]))
@@ -95,8 +140,11 @@ class StudentMixture:
         return np.asarray(self.centers[component] + shifts)
 
     def log_densities(self, points: Floats) -> Floats:
-        """Return log(share times density) of each component, (S, M)."""
-        nu, d = self.degrees, points.shape[1]
+        """Return log(share times density) of each component, (S, M).
+
+        Points are (S, d), or (M, S, d) where each component has its own.
+        """
+        nu, d = self.degrees, points.shape[-1]
         log_det = np.log(np.einsum("mdd->md", self.roots)).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
         tail = (nu + d) / 2 * np.log1p(self.squares(points) / nu)

@@ -20,7 +20,7 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_audit import audited_evaluator
-from prbayes.numerics.modes import Laplace, distinct_modes, laplace
+from prbayes.numerics.modes import Laplace, modes_each, of_one
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum, point_text
 from prbayes.posterior import smc
@@ -235,22 +235,11 @@ def _has_valley(target: Target, a: Floats, b: Floats) -> bool:
 
 def modes_of(target: Target) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
-    starts = target.starts
     try:
-        if len(starts) > 1:
-            # Continue once from starts that are on the way to the same mode.
-            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
-            starts = np.stack([mode.mode for mode in distinct_modes(rough)])
-        candidates = laplace(target.log_posterior, starts, target.scale)
+        (modes,) = modes_each(of_one(target.log_posterior), [target.starts], target.scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    highest = max(mode.log_mass for mode in candidates)
-    modes = [
-        mode
-        for i, mode in enumerate(distinct_modes(candidates))
-        if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
-    ]
-    return modes or None  # None, because populations that shrink to a point have no mass
+    return modes or None
 
 
 def importance_chains(

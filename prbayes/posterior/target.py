@@ -87,8 +87,14 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
     thetas = evaluator.hyperparameters.prior_points(1024, 0)
-    order = np.argsort(-target.log_posterior(thetas), kind="stable")
-    return replace(target, starts=far_apart(thetas[order[: len(thetas) // 4]], 8, prior_sd))
+    starts = specimen_starts(thetas, target.log_posterior(thetas), prior_sd)
+    return replace(target, starts=starts)
+
+
+def specimen_starts(thetas: Floats, log_p: Floats, unit: Floats) -> Floats:
+    """Return eight of the thetas, (n, d), from their likeliest quarter; far apart in a unit."""
+    order = np.argsort(-log_p, kind="stable")
+    return far_apart(thetas[order[: len(thetas) // 4]], 8, unit)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
