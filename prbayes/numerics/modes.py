@@ -77,35 +77,40 @@ def laplace_each(
         return log_density(points, number[rows])
 
     for _ in range(steps):
-        value, gradient, hessian = central_derivatives(of_rows, modes[rows], 0.05 * sd[rows])
-        values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-        # Absolute eigenvalues give a step away from a saddle, and Newton's step at a mode.
-        size = np.maximum(np.abs(values), 0.01)
-        inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
-        covariance = inverse * np.outer(scale, scale)
-        direction = np.einsum("mde,me->md", covariance, gradient)
+        height[rows], gradient, hessian = central_derivatives(of_rows, modes[rows], 0.05 * sd[rows])
+        covariances[rows], is_maximum = _inverse_curvature(hessian, scale)
+        direction = np.einsum("mde,me->md", covariances[rows], gradient)
         decrement = np.einsum("md,md->m", gradient, direction)
-        new_sd = np.sqrt(np.einsum("mdd->md", covariance))
+        new_sd = np.sqrt(np.einsum("mdd->md", covariances[rows]))
         ratio = new_sd / sd[rows]
         same_step = ((ratio < 2) & (ratio > 0.5)).all(axis=1)
-        is_maximum = values.min(axis=1) > -0.01
-        converged = same_step & (decrement < 1e-3) & is_maximum
-        height[rows], covariances[rows], is_done[rows] = value, covariance, converged
+        is_done[rows] = same_step & (decrement < 1e-3) & is_maximum
         is_open = (np.bincount(number, ~is_done) > 0)[number[rows]]
         if not is_open.any():
             break
-        rows, value, direction = rows[is_open], value[is_open], direction[is_open]
+        rows = rows[is_open]
         sd[rows] = np.minimum(new_sd[is_open], 10 * sd[rows])
-        trials = modes[rows, None] + lengths[:, None] * direction[:, None]
+        trials = modes[rows, None] + lengths[:, None] * direction[is_open, None]
         heights = np.nan_to_num(of_rows(trials), nan=-np.inf)
         best = heights.argmax(axis=1)
-        is_higher = heights[np.arange(len(rows)), best] > value
-        rises = np.flatnonzero(~is_done[rows] & is_higher)
+        rises = ~is_done[rows] & (heights.max(axis=1) > height[rows])
         modes[rows[rises]] = trials[rises, best[rises]]
     _, log_det = np.linalg.slogdet(covariances)
     log_mass = height + log_det / 2 + d / 2 * np.log(2 * np.pi)
     results = zip(modes, covariances, log_mass.tolist(), is_done.tolist(), strict=True)
     return [Laplace(*result) for result in results]
+
+
+def _inverse_curvature(hessian: Floats, scale: Floats) -> tuple[Floats, Bools]:
+    """Return the inverse of negative Hessians, (M, d, d), and which are those of maxima, (M,).
+
+    Absolute eigenvalues give a step away from a saddle, and Newton's step at a mode.
+    """
+    units = np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(-hessian * units)
+    size = np.maximum(np.abs(values), 0.01)
+    inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
+    return inverse * units, values.min(axis=1) > -0.01
 
 
 def distinct_modes(modes: list[Laplace]) -> list[Laplace]:

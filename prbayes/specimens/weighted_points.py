@@ -188,17 +188,17 @@ class ProductPoints:
         parameters = np.hstack([natural, np.ones((len(natural), 1))])
         parameters = parameters.reshape(len(products), -1, parameters.shape[1])
         result = (parameters @ self.single[products][:, :, None])[..., 0]
-        k, size = self.several.shape[1], parameters.shape[2]
+        k = self.several.shape[1]
         # Blocks of products and populations whose exponents stay in the cache of the processor.
         width = max(1, k * int(self.count[products].max()))
         step = max(64, IN_CACHE // 4 // width)
-        some = max(1, IN_CACHE // 4 // (width * min(step, result.shape[1])))
-        for start in range(0, len(products), some):
-            rows = slice(start, start + some)
+        size = max(1, IN_CACHE // 4 // (width * min(step, result.shape[1])))
+        for start in range(0, len(products), size):
+            rows = slice(start, start + size)
             n = int(self.count[products[rows]].max())
             if not n:
                 continue
-            terms = self.several[products[rows], :, :n].reshape(-1, k * n, size)
+            terms = self.several[products[rows], :, :n].reshape(-1, k * n, parameters.shape[2])
             for first in range(0, result.shape[1], step):
                 columns = slice(first, first + step)
                 exponents = terms @ parameters[rows, columns].swapaxes(1, 2)
@@ -210,8 +210,8 @@ class ProductPoints:
         is_rounded = (is_rounded & (result.ravel() > -1e6)) | is_invalid
         by_product = is_rounded.reshape(result.shape)
         for row in np.flatnonzero(by_product.any(axis=1)):
-            own = slice(*self.ends[products[row] : products[row] + 2])
-            x, log_a = [x[own] for x in self.points.x], self.points.log_a[own]
+            specimens = slice(*self.ends[products[row] : products[row] + 2])
+            x, log_a = [v[specimens] for v in self.points.x], self.points.log_a[specimens]
             columns = by_product[row]
             narrow = [v.reshape(*result.shape, *v.shape[1:])[row, columns] for v in parents]
             points = replace(self.points, x=x, log_a=log_a)

@@ -317,11 +317,12 @@ class Fleet:
         (node,) = self.evaluator.nodes
         evaluator = self.evaluator.observing({node.name: self.observed[name]})
         with designs_restored(evaluator.reweighted.values()):
-            values, pareto_k = posterior_of(evaluator, self.settings)
+            posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
+            values = values_of_variables(evaluator, {k: v.values[0] for k, v in posterior.items()})
             draw, predicted = partial(draw_responses, evaluator), None
             if name in self.further:
                 (predicted,) = self._predicted([values], draw)
-        return Drawn(values, pareto_k, predicted)
+        return Drawn(values, float(posterior.attrs.get("pareto_k", np.nan)), predicted)
 
     def _predicted(
         self, posteriors: Sequence[NamedArrays], draw: Callable[..., Floats], n: int = 50
@@ -336,12 +337,9 @@ class Fleet:
         return np.split(draw(rng, thinned, n), len(posteriors))
 
 
-def posterior_of(evaluator: Evaluator, settings: SamplingSettings) -> tuple[NamedArrays, float]:
-    """Return draws of the model's variables, and Pareto k of importance sampling."""
-    variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
-    posterior = draw_posterior(evaluator, settings)["posterior"].to_dataset()
-    pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
-    return {name: posterior[name].values[0] for name in variables}, pareto_k
+def values_of_variables(evaluator: Evaluator, values: Mapping[Any, Floats]) -> NamedArrays:
+    """Return the values of the model's variables, in the model's order."""
+    return {str(rv.name): values[rv.name] for rv in evaluator.model.unobserved_RVs}
 
 
 def draw_responses(
@@ -391,17 +389,19 @@ class SpecimenFleet(Fleet):
             return {}
         thetas = np.concatenate([sample.draws for sample in samples if sample is not None])
         of_all = self.evaluator.hyperparameters.constrained(thetas)
+        draws = self.settings.draws
         values = [
-            {
-                str(rv.name): of_all[str(rv.name)][first : first + self.settings.draws]
-                for rv in self.evaluator.model.unobserved_RVs
-            }
-            for first in range(0, len(thetas), self.settings.draws)
+            values_of_variables(
+                self.evaluator, {k: v[first : first + draws] for k, v in of_all.items()}
+            )
+            for first in range(0, len(thetas), draws)
         ]
         tested = [place for place, row in enumerate(rows) if names[row] in self.further]
-        predicted = (
-            self._predicted([values[place] for place in tested], self._draw) if tested else []
-        )
+        predicted: list[Floats] = []
+        if tested:
+            # Products differ in their specimens, and not in the way in which these are measured.
+            draw = partial(draw_readings_of, likelihood)
+            predicted = self._predicted([values[place] for place in tested], draw)
         by_place = dict(zip(tested, predicted, strict=True))
         findings = _misfits(likelihood, sizes)
         pareto_k = [np.nan if sample is None else sample.pareto_k for sample in samples]
@@ -420,19 +420,25 @@ class SpecimenFleet(Fleet):
         modes = modes_of(target)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if chains is None:
-            values, pareto_k = posterior_of(evaluator, self.settings)
+            posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
+            of_all: Mapping[Any, Floats] = {k: v.values[0] for k, v in posterior.items()}
+            pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
         else:
             of_all = evaluator.hyperparameters.constrained(chains.thetas[0])
-            values = {str(rv.name): of_all[str(rv.name)] for rv in evaluator.model.unobserved_RVs}
             pareto_k = chains.sampler["pareto_k"]
+        values = values_of_variables(evaluator, of_all)
         (finding,) = _misfits(likelihood, [len(self.observed[name])])
-        predicted = self._predicted([values], self._draw)[0] if name in self.further else None
+        predicted = None
+        if name in self.further:
+            (predicted,) = self._predicted([values], partial(draw_readings_of, likelihood))
         return Drawn(values, pareto_k, predicted, finding)
 
-    def _draw(self, rng: np.random.Generator, values: Mapping[str, Floats], n: int) -> Floats:
-        """Return readings of new specimens, (P, n) or (P, n, m)."""
-        # Products differ in their specimens, and not in the way in which these are measured.
-        return draw_readings(self.likelihood, rng, values, n, self.likelihood.measurements[0])
+
+def draw_readings_of(
+    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats], n: int
+) -> Floats:
+    """Return readings of new specimens of the populations, (P, n) or (P, n, m)."""
+    return draw_readings(likelihood, rng, values, n, likelihood.measurements[0])
 
 
 def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
