@@ -24,7 +24,7 @@ def effective_sample_size(weights: Floats) -> Floats:
 
 
 def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
-    """Return smoothed log weights that sum to one, (..., n), and the shape k of their tail, (...).
+    """Return log weights (P, n) so that rows are smooth and sum to one, and tail shapes k, (P,).
 
     The largest weights are replaced by quantiles of a generalised Pareto distribution [1]_, which
     is fitted as by Zhang and Stephens [2]_. The shape is NaN, and nothing is replaced, if a quarter
@@ -37,35 +37,36 @@ def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
     .. [2] Zhang, J. and M. A. Stephens (2009), A new and efficient estimation method for the
        generalized Pareto distribution, Technometrics 51(3), 316-325, doi:10.1198/tech.2009.08017.
     """
-    shape, size = log_w.shape[:-1], log_w.shape[-1]
-    result = (log_w - log_w.max(axis=-1, keepdims=True)).reshape(-1, size)
+    size = log_w.shape[1]
+    result = log_w - log_w.max(axis=1, keepdims=True)
     n = int(3 * np.sqrt(size)) if size > 225 else size // 5
-    order = np.argpartition(result, size - n - 1, axis=1)[:, size - n - 1 :]
-    tail = np.take_along_axis(result, order, axis=1)
-    ascending = np.argsort(tail, axis=1)
-    order = np.take_along_axis(order, ascending, axis=1)[:, 1:]
-    tail = np.exp(np.take_along_axis(tail, ascending, axis=1))
+    order = np.argsort(result, axis=1)[:, -n - 1 :]
+    tail = np.exp(np.take_along_axis(result, order, axis=1))
+    order = order[:, 1:]
     cutoff, tail = tail[:, :1], tail[:, 1:] - tail[:, :1]
+    m = 30 + int(np.sqrt(n))
+    quarter, largest = tail[:, int(n / 4 + 0.5) - 1, None], tail[:, -1:]
+    grid = 1 - np.sqrt(m / (np.arange(m) + 0.5))
+    log_p = np.log1p(-(np.arange(n) + 0.5) / n)
     with np.errstate(all="ignore"):
         # Profile likelihoods of candidates b = -k / sigma, (rows, m).
-        m = 30 + int(np.sqrt(n))
-        quarter, largest = tail[:, int(n / 4 + 0.5) - 1, None], tail[:, -1:]
-        b = (1 - np.sqrt(m / (np.arange(m) + 0.5))) / (3 * quarter) + 1 / largest
-        k = np.log(1 - b[:, :, None] * tail[:, None]).mean(axis=2)
+        b = grid / (3 * quarter) + 1 / largest
+        terms = 1 - b[:, :, None] * tail[:, None]
+        k = np.log(terms).mean(axis=2)
         profile = n * (np.log(-b / k) - k - 1)
         weights = normalised_weights(profile)
-        weights[weights < 10 * np.finfo(float).eps] = 0.0
-        b = (b * weights).sum(axis=1, keepdims=True) / weights.sum(axis=1, keepdims=True)
+        b = (b * weights).sum(axis=1, keepdims=True)
         k = np.log1p(-b * tail).mean(axis=1, keepdims=True)
         sigma = -k / b
         k = (n * k + 5) / (n + 10)  # a weak prior with the mean .5
-        log_p = np.log1p(-(np.arange(n) + 0.5) / n)
-        smoothed = np.log(cutoff + sigma * np.expm1(-k * log_p) / k)
+        quantiles = np.expm1(-k * log_p) / k
+        smoothed = np.log(cutoff + sigma * quantiles)
     k[quarter <= tail[:, :1]] = np.nan
-    rows = np.flatnonzero(np.isfinite(smoothed).all(axis=1) & np.isfinite(k[:, 0]))
+    is_smoothed = np.isfinite(smoothed).all(axis=1)
+    rows = np.flatnonzero(is_smoothed & np.isfinite(k[:, 0]))
     result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)
     result -= logsumexp(result, axis=1, keepdims=True)
-    return result.reshape(log_w.shape), k.reshape(shape)
+    return result, k[:, 0]
 
 
 def student_vectors(u: Floats, degrees: float) -> Floats:

@@ -127,7 +127,8 @@ def modes_each(
 ) -> list[list[Laplace]]:
     """Return distinct modes of each density from its starts, (M, d), the largest masses first.
 
-    All densities have one start, or all have several. Modes with less than e^-10 of the largest mass are left out.
+    All densities have one start, or all have several. Modes with less than e^-10 of the largest
+    mass are left out.
     """
     if max(map(len, starts)) > 1:
         # Continue once from starts that are on the way to the same mode.

@@ -61,45 +61,46 @@ class ProductPosteriors:
         log_p[~np.isfinite(log_p)] = -np.inf
         return log_p.reshape(thetas.shape[:2]), log_prior.reshape(thetas.shape[:2])
 
-    def samples(
-        self, products: Indices, settings: SamplingSettings
-    ) -> list[ImportanceSample | None]:
-        """Return draws of products (A,) with one mode by importance sampling.
+    def samples(self, products: Indices, settings: SamplingSettings) -> dict[int, ImportanceSample]:
+        """Return draws of the products (A,) with one mode by importance sampling.
 
-        None for the others, and where the weights of the first proposal are not even enough.
+        Products are left out where the weights of the first proposal are not even enough.
         """
         try:
             return self._samples(products, settings)
         except (ValueError, np.linalg.LinAlgError):
             if len(products) == 1:
-                return [None]
-        halves = np.array_split(products, 2)
-        return [sample for half in halves for sample in self.samples(half, settings)]
+                return {}
+        first, second = np.array_split(products, 2)
+        return self.samples(first, settings) | self.samples(second, settings)
 
     def _samples(
         self, products: Indices, settings: SamplingSettings
-    ) -> list[ImportanceSample | None]:
+    ) -> dict[int, ImportanceSample]:
         """Return `samples`; an error of one product is raised for all."""
         hyperparameters = self.evaluator.hyperparameters
+        unit = hyperparameters.prior_sd
         thetas = hyperparameters.prior_points(1024, 0)
         log_p, _ = self.log_densities(np.stack([thetas] * len(products)), products)
-        starts = [specimen_starts(thetas, row, hyperparameters.prior_sd) for row in log_p]
-        modes = modes_each(
-            lambda points, numbers: self.log_densities(points, products[numbers])[0],
-            starts,
-            hyperparameters.prior_sd,
-        )
-        result: list[ImportanceSample | None] = [None] * len(products)
+        starts = [specimen_starts(thetas, row, unit) for row in log_p]
+
+        def log_density(points: Floats, numbers: Indices) -> Floats:
+            return self.log_densities(points, products[numbers])[0]
+
+        modes = modes_each(log_density, starts, unit)
         single = np.flatnonzero([len(of_product) == 1 for of_product in modes])
         seed = settings.random_seed or 0
-        for block in np.array_split(single, 1 + len(single) // 25):
-            drawn = importance_samples(
+        prior_points = hyperparameters.prior_thetas(settings.draws // 5, seed)
+        result = {}
+        for block in np.array_split(single, 1 + len(single) // 25) if single.size else ():
+            samples = importance_samples(
                 partial(self.log_densities, products=products[block]),
                 [modes[i][0] for i in block],
-                hyperparameters.prior_thetas(settings.draws // 5, seed),
+                prior_points,
                 settings.draws,
                 seed,
             )
-            for i, sample in zip(block.tolist(), drawn, strict=True):
-                result[i] = sample
+            for product, sample in zip(products[block].tolist(), samples, strict=True):
+                if sample is not None:
+                    result[product] = sample
         return result

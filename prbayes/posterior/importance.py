@@ -21,7 +21,6 @@ from prbayes._validate import Floats
 from prbayes.numerics.mixtures import (
     StudentMixture,
     effective_sample_size,
-    normalised_weights,
     pareto_smoothed,
     student_vectors,
 )
@@ -171,7 +170,8 @@ def _resampled(
     shuffled = rng.permutation(size)
     rows = order[reached(weights[:, order], positions)[:, shuffled]]
     effective = effective_sample_size(weights)
-    is_reliable = (pareto_k <= options.pareto_k) & (effective >= options.effective * size)
+    is_reliable = effective >= options.effective * size
+    is_reliable &= pareto_k <= options.pareto_k
     log_evidence = logsumexp(log_ratio, axis=1) - np.log(n)
     return [
         ImportanceSample(
@@ -203,7 +203,8 @@ def importance_samples(
     centers = np.stack([mode.mode for mode in modes])
     roots = np.linalg.cholesky([mode.covariance for mode in modes])
     count, d = options.oversampling * size, centers.shape[1]
-    standard = student_vectors(sobol(count, d + 2, seed)[:, : d + 1], options.degrees)
+    u = sobol(count, d + 2, seed)
+    standard = student_vectors(u[:, : d + 1], options.degrees)
     drawn = centers[:, None] + standard @ roots.swapaxes(1, 2)
     of_prior = np.broadcast_to(prior_points, (len(modes), *prior_points.shape))
     points = np.concatenate([drawn, of_prior], axis=1)
@@ -211,12 +212,8 @@ def importance_samples(
     n = points.shape[1]
     proposals = StudentMixture(centers, roots, np.ones(len(modes)), options.degrees)
     log_q = proposals.log_densities(points).T
-    pilot = min(max(count // 8, 512), count)
-    weights = normalised_weights((log_p - log_q)[:, :pilot])
-    is_poor = effective_sample_size(weights) < pilot * options.effective / options.oversampling
-    log_mixture = np.logaddexp(log_q + np.log(count / n), log_prior + np.log((n - count) / n))
-    samples = _resampled(points, log_p, log_p - log_mixture, size, seed, options)
-    return [
-        sample if sample.is_reliable and not poor else None
-        for sample, poor in zip(samples, is_poor, strict=True)
-    ]
+    from_modes = log_q + np.log(count / n)
+    from_prior = log_prior + np.log((n - count) / n)
+    log_ratio = log_p - np.logaddexp(from_modes, from_prior)
+    samples = _resampled(points, log_p, log_ratio, size, seed, options)
+    return [sample if sample.is_reliable else None for sample in samples]

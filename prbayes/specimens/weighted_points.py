@@ -187,7 +187,8 @@ class ProductPoints:
         natural, is_invalid = form.natural_parameters(at_anchors, np.inf)
         parameters = np.hstack([natural, np.ones((len(natural), 1))])
         parameters = parameters.reshape(len(products), -1, parameters.shape[1])
-        result = (parameters @ self.single[products][:, :, None])[..., 0]
+        single = self.single[products]
+        result = (parameters @ single[:, :, None])[..., 0]
         k = self.several.shape[1]
         # Blocks of products and populations whose exponents stay in the cache of the processor.
         width = max(1, k * int(self.count[products].max()))
@@ -202,12 +203,14 @@ class ProductPoints:
             for first in range(0, result.shape[1], step):
                 columns = slice(first, first + step)
                 exponents = terms @ parameters[rows, columns].swapaxes(1, 2)
-                by_point = exponents.reshape(len(terms), k, n, -1).swapaxes(0, 1)
-                result[rows, columns] += _log_sum_exp_first(by_point).sum(axis=1)
+                by_point = exponents.reshape(len(terms), k, n, -1)
+                logs = _log_sum_exp_first(by_point.swapaxes(0, 1))
+                result[rows, columns] += logs.sum(axis=1)
         result[result < -1e299] = -np.inf
         # Rounding matters where the density is not so low that the population is impossible.
         is_rounded = np.abs(at_anchors).max(axis=1) >= self.points.largest
-        is_rounded = (is_rounded & (result.ravel() > -1e6)) | is_invalid
+        is_rounded &= result.ravel() > -1e6
+        is_rounded |= is_invalid
         by_product = is_rounded.reshape(result.shape)
         for row in np.flatnonzero(by_product.any(axis=1)):
             specimens = slice(*self.ends[products[row] : products[row] + 2])
@@ -215,7 +218,8 @@ class ProductPoints:
             columns = by_product[row]
             narrow = [v.reshape(*result.shape, *v.shape[1:])[row, columns] for v in parents]
             points = replace(self.points, x=x, log_a=log_a)
-            result[row, columns] = points.by_graph(narrow).sum(axis=1)
+            logs = points.by_graph(narrow)
+            result[row, columns] = logs.sum(axis=1)
         return result
 
 

@@ -318,7 +318,7 @@ class Fleet:
         evaluator = self.evaluator.observing({node.name: self.observed[name]})
         with designs_restored(evaluator.reweighted.values()):
             posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
-            values = values_of_variables(evaluator, {k: v.values[0] for k, v in posterior.items()})
+            values = values_of_variables(evaluator, posterior)
             draw, predicted = partial(draw_responses, evaluator), None
             if name in self.further:
                 (predicted,) = self._predicted([values], draw)
@@ -337,9 +337,10 @@ class Fleet:
         return np.split(draw(rng, thinned, n), len(posteriors))
 
 
-def values_of_variables(evaluator: Evaluator, values: Mapping[Any, Floats]) -> NamedArrays:
-    """Return the values of the model's variables, in the model's order."""
-    return {str(rv.name): values[rv.name] for rv in evaluator.model.unobserved_RVs}
+def values_of_variables(evaluator: Evaluator, posterior: xr.Dataset) -> NamedArrays:
+    """Return draws of the first chain, (draws, *shape), of the model's variables."""
+    names = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
+    return {name: posterior[name].values[0] for name in names}
 
 
 def draw_responses(
@@ -367,7 +368,8 @@ class SpecimenFleet(Fleet):
     def _rows(self) -> dict[str, Indices]:
         """The rows of each product among the specimens of all."""
         ends = np.cumsum([len(values) for values in self.observed.values()])
-        return dict(zip(self.observed, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
+        parts = np.split(np.arange(ends[-1]), ends[:-1])
+        return dict(zip(self.observed, parts, strict=True))
 
     def _likelihood(self, names: Sequence[str]) -> SpecimenLikelihood:
         """Return the likelihood of the specimens of some products, with their points."""
@@ -381,33 +383,29 @@ class SpecimenFleet(Fleet):
         likelihood = self._likelihood(names)
         sizes = [len(self.observed[name]) for name in names]
         posteriors = ProductPosteriors.of(self.evaluator, likelihood, sizes)
-        samples = (
-            [] if posteriors is None else posteriors.samples(np.arange(len(names)), self.settings)
-        )
-        rows = [row for row, sample in enumerate(samples) if sample is not None]
-        if not rows:
+        if posteriors is None:
             return {}
-        thetas = np.concatenate([sample.draws for sample in samples if sample is not None])
-        of_all = self.evaluator.hyperparameters.constrained(thetas)
+        samples = posteriors.samples(np.arange(len(names)), self.settings)
+        if not samples:
+            return {}
         draws = self.settings.draws
-        values = [
-            values_of_variables(
-                self.evaluator, {k: v[first : first + draws] for k, v in of_all.items()}
-            )
-            for first in range(0, len(thetas), draws)
-        ]
-        tested = [place for place, row in enumerate(rows) if names[row] in self.further]
-        predicted: list[Floats] = []
+        thetas = np.concatenate([sample.draws for sample in samples.values()])
+        of_all = self.evaluator.hyperparameters.constrained(thetas)
+        values = {}
+        for place, row in enumerate(samples):
+            rows = slice(place * draws, (place + 1) * draws)
+            values[row] = {name: value[rows] for name, value in of_all.items()}
+        tested = [row for row in samples if names[row] in self.further]
+        predicted: dict[int, Floats] = {}
         if tested:
             # Products differ in their specimens, and not in the way in which these are measured.
             draw = partial(draw_readings_of, likelihood)
-            predicted = self._predicted([values[place] for place in tested], draw)
-        by_place = dict(zip(tested, predicted, strict=True))
+            responses = self._predicted([values[row] for row in tested], draw)
+            predicted = dict(zip(tested, responses, strict=True))
         findings = _misfits(likelihood, sizes)
-        pareto_k = [np.nan if sample is None else sample.pareto_k for sample in samples]
         return {
-            names[row]: Drawn(values[place], pareto_k[row], by_place.get(place), findings[row])
-            for place, row in enumerate(rows)
+            names[row]: Drawn(values[row], sample.pareto_k, predicted.get(row), findings[row])
+            for row, sample in samples.items()
         }
 
     def _singly(self, name: str) -> Drawn:
@@ -421,12 +419,11 @@ class SpecimenFleet(Fleet):
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if chains is None:
             posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
-            of_all: Mapping[Any, Floats] = {k: v.values[0] for k, v in posterior.items()}
+            values = values_of_variables(evaluator, posterior)
             pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
         else:
-            of_all = evaluator.hyperparameters.constrained(chains.thetas[0])
+            values = evaluator.hyperparameters.constrained(chains.thetas[0])
             pareto_k = chains.sampler["pareto_k"]
-        values = values_of_variables(evaluator, of_all)
         (finding,) = _misfits(likelihood, [len(self.observed[name])])
         predicted = None
         if name in self.further:
@@ -490,13 +487,12 @@ def _misfits(
     misfit = np.where(np.isnan(residual), 0.0, residual**2).sum(axis=-1) / 2
     exists = np.isfinite(preparation.points.log_a) | (misfit > largest)
     is_poor = np.where(exists, misfit, np.inf).min(axis=1) > largest
-    return [
-        "No inputs in the range of the priors reproduce the readings of "
-        f"{part.sum()} of {len(part)} specimens."
-        if part.any()
-        else ""
-        for part in np.split(is_poor, np.cumsum(sizes)[:-1])
-    ]
+    findings = []
+    for part in np.split(is_poor, np.cumsum(sizes)[:-1]):
+        finding = "No inputs in the range of the priors reproduce the readings of"
+        finding += f" {part.sum()} of {len(part)} specimens."
+        findings.append(finding if part.any() else "")
+    return findings
 
 
 def _tree(

@@ -40,7 +40,7 @@ from prbayes.propagation.design import PoorEmulatorError
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings, data_digest, in_order, serving, specimen_names
-from prbayes.validation.pit import Case, Predictive, TestedCondition, between, own_steps
+from prbayes.validation.pit import Case, Predictive, TestedCondition, between
 
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.
 LEAST_REPLICATES = 19
@@ -155,7 +155,7 @@ class PosteriorNull(Null):
         if case.shares_specimens:
             # A shared specimen needs a response under all conditions.
             usable = [np.logical_and.reduce(usable)] * len(usable)
-        steps = [own_steps(c.predicted) for c in case.conditions]
+        steps = [Predictive(c.predicted).steps(c.predicted) for c in case.conditions]
         # Order of the samples of each draw, those with a response first, and the number of these.
         orders = [np.argsort(~is_usable, axis=1, kind="stable") for is_usable in usable]
         counts = [np.count_nonzero(is_usable, axis=1) for is_usable in usable]

@@ -509,22 +509,6 @@ class Predictive:
         return between(lower, upper, rng)
 
 
-def own_steps(values: Floats) -> tuple[Floats, Floats]:
-    """Return P(Y < y) and P(Y <= y) at all values y of a `Predictive`, in their shape."""
-    flat = values.ravel()
-    order = np.argsort(flat)  # NaN comes last
-    ascending = flat[order[: flat.size - np.isnan(flat).sum()]]
-    ranks = np.arange(ascending.size)
-    is_first = np.append(True, ascending[1:] != ascending[:-1])[: ascending.size]
-    # The first and the last place of equal values.
-    first = np.maximum.accumulate(np.where(is_first, ranks, 0))
-    is_last = np.append(is_first[1:], True)[: ascending.size]
-    last = np.minimum.accumulate(np.where(is_last, ranks, ascending.size)[::-1])[::-1]
-    steps = np.full((2, flat.size), np.nan)
-    steps[:, order[: ascending.size]] = np.stack([first, last + 1]) / max(1, ascending.size)
-    return steps[0].reshape(values.shape), steps[1].reshape(values.shape)
-
-
 def between(lower: Floats, upper: Floats, rng: np.random.Generator | None) -> Floats:
     """Return the middle of both bounds, or with a generator uniform numbers between them."""
     fraction = 0.5 if rng is None else rng.random(lower.shape)

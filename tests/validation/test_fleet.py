@@ -130,7 +130,7 @@ def test_products_of_a_batch_have_the_draws_that_they_have_singly(
         x = pm.Normal.dist(pm.Normal("mu", 0.5, 0.3), pm.HalfCauchy("sigma", 1e-3))
         prb.Simulator("y", lambda x: (x + 0.1) ** 2, x, observed=data["p0"], **QUIET)
     together = prb.calibrate_each(data, model=model, draws=100, **QUIET)
-    monkeypatch.setattr(ProductPosteriors, "samples", lambda *_: [None] * 4)
+    monkeypatch.setattr(ProductPosteriors, "samples", lambda *_: {})
     singly = prb.calibrate_each(data, model=model, draws=100, **QUIET)
     for name in ("mu", "sigma"):
         first, second = (tree["posterior"][name].values for tree in (together, singly))

@@ -13,7 +13,6 @@ from prbayes.validation.pit import (
     area,
     between,
     comparables,
-    own_steps,
     projections,
     read_case,
 )
@@ -227,13 +226,3 @@ def test_randomised_u_values_of_ties_are_uniform() -> None:
     normal = xr.DataArray(rng.normal(0, 1, (1, 1, 50_000)), dims=DIMS)
     u = u_values(rng.normal(0, 1, 2000).round(0), normal.round(0), randomize=True)
     assert EXACT.p_value(float(area(u)), 2000) > 0.01
-
-
-@pytest.mark.parametrize("unlike", [0.3, 1.0])
-def test_steps_at_the_predicted_values_themselves(unlike: float) -> None:
-    """With ties, failures and missing values."""
-    values = np.round(np.random.default_rng(0).normal(size=(4, 9)) / unlike) * unlike
-    values[0, :2], values[1, :2] = np.nan, np.inf
-    for found, expected in zip(own_steps(values), Predictive(values).steps(values), strict=True):
-        np.testing.assert_array_equal(found, expected)
-    assert np.isnan(own_steps(np.full((2, 2), np.nan))).all()
