@@ -274,21 +274,23 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
     location = np.zeros(z.shape[1])
     root = np.eye(z.shape[1])
     w = weights
+    columns = np.ascontiguousarray(z.T)  # because sums along rows take a third of the time
     # 40 to 150 steps converge for 50 values of 2 to 8 outputs, unless there is no scatter.
     for _ in range(2000):
-        x = (z - location) @ root
-        shift = w @ x
-        size, axes = _singular(x - shift, w)
-        largest = max(size[0], np.abs(root).max())
-        if not size[-1] > 1e-13 * largest:  # a combination has no scatter but rounding
-            return location, root, root @ axes[-1]
+        x = root.T @ (columns - location[:, None])
+        shift = x @ w
+        x -= shift[:, None]
+        values, axes = np.linalg.eigh((x * w) @ x.T)
+        size = np.sqrt(np.maximum(values, 0.0))
+        largest = max(size[-1], np.abs(root).max())
+        if not size[0] > 1e-13 * largest:  # a combination has no scatter but rounding
+            return location, root, root @ _singular(x.T, w)[1][-1]
         location = location + np.linalg.solve(root.T, shift)
-        root = root @ (axes.T / size)
+        root = root @ (axes / size)
         stretch = np.abs(size - 1).max()
         if max(stretch, np.abs(shift).max()) < 1e-9:
             break
-        white = (z - location) @ root
-        squares = (white**2).sum(axis=-1)
+        squares = np.square((axes / size).T @ x).sum(axis=0)
         w = weights / (1 + squares / degrees)
         w = w / w.sum()
     # Smallest variance of a combination of outputs, in units of their spread. Below 1e-10 it is the

@@ -74,7 +74,7 @@ def _array_values(likelihood: SpecimenLikelihood) -> tuple[list[Floats], Floats]
     return [variable.get_value(borrow=True) for variable in shared], log_a.get_value(borrow=True)
 
 
-def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
+def points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     """Return the points of the specimens of each group."""
     x, log_a = _array_values(likelihood)
     last: tuple[Any, list[WeightedPoints]] = likelihood.cache.get("points by group", (None, []))
@@ -94,9 +94,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     share, repeats = prepared(likelihood).share, likelihood.stacked.repeats
     errors = _errors(likelihood, values)
     parts = []
-    for (group, rows), points in zip(
-        likelihood.by_group, _points_by_group(likelihood), strict=True
-    ):
+    for (group, rows), points in zip(likelihood.by_group, points_by_group(likelihood), strict=True):
         parents = likelihood.parents(values, group, rows)
         parts.append(_of_points(likelihood, errors, parents, points, rows))
     result = parts[0]

@@ -70,15 +70,17 @@ def second_differences(value: ArrayFunction, r: int) -> Floats:
 def central_derivatives(
     function: ArrayFunction, thetas: Floats, steps: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return values, gradients and Hessians at M points by central differences, in one call."""
+    """Return values, gradients and Hessians at M points by central differences, in one call.
+
+    The function returns values, (M, n), of points (M, n, d).
+    """
     count, d = thetas.shape
     axes = steps[:, None] * np.eye(d)
     first, second = np.triu_indices(d, 1)
     diagonals = axes[:, first] + axes[:, second]
     center = np.zeros((count, 1, d))
     shifts = np.concatenate([center, axes, -axes, diagonals, -diagonals], axis=1)
-    points = thetas[:, None] + shifts
-    values = function(points.reshape(-1, d)).reshape(count, -1)
+    values = function(thetas[:, None] + shifts)
     if not np.isfinite(values).all():
         raise ValueError("got a log-density that is not finite around a mode")
     ends = np.cumsum([1, d, d, len(first)]).tolist()

@@ -23,6 +23,52 @@ def effective_sample_size(weights: Floats) -> Floats:
     return 1 / (weights**2).sum(axis=-1)
 
 
+def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
+    """Return log weights (P, n) so that rows are smooth and sum to one, and tail shapes k, (P,).
+
+    The largest weights are replaced by quantiles of a generalised Pareto distribution [1]_, which
+    is fitted as by Zhang and Stephens [2]_. The shape is NaN, and nothing is replaced, if a quarter
+    of the tail is equal.
+
+    References
+    ----------
+    .. [1] Vehtari, A., D. Simpson, A. Gelman, Y. Yao and J. Gabry (2024), Pareto smoothed
+       importance sampling, J. Mach. Learn. Res. 25(72), 1-58.
+    .. [2] Zhang, J. and M. A. Stephens (2009), A new and efficient estimation method for the
+       generalized Pareto distribution, Technometrics 51(3), 316-325, doi:10.1198/tech.2009.08017.
+    """
+    size = log_w.shape[1]
+    result = log_w - log_w.max(axis=1, keepdims=True)
+    n = int(3 * np.sqrt(size)) if size > 225 else size // 5
+    order = np.argsort(result, axis=1)[:, -n - 1 :]
+    tail = np.exp(np.take_along_axis(result, order, axis=1))
+    order = order[:, 1:]
+    cutoff, tail = tail[:, :1], tail[:, 1:] - tail[:, :1]
+    m = 30 + int(np.sqrt(n))
+    quarter, largest = tail[:, int(n / 4 + 0.5) - 1, None], tail[:, -1:]
+    grid = 1 - np.sqrt(m / (np.arange(m) + 0.5))
+    log_p = np.log1p(-(np.arange(n) + 0.5) / n)
+    with np.errstate(all="ignore"):
+        # Profile likelihoods of candidates b = -k / sigma, (rows, m).
+        b = grid / (3 * quarter) + 1 / largest
+        terms = 1 - b[:, :, None] * tail[:, None]
+        k = np.log(terms).mean(axis=2)
+        profile = n * (np.log(-b / k) - k - 1)
+        weights = normalised_weights(profile)
+        b = (b * weights).sum(axis=1, keepdims=True)
+        k = np.log1p(-b * tail).mean(axis=1, keepdims=True)
+        sigma = -k / b
+        k = (n * k + 5) / (n + 10)  # a weak prior with the mean .5
+        quantiles = np.expm1(-k * log_p) / k
+        smoothed = np.log(cutoff + sigma * quantiles)
+    k[quarter <= tail[:, :1]] = np.nan
+    is_smoothed = np.isfinite(smoothed).all(axis=1)
+    rows = np.flatnonzero(is_smoothed & np.isfinite(k[:, 0]))
+    result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)
+    result -= logsumexp(result, axis=1, keepdims=True)
+    return result, k[:, 0]
+
+
 def student_vectors(u: Floats, degrees: float) -> Floats:
     """Return vectors of a standard t distribution, (n, d), from uniform numbers, (n, d + 1)."""
     radius = np.sqrt(degrees / chdtri(degrees, u[:, -1]))
@@ -95,8 +141,11 @@ class StudentMixture:
         return np.asarray(self.centers[component] + shifts)
 
     def log_densities(self, points: Floats) -> Floats:
-        """Return log(share times density) of each component, (S, M)."""
-        nu, d = self.degrees, points.shape[1]
+        """Return log(share times density) of each component, (S, M).
+
+        Points are (S, d), or (M, S, d) where each component has its own.
+        """
+        nu, d = self.degrees, points.shape[-1]
         log_det = np.log(np.einsum("mdd->md", self.roots)).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
         tail = (nu + d) / 2 * np.log1p(self.squares(points) / nu)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from prbayes.numerics.points import farthest_rows
 
 # function of points, (S, d), that returns log-densities, (S,)
 LogDensity = Callable[[Floats], Floats]
+# function of points, (A, n, d), and numbers, (A,), that returns their log-densities, (A, n), in the
+# densities with these numbers
+RowDensity = Callable[[Floats, Indices], Floats]
 
 
 def far_apart(candidates: Floats, count: int, unit: Floats) -> Floats:
@@ -40,37 +44,73 @@ def laplace(
     log_density: LogDensity, starts: Floats, scale: Floats, steps: int = 20
 ) -> list[Laplace]:
     """Return the modes near starts, (M, d), by damped Newton steps with finite differences."""
+    return laplace_each(
+        of_one(log_density), starts, np.zeros(len(starts), dtype=np.intp), scale, steps
+    )
+
+
+def of_one(log_density: LogDensity) -> RowDensity:
+    """Return a density as the only one of a `RowDensity`."""
+
+    def log_densities(points: Floats, numbers: Indices) -> Floats:
+        return log_density(points.reshape(-1, points.shape[2])).reshape(points.shape[:2])
+
+    return log_densities
+
+
+def laplace_each(
+    log_density: RowDensity, starts: Floats, number: Indices, scale: Floats, steps: int = 20
+) -> list[Laplace]:
+    """Return the modes near starts, (M, d), of the densities with these numbers, (M,).
+
+    The steps of a density end when all of its starts have converged.
+    """
     modes = np.array(starts)
     count, d = modes.shape
     sd = np.tile(0.1 * scale, (count, 1))
+    height, covariances = np.empty(count), np.empty((count, d, d))
+    is_done = np.zeros(count, dtype=bool)
     lengths = np.array([2.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003])
+    rows = np.arange(count)
+
+    def of_rows(points: Floats) -> Floats:
+        return log_density(points, number[rows])
+
     for _ in range(steps):
-        value, gradient, hessian = central_derivatives(log_density, modes, 0.05 * sd)
-        values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-        # Absolute eigenvalues give a step away from a saddle, and Newton's step at a mode.
-        size = np.maximum(np.abs(values), 0.01)
-        inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
-        covariance = inverse * np.outer(scale, scale)
-        direction = np.einsum("mde,me->md", covariance, gradient)
+        height[rows], gradient, hessian = central_derivatives(of_rows, modes[rows], 0.05 * sd[rows])
+        covariances[rows], is_maximum = _inverse_curvature(hessian, scale)
+        direction = np.einsum("mde,me->md", covariances[rows], gradient)
         decrement = np.einsum("md,md->m", gradient, direction)
-        new_sd = np.sqrt(np.einsum("mdd->md", covariance))
-        ratio = new_sd / sd
+        new_sd = np.sqrt(np.einsum("mdd->md", covariances[rows]))
+        ratio = new_sd / sd[rows]
         same_step = ((ratio < 2) & (ratio > 0.5)).all(axis=1)
-        is_maximum = values.min(axis=1) > -0.01
-        converged = same_step & (decrement < 1e-3) & is_maximum
-        if converged.all():
+        is_done[rows] = same_step & (decrement < 1e-3) & is_maximum
+        is_open = (np.bincount(number, ~is_done) > 0)[number[rows]]
+        if not is_open.any():
             break
-        sd = np.minimum(new_sd, 10 * sd)
-        trials = modes[:, None] + lengths[:, None] * direction[:, None]
-        heights = np.nan_to_num(log_density(trials.reshape(-1, d)), nan=-np.inf)
-        heights = heights.reshape(count, -1)
+        rows = rows[is_open]
+        sd[rows] = np.minimum(new_sd[is_open], 10 * sd[rows])
+        trials = modes[rows, None] + lengths[:, None] * direction[is_open, None]
+        heights = np.nan_to_num(of_rows(trials), nan=-np.inf)
         best = heights.argmax(axis=1)
-        rises = ~converged & (heights[np.arange(count), best] > value)
-        modes[rises] = trials[rises, best[rises]]
-    _, log_det = np.linalg.slogdet(covariance)
-    log_mass = value + log_det / 2 + d / 2 * np.log(2 * np.pi)
-    results = zip(modes, covariance, log_mass.tolist(), converged.tolist(), strict=True)
+        rises = ~is_done[rows] & (heights.max(axis=1) > height[rows])
+        modes[rows[rises]] = trials[rises, best[rises]]
+    _, log_det = np.linalg.slogdet(covariances)
+    log_mass = height + log_det / 2 + d / 2 * np.log(2 * np.pi)
+    results = zip(modes, covariances, log_mass.tolist(), is_done.tolist(), strict=True)
     return [Laplace(*result) for result in results]
+
+
+def _inverse_curvature(hessian: Floats, scale: Floats) -> tuple[Floats, Bools]:
+    """Return the inverse of negative Hessians, (M, d, d), and which are those of maxima, (M,).
+
+    Absolute eigenvalues give a step away from a saddle, and Newton's step at a mode.
+    """
+    units = np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(-hessian * units)
+    size = np.maximum(np.abs(values), 0.01)
+    inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
+    return inverse * units, values.min(axis=1) > -0.01
 
 
 def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
@@ -80,6 +120,40 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
         if all(better.is_apart(mode) for better in distinct):
             distinct.append(mode)
     return distinct
+
+
+def modes_each(
+    log_density: RowDensity, starts: Sequence[Floats], scale: Floats
+) -> list[list[Laplace]]:
+    """Return distinct modes of each density from its starts, (M, d), the largest masses first.
+
+    All densities have one start, or all have several. Modes with less than e^-10 of the largest
+    mass are left out.
+    """
+    if max(map(len, starts)) > 1:
+        # Continue once from starts that are on the way to the same mode.
+        rough = _laplace_from(log_density, starts, scale, 6)
+        starts = [np.stack([mode.mode for mode in distinct_modes(modes)]) for modes in rough]
+    result = []
+    for candidates in _laplace_from(log_density, starts, scale, 20):
+        highest = max(mode.log_mass for mode in candidates)
+        modes = [
+            mode
+            for i, mode in enumerate(distinct_modes(candidates))
+            if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
+        ]
+        result.append(modes)  # empty where populations that shrink to a point have no mass
+    return result
+
+
+def _laplace_from(
+    log_density: RowDensity, starts: Sequence[Floats], scale: Floats, steps: int
+) -> list[list[Laplace]]:
+    """Return the modes near the starts of each density."""
+    sizes = [len(of_density) for of_density in starts]
+    number = np.repeat(np.arange(len(starts)), sizes)
+    modes = iter(laplace_each(log_density, np.concatenate(starts), number, scale, steps))
+    return [list(islice(modes, size)) for size in sizes]
 
 
 def ridges(log_density: LogDensity, modes: Sequence[Laplace]) -> list[Laplace]:

@@ -12,16 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
 from prbayes._stats import reached
 from prbayes._validate import Floats
-from prbayes.numerics.mixtures import StudentMixture, effective_sample_size
+from prbayes.numerics.mixtures import (
+    StudentMixture,
+    effective_sample_size,
+    pareto_smoothed,
+    student_vectors,
+)
 from prbayes.numerics.modes import Laplace, LogDensity, ridges
+from prbayes.numerics.points import sobol
 
 # prior as a proposal: function of size and seed that returns draws, (size, d), and log-density
 Prior = tuple[Callable[[int, int], Floats], LogDensity]
@@ -87,7 +91,7 @@ def importance_sample(
             [*proposals, (prior[1], n_prior)] if prior is not None and n_prior else proposals
         )
         log_ratio = log_p - balance_heuristic(points, densities)
-        sample = _resampled(points, log_p, log_ratio, size, seed, options)
+        (sample,) = _resampled(points[None], log_p[None], log_ratio[None], size, seed, options)
         # Stop if there are too few effective points for the moments of a mixture.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
         # Require more effective points of fitted proposals, which look better than they are until
@@ -151,26 +155,65 @@ def _resampled(
     size: int,
     seed: int,
     options: ImportanceOptions,
-) -> ImportanceSample:
-    """Return draws by Pareto-smoothed weights and systematic resampling."""
-    stats: Any = import_module("arviz_stats")
-    # ArviZ expects log-likelihoods, whose negatives are the log weights of leave-one-out.
-    smoothed, pareto_k = stats.base.array_stats.psislw(-log_ratio)
-    weights = np.exp(smoothed - logsumexp(smoothed))
+) -> list[ImportanceSample]:
+    """Return draws of P densities from points, (P, n, d), with log densities and ratios, (P, n).
+
+    By Pareto-smoothed weights and systematic resampling.
+    """
+    smoothed, pareto_k = pareto_smoothed(log_ratio)
+    weights, n = np.exp(smoothed), log_ratio.shape[1]
     rng = np.random.default_rng(seed)
     # Shuffle the points, because every fourth point of a Sobol sequence is in the same quarter.
-    order = rng.permutation(len(weights))
+    order = rng.permutation(n)
     positions = (np.arange(size) + rng.random()) / size
     # Shuffle the draws, because copies of a point are next to each other.
-    rows = rng.permutation(order[reached(weights[order], positions)])
-    efficiency = float(effective_sample_size(weights) / len(weights))
-    effective = efficiency * len(points)
-    return ImportanceSample(
-        points[rows],
-        log_p[rows],
-        pareto_k=float(pareto_k),
-        efficiency=efficiency,
-        effective_size=effective,
-        log_evidence=float(logsumexp(log_ratio) - np.log(len(log_ratio))),
-        is_reliable=pareto_k <= options.pareto_k and effective >= options.effective * size,
-    )
+    shuffled = rng.permutation(size)
+    rows = order[reached(weights[:, order], positions)[:, shuffled]]
+    effective = effective_sample_size(weights)
+    is_reliable = effective >= options.effective * size
+    is_reliable &= pareto_k <= options.pareto_k
+    log_evidence = logsumexp(log_ratio, axis=1) - np.log(n)
+    return [
+        ImportanceSample(
+            points[i, rows[i]],
+            log_p[i, rows[i]],
+            pareto_k=float(pareto_k[i]),
+            efficiency=float(effective[i] / n),
+            effective_size=float(effective[i]),
+            log_evidence=float(log_evidence[i]),
+            is_reliable=bool(is_reliable[i]),
+        )
+        for i in range(len(points))
+    ]
+
+
+def importance_samples(
+    log_density: Callable[[Floats], tuple[Floats, Floats]],
+    modes: Sequence[Laplace],
+    prior_points: Floats,
+    size: int,
+    seed: int,
+    options: ImportanceOptions = ImportanceOptions(),
+) -> list[ImportanceSample | None]:
+    """Return the first round of `importance_sample` of P densities with one mode each.
+
+    The function returns log-densities of points, (P, n, d) -> (P, n), and those of the prior, from
+    which the prior's points, (m, d), are drawn. None where the first round does not suffice.
+    """
+    centers = np.stack([mode.mode for mode in modes])
+    roots = np.linalg.cholesky([mode.covariance for mode in modes])
+    count, d = options.oversampling * size, centers.shape[1]
+    u = sobol(count, d + 2, seed)
+    standard = student_vectors(u[:, : d + 1], options.degrees)
+    drawn = centers[:, None] + standard @ roots.swapaxes(1, 2)
+    of_prior = np.broadcast_to(prior_points, (len(modes), *prior_points.shape))
+    points = np.concatenate([drawn, of_prior], axis=1)
+    log_p, log_prior = log_density(points)
+    n = points.shape[1]
+    proposals = StudentMixture(centers, roots, np.ones(len(modes)), options.degrees)
+    log_q = proposals.log_densities(points).T
+    from_modes = log_q + np.log(count / n)
+    from_prior = log_prior + np.log((n - count) / n)
+    log_ratio = log_p - np.logaddexp(from_modes, from_prior)
+    samples = _resampled(points, log_p, log_ratio, size, seed, options)
+    return [sample if sample.is_reliable else None for sample in samples]

@@ -44,7 +44,7 @@ from prbayes.model.evaluator import (
     with_targets,
 )
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.modes import Laplace, LogDensity, distinct_modes, far_apart, laplace
+from prbayes.numerics.modes import Laplace, LogDensity, far_apart, laplace, modes_each, of_one
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, element_order, optima_of
@@ -101,8 +101,14 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
     thetas = evaluator.hyperparameters.prior_points(1024, 0)
-    order = np.argsort(-target.log_posterior(thetas), kind="stable")
-    return replace(target, starts=far_apart(thetas[order[: len(thetas) // 4]], 8, prior_sd))
+    starts = specimen_starts(thetas, target.log_posterior(thetas), prior_sd)
+    return replace(target, starts=starts)
+
+
+def specimen_starts(thetas: Floats, log_p: Floats, unit: Floats) -> Floats:
+    """Return eight of the thetas, (n, d), from their likeliest quarter; far apart in a unit."""
+    order = np.argsort(-log_p, kind="stable")
+    return far_apart(thetas[order[: len(thetas) // 4]], 8, unit)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
@@ -133,22 +139,11 @@ def posterior_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
 
 def modes_of(target: Target) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
-    starts = target.starts
     try:
-        if len(starts) > 1:
-            # Continue once from starts that are on the way to the same mode.
-            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
-            starts = np.stack([mode.mode for mode in distinct_modes(rough)])
-        candidates = laplace(target.log_posterior, starts, target.scale)
+        (modes,) = modes_each(of_one(target.log_posterior), [target.starts], target.scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    highest = max(mode.log_mass for mode in candidates)
-    modes = [
-        mode
-        for i, mode in enumerate(distinct_modes(candidates))
-        if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
-    ]
-    return modes or None  # None, because populations that shrink to a point have no mass
+    return modes or None
 
 
 def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:

@@ -235,7 +235,7 @@ def area_test(
         _refuse_calibration_specimens(case)
     if case.shares_specimens:
         _require_same_samples(case)
-    report(*_excluded_failures(case))
+    report(*excluded_failures(case))
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
@@ -249,7 +249,7 @@ def area_test(
         null=null.describe(case),
         u_values=u,
         folded=folded,
-        envelope=np.array([judgement.lower, judgement.upper]),
+        envelope=np.array(judgement.envelope()),
         conditions=np.repeat(names, [c.observed.size for c in case.conditions]),
         specimens=np.array([label for c in case.conditions for label in c.specimens]),
         identity=case.identity,
@@ -276,7 +276,7 @@ def _refuse_calibration_specimens(case: Case) -> None:
         )
 
 
-def _excluded_failures(case: Case) -> list[Finding]:
+def excluded_failures(case: Case) -> list[Finding]:
     """Return findings of conditions with measured failures but no predicted ones."""
     findings = []
     for condition in case.conditions:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
@@ -40,6 +42,7 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
+from prbayes.posterior.batch import ProductPosteriors
 from prbayes.posterior.sample import draw_posterior, importance_chains, mode_findings
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import modes_of, specimen_target
@@ -47,8 +50,9 @@ from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
 from prbayes.specimens.coordinates import Coordinates
-from prbayes.validation.area_test import area_test
+from prbayes.validation.area_test import excluded_failures
 from prbayes.validation.nulls import PosteriorNull
+from prbayes.validation.pit import read_case
 
 
 @locked
@@ -84,7 +88,7 @@ def calibrate_each(
     alpha : float
         Significance level of the tests.
     executor : concurrent.futures.Executor, optional
-        Where products are calibrated, 25 at a time; the model is sent with cloudpickle. The result
+        Where products are calibrated, 100 at a time; the model is sent with cloudpickle. The result
         does not depend on it.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
@@ -154,7 +158,7 @@ def calibrate_each(
     if evaluator.likelihoods:
         likelihood = _common_likelihood(evaluator, observed)
         fleet = SpecimenFleet(**vars(fleet), likelihood=likelihood)
-    jobs = [names[first : first + 25] for first in range(0, len(names), 25)]
+    jobs = [names[first : first + 100] for first in range(0, len(names), 100)]
     with shown(progressbar), progress("products", len(names)) as advance:
         if executor is None:
             parts = [fleet.calibrated(job, lambda: advance(1, "")) for job in jobs]
@@ -252,6 +256,16 @@ class Calibration:
 
 
 @dataclass(frozen=True, eq=False)
+class Drawn:
+    """The posterior of one product, and what it predicts."""
+
+    values: NamedArrays  # hyperparameters, (draws, *shape)
+    pareto_k: float
+    predicted: Floats | None  # responses of populations, (P, n, ...); None without a test
+    finding: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class Fleet:
     """Products with a common model, whose simulator has a metric of distributions."""
 
@@ -271,65 +285,82 @@ class Fleet:
         self, names: Sequence[str], advance: Callable[[], Any] = lambda: None
     ) -> list[Calibration]:
         """Calibrate some products."""
+        drawn: dict[str, Drawn] = {}
+        with shown(False), suppress(ValueError, RuntimeError, np.linalg.LinAlgError):
+            drawn = self._in_batch(names)
         results = []
         for name in names:
             with shown(False):
                 try:
-                    results.append(self._calibrated(name))
+                    of_product = drawn.get(name) or self._singly(name)
+                    results.append(self._tested(name, of_product))
                 except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
                     results.append(Calibration({}, finding=f"{name}: {error}"))
             advance()
         return results
 
-    def _calibrated(self, name: str) -> Calibration:
-        """Return the posterior and the validity test of one product."""
-        evaluator = self._evaluator(name)
-        with designs_restored(evaluator.reweighted.values()):
-            values, pareto_k, texts = self._posterior(evaluator)
-            finding = " ".join(filter(None, [*map(_misfit, evaluator.likelihoods), *texts]))
-            if name not in self.further:
-                return Calibration(values, pareto_k, finding=finding)
-            test = area_test(
-                self.further[name], self._predicted(evaluator, values), alpha=self.alpha,
-                null=PosteriorNull(999), progressbar=False,
-            )  # fmt: skip
-        areas = (test.statistic, test.critical_value, test.p_value)
-        return Calibration(values, pareto_k, areas, finding)
+    def _tested(self, name: str, drawn: Drawn) -> Calibration:
+        """Return the posterior of a product with its validity test."""
+        result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
+        if name not in self.further:
+            return result
+        case = read_case(self.further[name], drawn.predicted)
+        report(*excluded_failures(case))
+        statistic = float(case.statistic(case.u_values()))
+        judgement = PosteriorNull(999).judge(case, statistic, self.alpha)
+        return replace(result, test=(statistic, judgement.critical_value, judgement.p_value))
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float, list[str]]:
-        """Return draws of the hyperparameters, Pareto k of importance sampling, and findings."""
-        variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
+    def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
+        """Return the posteriors of the products that are easily sampled together."""
+        return {}
+
+    def _singly(self, name: str) -> Drawn:
+        """Return the posterior of a product."""
+        (node,) = self.evaluator.nodes
+        evaluator = self.evaluator.observing({node.name: self.observed[name]})
+        with designs_restored(evaluator.reweighted.values()):
+            values, pareto_k, finding = self._sampled(evaluator)
+            draw, predicted = partial(draw_responses, evaluator), None
+            if name in self.further:
+                (predicted,) = self._predicted([values], draw)
+        return Drawn(values, pareto_k, predicted, finding)
+
+    def _sampled(self, evaluator: Evaluator) -> tuple[NamedArrays, float, str]:
+        """Return draws of the model's variables, Pareto k of importance sampling, and findings."""
         posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
-        pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
         codes = ("lost-mass", "second-mode")
         texts = [f.text for f in from_json(posterior.attrs["findings"]) if f.code in codes]
-        return {name: posterior[name].values[0] for name in variables}, pareto_k, texts
-
-    def _evaluator(self, name: str) -> Evaluator:
-        """Return the evaluator of a product's data."""
-        (node,) = self.evaluator.nodes
-        return self.evaluator.observing({node.name: self.observed[name]})
-
-    def _draw(
-        self, evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
-    ) -> Floats:
-        """Return responses of points of the populations, (P, n), by weight."""
-        free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
-        responses, weights = evaluator.populations(evaluator.hyperparameters.thetas_of(free), 0)
-        levels = (np.arange(n) + rng.random((len(weights), 1))) / n
-        rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
-        return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
+        pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
+        return values_of_variables(evaluator, posterior), pareto_k, " ".join(texts)
 
     def _predicted(
-        self, evaluator: Evaluator, values: Mapping[str, Floats], n: int = 50
-    ) -> xr.DataArray:
-        """Return responses of n specimens of calibrated populations, (1, draws, n, ...)."""
+        self, posteriors: Sequence[NamedArrays], draw: Callable[..., Floats], n: int = 50
+    ) -> list[Floats]:
+        """Return responses of n specimens of 100 populations of each posterior, (100, n, ...)."""
         rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
-        thinned = {name: value[rows] for name, value in values.items()}
+        thinned = {
+            name: np.concatenate([values[name][rows] for values in posteriors])
+            for name in posteriors[0]
+        }
         rng = np.random.default_rng(self.settings.random_seed)
-        responses = self._draw(evaluator, thinned, rng, n)
-        dims = ("chain", "draw", "sample", "output")[: responses.ndim + 1]
-        return xr.DataArray(responses[None], dims=dims)
+        return np.split(draw(rng, thinned, n), len(posteriors))
+
+
+def values_of_variables(evaluator: Evaluator, posterior: xr.Dataset) -> NamedArrays:
+    """Return draws of the first chain, (draws, *shape), of the model's variables."""
+    names = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
+    return {name: posterior[name].values[0] for name in names}
+
+
+def draw_responses(
+    evaluator: Evaluator, rng: np.random.Generator, values: Mapping[str, Floats], n: int
+) -> Floats:
+    """Return responses of points of the populations, (P, n), by weight."""
+    free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
+    responses, weights = evaluator.populations(evaluator.hyperparameters.thetas_of(free), 0)
+    levels = (np.arange(n) + rng.random((len(weights), 1))) / n
+    rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
+    return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -340,42 +371,82 @@ class SpecimenFleet(Fleet):
 
     def part(self, names: Sequence[str]) -> Self:
         """Return the fleet of some products."""
-        rows = np.concatenate([self._rows(name) for name in names])
-        return replace(super().part(names), likelihood=_of_rows(self.likelihood, rows))
+        return replace(super().part(names), likelihood=self._likelihood(names))
 
-    def _rows(self, name: str) -> Indices:
-        """Return the rows of a product among the specimens of all."""
-        names = list(self.observed)
-        sizes = [len(values) for values in self.observed.values()]
-        first = sum(sizes[: names.index(name)])
-        return np.arange(first, first + len(self.observed[name]))
+    @cached_property
+    def _rows(self) -> dict[str, Indices]:
+        """The rows of each product among the specimens of all."""
+        ends = np.cumsum([len(values) for values in self.observed.values()])
+        parts = np.split(np.arange(ends[-1]), ends[:-1])
+        return dict(zip(self.observed, parts, strict=True))
 
-    def _posterior(self, evaluator: Evaluator) -> tuple[NamedArrays, float, list[str]]:
-        """Return draws of the hyperparameters, Pareto k of importance sampling, and findings."""
+    def _likelihood(self, names: Sequence[str]) -> SpecimenLikelihood:
+        """Return the likelihood of the specimens of some products, with their points."""
+        rows = np.concatenate([self._rows[name] for name in names])
+        result, preparation = self.likelihood.of_rows(rows), prepared(self.likelihood)
+        result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
+        return result
+
+    def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
+        """Return the posteriors of the products that are easily sampled together."""
+        likelihood = self._likelihood(names)
+        sizes = [len(self.observed[name]) for name in names]
+        posteriors = ProductPosteriors.of(self.evaluator, likelihood, sizes)
+        if posteriors is None:
+            return {}
+        samples = posteriors.samples(np.arange(len(names)), self.settings)
+        if not samples:
+            return {}
+        draws = self.settings.draws
+        thetas = np.concatenate([sample.draws for sample in samples.values()])
+        of_all = self.evaluator.hyperparameters.constrained(thetas)
+        values = {}
+        for place, row in enumerate(samples):
+            rows = slice(place * draws, (place + 1) * draws)
+            values[row] = {name: value[rows] for name, value in of_all.items()}
+        tested = [row for row in samples if names[row] in self.further]
+        predicted: dict[int, Floats] = {}
+        if tested:
+            # Products differ in their specimens, and not in the way in which these are measured.
+            draw = partial(draw_readings_of, likelihood)
+            responses = self._predicted([values[row] for row in tested], draw)
+            predicted = dict(zip(tested, responses, strict=True))
+        findings = _misfits(likelihood, sizes)
+        return {
+            names[row]: Drawn(values[row], sample.pareto_k, predicted.get(row), findings[row])
+            for row, sample in samples.items()
+        }
+
+    def _singly(self, name: str) -> Drawn:
+        """Return the posterior of a product."""
+        likelihood = self._likelihood([name])
+        emulated = (EmulatedSimulator(likelihood, likelihood.measurements[0]),)
+        evaluator = replace(self.evaluator, emulated=emulated, has_graph=False)
         # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
         modes = modes_of(target)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if modes is None or chains is None:
-            return super()._posterior(evaluator)
-        refuse_lost_specimens(evaluator, chains.thetas[0].mean(axis=0))
-        texts = [f.text for f in mode_findings(target, modes, chains.thetas)]
-        values = evaluator.hyperparameters.constrained(chains.thetas[0])
-        variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
-        return {name: values[name] for name in variables}, chains.sampler["pareto_k"], texts
+            values, pareto_k, finding = self._sampled(evaluator)
+        else:
+            refuse_lost_specimens(evaluator, chains.thetas[0].mean(axis=0))
+            values = evaluator.hyperparameters.constrained(chains.thetas[0])
+            pareto_k = chains.sampler["pareto_k"]
+            finding = " ".join(f.text for f in mode_findings(target, modes, chains.thetas))
+        finding = " ".join(
+            filter(None, [*_misfits(likelihood, [len(self.observed[name])]), finding])
+        )
+        predicted = None
+        if name in self.further:
+            (predicted,) = self._predicted([values], partial(draw_readings_of, likelihood))
+        return Drawn(values, pareto_k, predicted, finding)
 
-    def _evaluator(self, name: str) -> Evaluator:
-        """Return the evaluator of a product's data."""
-        likelihood = _of_rows(self.likelihood, self._rows(name))
-        emulated = (EmulatedSimulator(likelihood, likelihood.measurements[0]),)
-        return replace(self.evaluator, emulated=emulated, has_graph=False)
 
-    def _draw(
-        self, evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
-    ) -> Floats:
-        """Return readings of new specimens, (P, n) or (P, n, m)."""
-        (likelihood,) = evaluator.likelihoods
-        return draw_readings(likelihood, rng, values, n, likelihood.measurements[0])
+def draw_readings_of(
+    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats], n: int
+) -> Floats:
+    """Return readings of new specimens of the populations, (P, n) or (P, n, m)."""
+    return draw_readings(likelihood, rng, values, n, likelihood.measurements[0])
 
 
 def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
@@ -413,15 +484,13 @@ def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> 
     return result
 
 
-def _of_rows(likelihood: SpecimenLikelihood, rows: Indices) -> SpecimenLikelihood:
-    """Return the likelihood of some of the specimens, with their points of quadrature."""
-    result, preparation = likelihood.of_rows(rows), prepared(likelihood)
-    result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
-    return result
+def _misfits(
+    likelihood: SpecimenLikelihood, sizes: Sequence[int], largest: float = 50.0
+) -> list[str]:
+    """Return a sentence about specimens whose readings no point reproduces to so many nats.
 
-
-def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
-    """Return a sentence about specimens whose readings no point reproduces to so many nats."""
+    For each product, which have so many specimens; an empty text where there are none.
+    """
     preparation = prepared(likelihood)
     readings = likelihood.readings
     sd = readings.comparison_sd(preparation.emulation.error)[:, None]
@@ -429,12 +498,12 @@ def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
     misfit = np.where(np.isnan(residual), 0.0, residual**2).sum(axis=-1) / 2
     exists = np.isfinite(preparation.points.log_a) | (misfit > largest)
     is_poor = np.where(exists, misfit, np.inf).min(axis=1) > largest
-    if not is_poor.any():
-        return ""
-    return (
-        f"No inputs in the range of the priors reproduce the readings of {is_poor.sum()} of "
-        f"{len(is_poor)} specimens."
-    )
+    findings = []
+    for part in np.split(is_poor, np.cumsum(sizes)[:-1]):
+        finding = "No inputs in the range of the priors reproduce the readings of"
+        finding += f" {part.sum()} of {len(part)} specimens."
+        findings.append(finding if part.any() else "")
+    return findings
 
 
 def _tree(
@@ -445,15 +514,14 @@ def _tree(
     attrs: Mapping[str, Any],
 ) -> Products:
     """Return the posteriors and the table of products."""
-    sizes = {"chain": 1, "draw": draws}
     first = next(row for row in rows if row.values)
     missing = {name: np.full_like(values, np.nan) for name, values in first.values.items()}
-    by_product = [
-        labelled(evaluator, {k: v[None] for k, v in (row.values or missing).items()}, sizes)
-        for row in rows
-    ]
-    posterior = xr.concat(by_product, xr.Variable("product", np.array(names)))
-    posterior = posterior.transpose("chain", "draw", "product", ...)
+    arrays = {
+        name: np.stack([(row.values or missing)[name] for row in rows], axis=1)[None]
+        for name in missing
+    }
+    posterior = labelled(evaluator, arrays, {"chain": 1, "draw": draws, "product": len(rows)})
+    posterior = posterior.assign_coords(product=np.array(names))
     columns = {
         "pareto_k": [row.pareto_k for row in rows],
         "finding": [row.finding for row in rows],

@@ -7,10 +7,10 @@ to the tested specimens themselves (`JointNull`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from typing import Any, ClassVar
 
@@ -48,12 +48,11 @@ LEAST_REPLICATES = 19
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """p-value and critical value, and bounds of the sorted values that are tested, (n,)."""
+    """p-value and critical value, and a function that returns the envelope of sorted values."""
 
     p_value: float
     critical_value: float
-    lower: Floats
-    upper: Floats
+    envelope: Callable[[], tuple[Floats, Floats]]  # lower and upper bounds, (n,)
 
 
 class Null(ABC):
@@ -100,12 +99,10 @@ def judge_by_replicates(
         )
     # The factor counts ties that differ by rounding.
     n_as_large = np.sum(areas >= statistic * (1 - 1e-12))
-    lower, upper = envelope(enveloped, alpha)
     return Judgement(
         p_value=float((1 + n_as_large) / total),
         critical_value=float(areas[areas.size - allowed - 1]),
-        lower=lower,
-        upper=upper,
+        envelope=partial(envelope, enveloped, alpha),
     )
 
 
@@ -314,12 +311,10 @@ class ExactModel(Null):
             pooled = replace(case, conditions=tuple(conditions))
             replicates = PosteriorNull().replicates_of(pooled)
             return judge_by_replicates(replicates, pooled, statistic, alpha)
-        lower, upper = uniform_envelope(case.size, alpha)
         return Judgement(
             p_value=self.p_value(statistic, case.size),
             critical_value=self.critical_value(case.size, alpha),
-            lower=lower,
-            upper=upper,
+            envelope=partial(uniform_envelope, case.size, alpha),
         )
 
 

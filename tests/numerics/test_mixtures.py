@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import arviz_stats
 import numpy as np
+import pytest
 from scipy.stats import multivariate_t
 
 from prbayes.numerics.mixtures import (
     StudentMixture,
     effective_sample_size,
     normalised_weights,
+    pareto_smoothed,
     student_vectors,
 )
 
@@ -49,3 +52,14 @@ def test_a_fitted_mixture_has_the_components_of_the_points() -> None:
     mixture = StudentMixture.fitted(points, weights, 2, 30.0, rng)
     np.testing.assert_allclose(np.sort(mixture.centers[:, 0]), [-5.0, 5.0], atol=0.15)
     np.testing.assert_allclose(mixture.shares, 0.5, atol=0.06)
+
+
+@pytest.mark.parametrize(("n", "scale"), [(60, 1.0), (300, 0.1), (2200, 5.0)])
+def test_smoothed_weights_are_those_of_arviz(n: int, scale: float) -> None:
+    log_w = scale * np.random.default_rng(n).exponential(size=(3, n))
+    smoothed, k = pareto_smoothed(log_w)
+    for row, weights, shape in zip(log_w, smoothed, k, strict=True):
+        expected, expected_k = arviz_stats.base.array_stats.psislw(-row)
+        np.testing.assert_allclose(weights, expected, atol=1e-9)
+        assert shape == pytest.approx(expected_k, abs=1e-9)
+    assert np.isnan(pareto_smoothed(np.zeros(n))[1])

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from prbayes._validate import Floats
-from prbayes.numerics.modes import Laplace, distinct_modes, far_apart, laplace, rows_by_mode
+from prbayes._validate import Floats, Indices
+from prbayes.numerics.modes import (
+    Laplace,
+    distinct_modes,
+    far_apart,
+    laplace,
+    modes_each,
+    rows_by_mode,
+)
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -79,3 +86,24 @@ def test_draws_are_split_into_their_modes() -> None:
     for rows in modes:
         # A normal exceeds the middle, five standard deviations away, in no draw.
         assert len(np.unique(place[rows])) == 1
+
+
+def test_several_densities_have_the_modes_that_they_have_alone() -> None:
+    """Although one of them takes more steps, and another has two modes."""
+
+    def log_density(points: Floats, numbers: Indices) -> Floats:
+        x = points[..., 0] - numbers[:, None]
+        return np.asarray(np.where(numbers[:, None] == 1, -((x**2 - 4) ** 2) / 8, -(x**4) / 4 - x))
+
+    starts = [np.array([[-1.0], [4.0]]), np.array([[-3.0], [2.0], [5.0]]), np.array([[9.0], [8.0]])]
+    together = modes_each(log_density, starts, np.ones(1))
+    for number, of_density in enumerate(together):
+        alone = modes_each(
+            lambda points, _, number=number: log_density(points, np.full(len(points), number)),
+            [starts[number]],
+            np.ones(1),
+        )[0]
+        assert len(of_density) == (2 if number == 1 else 1)
+        for first, second in zip(of_density, alone, strict=True):
+            np.testing.assert_allclose(first.mode, second.mode, rtol=1e-12)
+            np.testing.assert_allclose(first.covariance, second.covariance, rtol=1e-9)

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal, multivariate_t, norm
 
 from prbayes._validate import Floats
 from prbayes.numerics.modes import laplace
-from prbayes.posterior.importance import ImportanceOptions, importance_sample
+from prbayes.posterior.importance import ImportanceOptions, importance_sample, importance_samples
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -154,3 +154,26 @@ def test_a_ridge_between_two_modes_has_its_mass(nuisance: int) -> None:
     error = np.sqrt(right / 4000)
     assert np.abs(np.array(shares) - right).max() < 4 * error
     assert abs(np.mean(shares) - right) < 4 * error / np.sqrt(8)
+
+
+def test_densities_in_a_batch_have_the_draws_that_they_have_alone() -> None:
+    """None where the first proposal does not suffice."""
+    prior = multivariate_normal(np.zeros(3), 4 * np.eye(3))
+
+    def draws(size: int, seed: int) -> Floats:
+        return np.asarray(prior.rvs(size, random_state=seed))
+
+    (mode,) = laplace(normal, MEAN[None], SCALE)
+    narrow = replace(mode, covariance=mode.covariance / 50)
+    samples = importance_samples(
+        lambda points: (normal(points), prior.logpdf(points)),
+        [mode, narrow],
+        draws(400, 3),
+        2000,
+        3,
+    )
+    expected = importance_sample(normal, [mode], 2000, 3, prior=(draws, prior.logpdf))
+    assert samples[1] is None
+    assert samples[0] is not None
+    np.testing.assert_allclose(samples[0].draws, expected.draws, rtol=1e-9)
+    np.testing.assert_allclose(samples[0].pareto_k, expected.pareto_k, atol=1e-9)

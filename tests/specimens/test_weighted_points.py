@@ -17,7 +17,7 @@ from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_lik
 from prbayes.propagation.population_density import ExponentialForm, PopulationDensity
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.specimens.weighted_points import WeightedPoints
+from prbayes.specimens.weighted_points import ProductPoints, WeightedPoints
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(0.1, 0.9, (7, 5))  # within the support of all families
@@ -158,3 +158,23 @@ def test_an_evaluator_has_the_log_likelihood_of_pymc() -> None:
     expected = graphs(thetas)[0]
     assert np.allclose(specimen_log_likelihoods(evaluator, thetas)["y"], expected, rtol=1e-11)
     assert np.allclose(evaluator.log_other(thetas), expected.sum(axis=1), rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["normal", "gamma"])
+def test_products_have_the_likelihoods_of_their_own_specimens(name: str) -> None:
+    """Also of specimens with one point, and of populations far narrower than the points."""
+    inputs = inputs_of(FAMILIES[name][0])
+    log_a = LOG_A.copy()
+    log_a[[1, 4], 1:] = -np.inf
+    x, sizes, products = X.copy(), [2, 4, 1], np.array([2, 0, 1])
+    x[6] = 0.5
+    points = WeightedPoints.of(PopulationDensity(inputs), [x], log_a)
+    # The last population is as narrow as rounding allows at the one place of the third product.
+    of_each = (
+        [np.append(FIRST, 0.5), np.append(SECOND, 1e-7)] if name == "normal" else [FIRST, SECOND]
+    )
+    roots = by_name(inputs, dict(zip(("a0", "b0"), of_each, strict=True)))
+    tiled = [np.tile(root, 3) for root in roots]
+    found = ProductPoints.of(points, sizes).log_likelihoods(tiled, products)
+    expected = np.add.reduceat(by_graph(inputs, roots, [x], log_a), [0, 2, 6], axis=1)
+    np.testing.assert_allclose(found, expected.T[products], rtol=1e-7)
