@@ -319,13 +319,13 @@ class Fleet:
         (node,) = self.evaluator.nodes
         evaluator = self.evaluator.observing({node.name: self.observed[name]})
         with designs_restored(evaluator.reweighted.values()):
-            values, pareto_k, finding = self._sampled(evaluator)
+            values, pareto_k, finding = self._samples(evaluator)
             draw, predicted = partial(draw_responses, evaluator), None
             if name in self.further:
                 (predicted,) = self._predicted([values], draw)
         return Drawn(values, pareto_k, predicted, finding)
 
-    def _sampled(self, evaluator: Evaluator) -> tuple[NamedArrays, float, str]:
+    def _samples(self, evaluator: Evaluator) -> tuple[NamedArrays, float, str]:
         """Return draws of the model's variables, Pareto k of importance sampling, and findings."""
         posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
         codes = ("lost-mass", "second-mode")
@@ -427,7 +427,7 @@ class SpecimenFleet(Fleet):
         modes = modes_of(target)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if modes is None or chains is None:
-            values, pareto_k, finding = self._sampled(evaluator)
+            values, pareto_k, finding = self._samples(evaluator)
         else:
             refuse_lost_specimens(evaluator, chains.thetas[0].mean(axis=0))
             values = evaluator.hyperparameters.constrained(chains.thetas[0])
