@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import Floats, StrPath, called, flag, positive_integer, share
-from prbayes.decision.population_quantities import PopulationReader
-from prbayes.decision.populations import Populations, quantiles_of
+from prbayes.decision.population_quantities import Element, PopulationReader
+from prbayes.decision.populations import NestedPopulations, Populations, quantiles_of
 from prbayes.model.locking import locked
-from prbayes.model.parameters import element_name
+from prbayes.model.parameters import element_name, variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.outputs import with_unit
 from prbayes.results.predict import call_settings, width_of_epsilon
@@ -135,6 +136,9 @@ def population(
     bases = {name: 1 - p if upper else p for name, p in BASES.items()}
     reader = PopulationReader(populations, levels | bases, _covariates(populations, at))
     elements = reader.elements(inputs)
+    nested, findings = NestedPopulations.of(populations)
+    if nested is not None:
+        elements += _under_nested_family(reader, nested, inputs)
     names = list(dict.fromkeys(name for x in elements for name in x.numbers))
     groups = {x.groups.dim: list(x.groups.labels) for x in elements if x.groups is not None}
     if len(groups) > 1:
@@ -154,6 +158,9 @@ def population(
             else:
                 estimate = _means(draws) if populations.are_draws else values[:, 0]
                 table[:, i, :, q] = [estimate, *_quantiles(draws, tail_levels(prob))]
+    if nested is not None:
+        a_basis = zip([x.name for x in elements], table[0, :, 0, names.index("A-basis")], strict=True)
+        findings = report(nested.finding(_answers(dict(a_basis), nested)))
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -170,10 +177,44 @@ def population(
             "prob": prob,
             "interval": "posterior" if populations.are_draws else "standard error",
             "bounds": "upper" if upper else "lower",
-            "findings": as_json((*report(*width), *(f for x in elements for f in x.findings))),
+            "findings": as_json(
+                (*findings, *report(*width), *(f for x in elements for f in x.findings))
+            ),
             **populations.provenance(),
         },
     )
+
+
+def _under_nested_family(
+    reader: PopulationReader, nested: NestedPopulations, inputs: Any
+) -> list[Element]:
+    """Return the requested elements whose populations a nested family changes, under this family.
+
+    The draws of a prediction are those of the model's own family.
+    """
+    several = inputs if isinstance(inputs, list | tuple) else [inputs]
+    inputs = [x for x in several if not isinstance(x, xr.DataArray)]
+    if not inputs:
+        return []
+    elements = replace(reader, populations=nested.populations).elements(
+        None if inputs == [None] else inputs
+    )
+    return [
+        replace(x, name=nested.label(x.name))
+        for x in elements
+        if variable_of(x.name) not in nested.family.unchanged
+    ]
+
+
+def _answers(a_basis: Mapping[str, float], nested: NestedPopulations) -> str:
+    """Return the A-basis values under both families as a text."""
+    answers = [
+        f"the A-basis value of {name} is {value:.4g}, or {a_basis[nested.label(name)]:.4g} under "
+        f"the {nested.name} family"
+        for name, value in a_basis.items()
+        if nested.label(name) in a_basis
+    ]
+    return "; ".join(answers)
 
 
 def _covariates(populations: Populations, at: Any) -> Mapping[str, float]:

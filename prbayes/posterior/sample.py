@@ -20,7 +20,7 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_audit import audited_evaluator
-from prbayes.numerics.modes import Laplace, distinct_modes, laplace
+from prbayes.numerics.modes import Laplace, LogDensity, distinct_modes, laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum, point_text
 from prbayes.posterior import smc
@@ -162,7 +162,7 @@ def draw_posterior(
         findings: Findings = ()
         for round_ in range(MAX_ROUNDS + 1):
             target = posterior_target(evaluator, optimum)
-            modes = modes_of(target)
+            modes = modes_of(target.log_posterior, target.starts, target.scale)
             if modes is None:
                 break
             chains = importance_chains(target, modes, settings)
@@ -233,15 +233,14 @@ def _has_valley(target: Target, a: Floats, b: Floats) -> bool:
     return bool(heights.min() < min(heights[0], heights[-1]) - 1)
 
 
-def modes_of(target: Target) -> list[Laplace] | None:
+def modes_of(log_density: LogDensity, starts: Floats, scale: Floats) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
-    starts = target.starts
     try:
         if len(starts) > 1:
             # Continue once from starts that are on the way to the same mode.
-            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
+            rough = laplace(log_density, starts, scale, steps=6)
             starts = np.stack([mode.mode for mode in distinct_modes(rough)])
-        candidates = laplace(target.log_posterior, starts, target.scale)
+        candidates = laplace(log_density, starts, scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
     highest = max(mode.log_mass for mode in candidates)

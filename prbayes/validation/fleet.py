@@ -350,7 +350,7 @@ class SpecimenFleet(Fleet):
         """Return draws of the hyperparameters, and Pareto k of importance sampling."""
         # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
-        modes = modes_of(target)
+        modes = modes_of(target.log_posterior, target.starts, target.scale)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if chains is None:
             return super()._posterior(evaluator)
