@@ -45,7 +45,7 @@ LAYERS = (
     _GROUND,
     ("numerics",),
     ("metrics", "response"),
-    ("emulators",),
+    ("emulators", "families"),
     ("propagation",),
     ("specimens",),
     ("model",),

@@ -110,10 +110,10 @@ def exceedance(
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     n_points : int, optional
         Number of responses to compute near the limit, for each point of the intervals and each
-        family of the population; 0, or at least 100. The inputs need inverse distribution functions and a support that does not depend
-        on hyperparameters, and no stored responses. By default 0; but 1000 if the error of stored
-        responses is above .3 of the distance between ``requirement`` and interval, and the
-        calibration has at least 1000 runs.
+        family of the population; 0, or at least 100. The inputs need inverse distribution functions
+        and a support that does not depend on hyperparameters, and no stored responses. By default
+        0; but 1000 if the error of stored responses is above .3 of the distance between
+        ``requirement`` and interval, and the calibration has at least 1000 runs.
     steps : int
         Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional

@@ -159,7 +159,9 @@ def population(
                 estimate = _means(draws) if populations.are_draws else values[:, 0]
                 table[:, i, :, q] = [estimate, *_quantiles(draws, tail_levels(prob))]
     if nested is not None:
-        a_basis = zip([x.name for x in elements], table[0, :, 0, names.index("A-basis")], strict=True)
+        a_basis = zip(
+            [x.name for x in elements], table[0, :, 0, names.index("A-basis")], strict=True
+        )
         findings = report(nested.finding(_answers(dict(a_basis), nested)))
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
@@ -306,7 +308,7 @@ class PopulationTable(Table):
         """Return a sentence for each population, or xarray's text for a selection."""
         if not self._is_whole:
             return super().__repr__()
-        return "\n  ".join([f"{self._heading()}:", *self.sentences()])
+        return "\n  ".join([f"{self._heading()}:", *self.sentences(), *sentences_of(self.attrs)])
 
     def to_view(self) -> View:
         """Return what a reader sees."""

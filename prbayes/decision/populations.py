@@ -229,9 +229,10 @@ class NestedPopulations:
 
     def finding(self, answers: str) -> Finding:
         """Return the finding that reports the answers under both families."""
+        names = ", ".join(self.family.families)
         text = (
-            f"The data do not separate the {self.family.describe(0)} population of "
-            f"{', '.join(self.family.families)} from a {self.name} one (probability {self.probability:.2f} if both are equally probable "
+            f"The data do not separate the {self.family.describe(0)} population of {names} from a "
+            f"{self.name} one (probability {self.probability:.2f} if both are equally probable "
             f"before the data): {answers}."
         )
         return Finding("two-families", text, _TAILS)

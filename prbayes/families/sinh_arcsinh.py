@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from pymc.distributions.continuous import Continuous, PositiveContinuous
-from pymc.distributions.dist_math import check_parameters
+from pymc.logprob.utils import CheckParameterValue
+from pytensor import config
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -69,7 +69,13 @@ def _arsinh_score(x: Any, mu: Any, s: Any, skew: Any, tail: Any) -> tuple[Any, A
     return scaled, tail * pt.arcsinh(scaled) - skew
 
 
-class _SinhArcsinh(Continuous):  # type: ignore[misc]
+def _checked(value: Any, s: Any, tail: Any, *, is_log: bool = True) -> Any:
+    """Return a graph that raises if a parameter is invalid; if it is a log, a model has -inf."""
+    check = CheckParameterValue("s > 0, tail > 0", can_be_replaced_by_ninf=is_log)
+    return check(value, pt.all(s > 0), pt.all(tail > 0))
+
+
+class _SinhArcsinh(pm.Continuous):  # type: ignore[misc]
     """PyMC's functions of the distribution."""
 
     rv_op = SinhArcsinhRV()
@@ -83,20 +89,18 @@ class _SinhArcsinh(Continuous):  # type: ignore[misc]
         square = pt.minimum(pt.sinh(score) ** 2, 1e30)
         log_density = (pt.log((1 + square) / (1 + scaled**2)) - square - np.log(2 * np.pi)) / 2
         log_density -= pt.log(s)
-        return check_parameters(log_density, s > 0, tail > 0, msg="s > 0, tail > 0")
+        return _checked(log_density, s, tail)
 
     def logcdf(value: Any, mu: Any, s: Any, skew: Any, tail: Any) -> Any:  # noqa: N805
         _, score = _arsinh_score(value, mu, s, skew, tail)
-        return check_parameters(
-            pm.logcdf(pm.Normal.dist(), pt.sinh(score)), s > 0, tail > 0, msg="s > 0, tail > 0"
-        )
+        return _checked(pm.logcdf(pm.Normal.dist(), pt.sinh(score)), s, tail)
 
     def icdf(value: Any, mu: Any, s: Any, skew: Any, tail: Any) -> Any:  # noqa: N805
         x = _of_normal(pt, pm.icdf(pm.Normal.dist(), value), mu, s, skew, tail)
-        return check_parameters(x, s > 0, tail > 0, msg="s > 0, tail > 0")
+        return _checked(x, s, tail, is_log=False)
 
 
-class _LogSinhArcsinh(PositiveContinuous):  # type: ignore[misc]
+class _LogSinhArcsinh(pm.Continuous):  # type: ignore[misc]
     """PyMC's functions of the distribution of a positive number."""
 
     rv_op = LogSinhArcsinhRV()
@@ -193,7 +197,8 @@ class SinhArcsinh:
             skew = pm.Normal(f"{name}_skew", 0.0, 0.35)
         if tail is None:
             tail = pm.LogNormal(f"{name}_tail", 0.0, 0.25)
-        parameters = [pt.as_tensor(parameter) for parameter in (mu, s, skew, tail)]
+        # A number such as 2.0 would have single precision.
+        parameters = [pt.as_tensor(p).astype(config.floatX) for p in (mu, s, skew, tail)]
         x = cls._distribution.dist(parameters, **kwargs)
         x.name = name
         return x

@@ -1,7 +1,7 @@
 """Nested families: the posterior where populations are restricted to a family that theirs contains.
 
-An operation of a distribution may declare ``nested``: the name of the simpler family, and the values
-of its parameters at which it is this family, by position. Under the restriction these
+An operation of a distribution may declare ``nested``: the name of the simpler family, and the
+values of its parameters at which it is this family, by position. Under the restriction these
 hyperparameters are fixed. The points of the specimens serve both families, and no run is made.
 """
 
