@@ -195,13 +195,7 @@ def exceedance(
     question = _Question(populations, quantity, seed_number(random_seed))
     settings = _Settings(prob, requirement, steps, n_points)
     places, estimates, n_searched = question.over_intervals(settings)
-    nested, findings = NestedPopulations.of(populations)
-    if nested is not None:
-        question = replace(question, populations=nested.populations)
-        _, simpler, count = question.over_intervals(settings)
-        n_searched += count + sum(estimate.responses for estimate in simpler)
-        answers = f"it is {_described(estimates, settings)}, or {_described(simpler, settings)}"
-        findings = report(nested.finding(f"{answers} under the {nested.name} family"))
+    findings, n_nested = question.compared(estimates, settings)
     intervals = np.array([estimate.interval(prob) for estimate in estimates])
     bounds = [choose(estimates, key=lambda estimate: estimate.mean) for choose in (min, max)]
     # A probability is rough if two standard errors are about a factor of two, or would decide the
@@ -229,7 +223,7 @@ def exceedance(
             "limit": quantity.limit,
             "below": int(below),
             "response": response_name(response),
-            "responses": n_searched + sum(estimate.responses for estimate in estimates),
+            "responses": n_searched + n_nested + sum(estimate.responses for estimate in estimates),
             "source": bounds[1].source,
             "random_seed": str(question.seed),
             "findings": as_json((*findings, *_error_findings(response, estimates, rough))),
@@ -403,6 +397,20 @@ class _Question:
                 for estimate, place in zip(estimates, places, strict=True)
             ]
         return places, estimates, count
+
+    def compared(self, estimates: Sequence[_Estimate], settings: _Settings) -> tuple[Findings, int]:
+        """Report the answers under the families that the data do not separate.
+
+        The number is that of the responses of the simpler family.
+        """
+        nested, findings = NestedPopulations.of(self.populations)
+        if nested is None:
+            return findings, 0
+        question = replace(self, populations=nested.populations)
+        _, simpler, count = question.over_intervals(settings)
+        answers = f"it is {_described(estimates, settings)}, or {_described(simpler, settings)}"
+        finding = nested.finding(f"{answers} under the {nested.name} family")
+        return report(finding), count + sum(estimate.responses for estimate in simpler)
 
     def refined(self, estimate: _Estimate, inputs: tuple[Any, ...]) -> _Estimate:
         """Return an estimate by new points, if they are no more than the runs of the first one.

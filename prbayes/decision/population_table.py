@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import as_json, report, sentences_of
+from prbayes._finding import Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import Floats, StrPath, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import Element, PopulationReader
@@ -147,22 +147,14 @@ def population(
             "one partition; ask for one input at a time"
         )
     n_groups = max(map(len, groups.values()), default=1)
-    # table, (3, elements, groups, quantities): estimates, lower and upper ends
+    # (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
-            draws = values if populations.are_draws else values[..., 1:]
-            q = names.index(name)
-            if name in bases:
-                table[0, i, :, q] = _quantiles(draws, [0.95 if upper else 0.05])[0]
-            else:
-                estimate = _means(draws) if populations.are_draws else values[:, 0]
-                table[:, i, :, q] = [estimate, *_quantiles(draws, tail_levels(prob))]
+            bound = (0.95 if upper else 0.05) if name in bases else None
+            table[:, i, :, names.index(name)] = _numbers(values, populations, prob, bound)
     if nested is not None:
-        a_basis = zip(
-            [x.name for x in elements], table[0, :, 0, names.index("A-basis")], strict=True
-        )
-        findings = report(nested.finding(_answers(dict(a_basis), nested)))
+        findings = _difference(nested, elements, table[0, :, 0, names.index("A-basis")])
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -187,6 +179,21 @@ def population(
     )
 
 
+def _numbers(
+    values: Floats, populations: Populations, prob: float, bound: float | None
+) -> Sequence[Floats]:
+    """Return estimate, lower and upper end, (groups,) each, of values, (groups, k).
+
+    A tolerance bound, the quantile over populations at ``bound``, has no ends.
+    """
+    draws = values if populations.are_draws else values[..., 1:]
+    if bound is not None:
+        (estimate,) = _quantiles(draws, [bound])
+        return [estimate, *np.full((2, len(draws)), np.nan)]
+    estimate = _means(draws) if populations.are_draws else values[:, 0]
+    return [estimate, *_quantiles(draws, tail_levels(prob))]
+
+
 def _under_nested_family(
     reader: PopulationReader, nested: NestedPopulations, inputs: Any
 ) -> list[Element]:
@@ -208,15 +215,18 @@ def _under_nested_family(
     ]
 
 
-def _answers(a_basis: Mapping[str, float], nested: NestedPopulations) -> str:
-    """Return the A-basis values under both families as a text."""
+def _difference(
+    nested: NestedPopulations, elements: Sequence[Element], a_basis: Floats
+) -> Findings:
+    """Report the A-basis values of elements, (elements,), under both families."""
+    by_name = dict(zip([x.name for x in elements], a_basis.tolist(), strict=True))
     answers = [
-        f"the A-basis value of {name} is {value:.4g}, or {a_basis[nested.label(name)]:.4g} under "
+        f"the A-basis value of {name} is {value:.4g}, or {by_name[nested.label(name)]:.4g} under "
         f"the {nested.name} family"
-        for name, value in a_basis.items()
-        if nested.label(name) in a_basis
+        for name, value in by_name.items()
+        if nested.label(name) in by_name
     ]
-    return "; ".join(answers)
+    return report(nested.finding("; ".join(answers)))
 
 
 def _covariates(populations: Populations, at: Any) -> Mapping[str, float]:

@@ -198,10 +198,11 @@ class NestedPopulations:
         if family is None:
             return None, ()
         obstacle, posterior = "", None
+        by_metric = [node.name for node in evaluator.nodes if not node.metric.exact_likelihood]
         if not populations.are_draws:
             obstacle = "an optimum has no posterior of either; pass the result of prb.sample"
-        elif evaluator.nodes:
-            obstacle = "that needs prb.LogLikelihood() as the metric of all simulators"
+        elif by_metric:
+            obstacle = f"that needs prb.LogLikelihood() in place of the metric of {by_metric[0]}"
         elif product_names(populations.result):
             obstacle = "that needs prb.sample of a model with the data of this product"
         else:

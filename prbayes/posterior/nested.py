@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.parameters import log_posterior, log_prior_terms
 from prbayes.numerics.modes import far_apart
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
@@ -111,14 +111,16 @@ def _restricted(
         thetas[:, is_free] = free
         return thetas
 
+    def log_likelihood(thetas: Floats) -> Floats:
+        return evaluator(thetas).log_likelihood(epsilons(evaluator))
+
     def log_prior_of_fixed(thetas: Floats) -> Floats:
         terms = log_prior_terms(hyperparameters, thetas) if fixed else {}
         return log_jacobian + sum((terms[name] for name in fixed), np.zeros(len(thetas)))
 
     def log_density(free: Floats) -> Floats:
         thetas = whole(free)
-        logs = log_posterior(hyperparameters, thetas, evaluator.log_other)
-        return logs - log_prior_of_fixed(thetas)
+        return log_posterior(hyperparameters, thetas, log_likelihood) - log_prior_of_fixed(thetas)
 
     def log_prior(free: Floats) -> Floats:
         thetas = whole(free)

@@ -296,7 +296,7 @@ def test_why_families_were_not_compared() -> None:
     assert "data of this product" in repr(prb.population(fleet.sel(product="B"), model=model))
     by_metric, _ = skewed_model(20, prb.ProbabilityResidual())
     result = prb.sample(100, chains=1, model=by_metric, random_seed=1, progressbar=False)
-    assert "needs prb.LogLikelihood()" in repr(prb.population(result, model=by_metric))
+    assert "in place of the metric of y" in repr(prb.population(result, model=by_metric))
 
 
 @pytest.mark.long
