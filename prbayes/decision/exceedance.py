@@ -160,6 +160,9 @@ def exceedance(
 
     Probabilities are those of specimens that have a response: NaN are left out, and reported.
 
+    If the data do not separate a population of `prbayes.families` from a simpler one, the finding
+    ``two-families`` has the probability and the verdict under the latter.
+
     References
     ----------
     .. [1] Owen, A. B. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat.
