@@ -109,6 +109,20 @@ _CASES = (
 )  # fmt: skip
 
 
+def tails() -> Iterator[Row]:
+    """Yield coverage of quantiles by both families, and the ratio of the widths, by population."""
+    for cell, figures in summary("tails").items():
+        truth, n, response = cell.split("/")
+        normal, wide = (figures[family]["hits"] for family in ("normal", "sinh-arcsinh"))
+        yield [
+            f"{truth}, {n}" + (", fold" if response == "fold" else ""),
+            str(figures["data sets"]),
+            " ".join(short(normal[k]) for k in (0, -1)),
+            " ".join(map(short, wide)),
+            " ".join(short(figures["ratio"][k]) for k in (0, 2, -1)),
+        ]
+
+
 def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
     for problem, checks in summary("likelihood_guards").items():
@@ -597,6 +611,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "partial pooling": partial_pooling,
     "small groups": small_groups,
     "measurement error": measurement_error,
+    "tails": tails,
     "gross errors": gross_errors,
     "readings, coverage": partial(coverage_of, "readings_coverage"),
     "covariates": partial(coverage_of, "covariates"),

@@ -2,6 +2,7 @@
 
 from prbayes import datasets as datasets
 from prbayes import decision as decision
+from prbayes import families as families
 from prbayes import metrics as metrics
 from prbayes import plots as plots
 from prbayes import posterior as posterior

@@ -42,7 +42,7 @@ LAYERS = (
     _GROUND,
     ("numerics",),
     ("metrics", "response"),
-    ("emulators",),
+    ("emulators", "families"),
     ("propagation",),
     ("specimens",),
     ("model",),

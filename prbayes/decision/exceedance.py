@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,9 @@ from prbayes._validate import (
 from prbayes.decision.populations import (
     CentralSpecimens,
     InverseTransform,
+    NestedPopulations,
     Populations,
+    ResponseSample,
     output_column,
     probability_bounds,
     share_error,
@@ -107,11 +109,11 @@ def exceedance(
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     n_points : int, optional
-        Number of responses to compute near the limit, for each point of the intervals; 0, or at
-        least 100. The inputs need inverse distribution functions and a support that does not depend
-        on hyperparameters, and no stored responses. By default 0; but 1000 if the error of stored
-        responses is above .3 of the distance between ``requirement`` and interval, and the
-        calibration has at least 1000 runs.
+        Number of responses to compute near the limit, for each point of the intervals and each
+        family of the population; 0, or at least 100. The inputs need inverse distribution functions
+        and a support that does not depend on hyperparameters, and no stored responses. By default
+        0; but 1000 if the error of stored responses is above .3 of the distance between
+        ``requirement`` and interval, and the calibration has at least 1000 runs.
     steps : int
         Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional
@@ -158,6 +160,9 @@ def exceedance(
 
     Probabilities are those of specimens that have a response: NaN are left out, and reported.
 
+    If the data do not separate a population of `prbayes.families` from a simpler one, the finding
+    ``two-families`` has the probability and the verdict under the latter.
+
     References
     ----------
     .. [1] Owen, A. B. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat.
@@ -191,12 +196,9 @@ def exceedance(
     calling = call_settings(executor, store, version)
     populations = Populations.of(result, model, n_draws, "prb.exceedance", calling)
     question = _Question(populations, quantity, seed_number(random_seed))
-    places, estimates, n_searched = question.over_intervals(steps, n_points)
-    if n_points is None and requirement is not None:
-        estimates = [
-            question.refined(estimate, place) if estimate.is_unsure(requirement, prob) else estimate
-            for estimate, place in zip(estimates, places, strict=True)
-        ]
+    settings = _Settings(prob, requirement, steps, n_points)
+    places, estimates, n_searched = question.over_intervals(settings)
+    findings, n_nested = question.compared(estimates, settings)
     intervals = np.array([estimate.interval(prob) for estimate in estimates])
     bounds = [choose(estimates, key=lambda estimate: estimate.mean) for choose in (min, max)]
     # A probability is rough if two standard errors are about a factor of two, or would decide the
@@ -224,10 +226,10 @@ def exceedance(
             "limit": quantity.limit,
             "below": int(below),
             "response": response_name(response),
-            "responses": n_searched + sum(estimate.responses for estimate in estimates),
+            "responses": n_searched + n_nested + sum(estimate.responses for estimate in estimates),
             "source": bounds[1].source,
             "random_seed": str(question.seed),
-            "findings": as_json(_error_findings(response, estimates, rough)),
+            "findings": as_json((*findings, *_error_findings(response, estimates, rough))),
             **populations.provenance(),
             **decision,
         },
@@ -269,6 +271,27 @@ class ExceedanceTable(Table):
             f"{float(self['lower']):.2g} to {float(self['upper']):.2g}"
         )
         return View(heading, rows=rows, sentences=sentences)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """How probabilities are computed and judged."""
+
+    prob: float
+    requirement: float | None
+    steps: int  # number of values in each interval
+    n_points: int | None  # number of points near the limit
+
+
+def _described(estimates: Sequence[_Estimate], settings: _Settings) -> str:
+    """Return the largest probability with its interval, and the verdict, as a text."""
+    largest = max(estimates, key=lambda estimate: estimate.mean)
+    low, high = largest.interval(settings.prob)
+    text = f"{largest.mean:.2g} ({percentage(settings.prob)} interval {low:.2g} to {high:.2g}"
+    if settings.requirement is not None:
+        verdict = _verdict(estimates, settings.requirement, settings.prob)
+        text += f"; requirement {verdict}"
+    return f"{text})"
 
 
 def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) -> str:
@@ -332,38 +355,67 @@ class _Question:
     populations: Populations
     quantity: Exceedance
     seed: int
+    # samples of the response by its inputs, shared by the families of the populations
+    samples: dict[tuple[Any, ...], ResponseSample] = field(default_factory=dict)
 
-    def estimate(self, inputs: Sequence[Any], points: int | None) -> _Estimate:
+    def estimate(self, inputs: tuple[Any, ...], points: int | None) -> _Estimate:
         """Return the probabilities by new points near the limit, or by stored responses if none."""
         quantity = self.quantity
         if points:
             responses = self.populations.responses(quantity.response, inputs)
             return _rare_probability(self.populations, responses, quantity, points, self.seed)
-        sample = self.populations.sample(quantity.response, inputs, quantity.output)
+        count = 0
+        if inputs not in self.samples:
+            sample = self.populations.sample(quantity.response, inputs, quantity.output)
+            self.samples[inputs] = sample
+            count = sample.responses.count
+        sample = replace(self.samples[inputs], populations=self.populations)
         by_draw = sample.evaluate(quantity.of, self.populations.thetas)
         error = share_error(sample, lambda values: quantity.of_specimen(values, np.nan))
         error = np.hypot(error, _error_of_draws(self.populations, by_draw))
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
-        count, n_runs = sample.responses.count, sample.design.n_runs
+        n_runs = sample.design.n_runs
         return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
 
     def over_intervals(
-        self, steps: int, n_points: int | None
+        self, settings: _Settings
     ) -> tuple[list[tuple[Any, ...]], list[_Estimate], int]:
         """Return places of the intervals with their estimates, and the responses of the search."""
-        quantity = self.quantity
-        places = interval_grid(quantity.inputs, steps)
+        quantity, n_points = self.quantity, settings.n_points
+        places = interval_grid(quantity.inputs, settings.steps)
         estimates = [self.estimate(place, n_points) for place in places]
-        if len(places) == 1:
-            return places, estimates, 0
-        n_runs = n_points or estimates[0].runs
-        respond = CentralSpecimens(self.populations, quantity.response, quantity.output, n_runs)
-        extremes = extreme_places(quantity.inputs, places, respond, [quantity.limit])
-        estimates += [self.estimate(place, n_points) for place in extremes]
-        return places + extremes, estimates, respond.count
+        count = 0
+        if len(places) > 1:
+            n_runs = n_points or estimates[0].runs
+            respond = CentralSpecimens(self.populations, quantity.response, quantity.output, n_runs)
+            extremes = extreme_places(quantity.inputs, places, respond, [quantity.limit])
+            estimates += [self.estimate(place, n_points) for place in extremes]
+            places, count = places + extremes, respond.count
+        if n_points is None and settings.requirement is not None:
+            estimates = [
+                self.refined(estimate, place)
+                if estimate.is_unsure(settings.requirement, settings.prob)
+                else estimate
+                for estimate, place in zip(estimates, places, strict=True)
+            ]
+        return places, estimates, count
 
-    def refined(self, estimate: _Estimate, inputs: Sequence[Any]) -> _Estimate:
+    def compared(self, estimates: Sequence[_Estimate], settings: _Settings) -> tuple[Findings, int]:
+        """Report the answers under the families that the data do not separate.
+
+        The number is that of the responses of the simpler family.
+        """
+        nested, findings = NestedPopulations.of(self.populations)
+        if nested is None:
+            return findings, 0
+        question = replace(self, populations=nested.populations)
+        _, simpler, count = question.over_intervals(settings)
+        answers = f"it is {_described(estimates, settings)}, or {_described(simpler, settings)}"
+        finding = nested.finding(f"{answers} under the {nested.name} family")
+        return report(finding), count + sum(estimate.responses for estimate in simpler)
+
+    def refined(self, estimate: _Estimate, inputs: tuple[Any, ...]) -> _Estimate:
         """Return an estimate by new points, if they are no more than the runs of the first one.
 
         Inputs without an inverse distribution function keep the estimate.

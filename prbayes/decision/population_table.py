@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,13 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import as_json, report, sentences_of
+from prbayes._finding import Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
 from prbayes._validate import Floats, StrPath, called, flag, positive_integer, share
-from prbayes.decision.population_quantities import PopulationReader
-from prbayes.decision.populations import Populations, quantiles_of
+from prbayes.decision.population_quantities import Element, PopulationReader
+from prbayes.decision.populations import NestedPopulations, Populations, quantiles_of
 from prbayes.model.locking import locked
-from prbayes.model.parameters import element_name
+from prbayes.model.parameters import element_name, variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.outputs import with_unit
 from prbayes.results.predict import call_settings, width_of_epsilon
@@ -106,6 +107,9 @@ def population(
 
     Margins come from inverse distribution functions, or from random draws where there is none.
 
+    If the data do not separate a population of `prbayes.families` from a simpler one, rows such as
+    ``"x (normal)"`` have the answer under the latter.
+
     References
     ----------
     .. [1] Krishnamoorthy, K. and T. Mathew (2009), Statistical Tolerance Regions, Wiley,
@@ -135,6 +139,9 @@ def population(
     bases = {name: 1 - p if upper else p for name, p in BASES.items()}
     reader = PopulationReader(populations, levels | bases, _covariates(populations, at))
     elements = reader.elements(inputs)
+    nested, findings = NestedPopulations.of(populations)
+    if nested is not None:
+        elements += _under_nested_family(reader, nested, inputs)
     names = list(dict.fromkeys(name for x in elements for name in x.numbers))
     groups = {x.groups.dim: list(x.groups.labels) for x in elements if x.groups is not None}
     if len(groups) > 1:
@@ -143,17 +150,14 @@ def population(
             "one partition; ask for one input at a time"
         )
     n_groups = max(map(len, groups.values()), default=1)
-    # table, (3, elements, groups, quantities): estimates, lower and upper ends
+    # (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
-            draws = values if populations.are_draws else values[..., 1:]
-            q = names.index(name)
-            if name in bases:
-                table[0, i, :, q] = _quantiles(draws, [0.95 if upper else 0.05])[0]
-            else:
-                estimate = _means(draws) if populations.are_draws else values[:, 0]
-                table[:, i, :, q] = [estimate, *_quantiles(draws, tail_levels(prob))]
+            bound = (0.95 if upper else 0.05) if name in bases else None
+            table[:, i, :, names.index(name)] = _numbers(values, populations, prob, bound)
+    if nested is not None:
+        findings = _difference(nested, elements, table[0, :, 0, names.index("A-basis")])
     width = width_of_epsilon(result, populations.evaluator.model)
     if not groups:
         table = table[:, :, 0]
@@ -170,10 +174,62 @@ def population(
             "prob": prob,
             "interval": "posterior" if populations.are_draws else "standard error",
             "bounds": "upper" if upper else "lower",
-            "findings": as_json((*report(*width), *(f for x in elements for f in x.findings))),
+            "findings": as_json(
+                (*findings, *report(*width), *(f for x in elements for f in x.findings))
+            ),
             **populations.provenance(),
         },
     )
+
+
+def _numbers(
+    values: Floats, populations: Populations, prob: float, bound: float | None
+) -> Sequence[Floats]:
+    """Return estimate, lower and upper end, (groups,) each, of values, (groups, k).
+
+    A tolerance bound, the quantile over populations at ``bound``, has no ends.
+    """
+    draws = values if populations.are_draws else values[..., 1:]
+    if bound is not None:
+        (estimate,) = _quantiles(draws, [bound])
+        return [estimate, *np.full((2, len(draws)), np.nan)]
+    estimate = _means(draws) if populations.are_draws else values[:, 0]
+    return [estimate, *_quantiles(draws, tail_levels(prob))]
+
+
+def _under_nested_family(
+    reader: PopulationReader, nested: NestedPopulations, inputs: Any
+) -> list[Element]:
+    """Return the requested elements whose populations a nested family changes, under this family.
+
+    The draws of a prediction are those of the model's own family.
+    """
+    several = inputs if isinstance(inputs, list | tuple) else [inputs]
+    inputs = [x for x in several if not isinstance(x, xr.DataArray)]
+    if not inputs:
+        return []
+    elements = replace(reader, populations=nested.populations).elements(
+        None if inputs == [None] else inputs
+    )
+    return [
+        replace(x, name=nested.label(x.name))
+        for x in elements
+        if variable_of(x.name) not in nested.family.unchanged
+    ]
+
+
+def _difference(
+    nested: NestedPopulations, elements: Sequence[Element], a_basis: Floats
+) -> Findings:
+    """Report the A-basis values of elements, (elements,), under both families."""
+    by_name = dict(zip([x.name for x in elements], a_basis.tolist(), strict=True))
+    answers = [
+        f"the A-basis value of {name} is {value:.4g}, or {by_name[nested.label(name)]:.4g} under "
+        f"the {nested.name} family"
+        for name, value in by_name.items()
+        if nested.label(name) in by_name
+    ]
+    return report(nested.finding("; ".join(answers)))
 
 
 def _covariates(populations: Populations, at: Any) -> Mapping[str, float]:
@@ -265,7 +321,7 @@ class PopulationTable(Table):
         """Return a sentence for each population, or xarray's text for a selection."""
         if not self._is_whole:
             return super().__repr__()
-        return "\n  ".join([f"{self._heading()}:", *self.sentences()])
+        return "\n  ".join([f"{self._heading()}:", *self.sentences(), *sentences_of(self.attrs)])
 
     def to_view(self) -> View:
         """Return what a reader sees."""

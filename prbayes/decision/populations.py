@@ -41,6 +41,7 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.posterior.nested import NestedFamily, nested_posterior
 from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
@@ -60,6 +61,9 @@ from prbayes.results.predict import (
     serving,
     thetas_of,
 )
+from prbayes.results.products import product_names
+
+_TAILS = "tails.md#both-families"  # page of the findings on families
 
 # Number of populations for checks and error estimates, whose quantiles then have an error of a few
 # percent
@@ -173,6 +177,66 @@ class Populations:
                 "it, or return +inf for specimens that fail"
             )
         return sample
+
+
+@dataclass(frozen=True, eq=False)
+class NestedPopulations:
+    """Populations under a simpler family that the data do not separate from that of the model."""
+
+    populations: Populations
+    family: NestedFamily
+    probability: float  # posterior probability of the simpler family, if it is one half before
+
+    @classmethod
+    def of(cls, populations: Populations) -> tuple[NestedPopulations | None, Findings]:
+        """Return the populations, or why they are not known; neither if the families are separate.
+
+        Families are separate if the simpler one has a posterior probability below .05.
+        """
+        evaluator, least = populations.evaluator, 0.05
+        family = NestedFamily.of(evaluator)
+        if family is None:
+            return None, ()
+        obstacle, posterior = "", None
+        by_metric = [node.name for node in evaluator.nodes if not node.metric.exact_likelihood]
+        if not populations.are_draws:
+            obstacle = "an optimum has no posterior of either; pass the result of prb.sample"
+        elif by_metric:
+            obstacle = f"that needs prb.LogLikelihood() in place of the metric of {by_metric[0]}"
+        elif product_names(populations.result):
+            obstacle = "that needs prb.sample of a model with the data of this product"
+        else:
+            posterior = nested_posterior(evaluator, family, populations.thetas)
+        if posterior is None:
+            obstacle = obstacle or "importance sampling of the simpler one is not reliable"
+            text = (
+                f"The {family.describe(0)} population of {', '.join(family.families)} was not "
+                f"compared with a {family.describe(1)} one: {obstacle}."
+            )
+            return None, report(Finding("family-not-compared", text, _TAILS))
+        if posterior.probability < least:
+            return None, ()
+        nested = replace(populations, thetas=posterior.thetas)
+        return cls(nested, family, posterior.probability), ()
+
+    @property
+    def name(self) -> str:
+        """The name of the simpler family."""
+        return self.family.describe(1)
+
+    def label(self, name: str) -> str:
+        """Return the name of an input or a response under the simpler family."""
+        return f"{name} ({self.name})"
+
+    def finding(self, answers: str) -> Finding:
+        """Return the finding that reports the answers under both families."""
+        names = ", ".join(self.family.families)
+        text = (
+            f"The data do not separate the {self.family.describe(0)} population of {names} from a "
+            f"{self.name} one (probability {self.probability:.2f} if both are equally probable "
+            f"before the data): {answers}."
+        )
+        return Finding("two-families", text, _TAILS)
 
 
 @dataclass(frozen=True, eq=False)

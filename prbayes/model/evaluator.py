@@ -148,7 +148,9 @@ class Evaluator:
             for first in range(0, len(thetas), step):
                 rows = slice(first, first + step)
                 at_rows = {name: value[rows] for name, value in values.items()}
-                total[rows] += log_likelihoods(likelihood, at_rows).sum(axis=1)
+                # A population far narrower than its distance has a sum of -inf.
+                with np.errstate(over="ignore"):
+                    total[rows] += log_likelihoods(likelihood, at_rows).sum(axis=1)
         observed = self.model.observed_RVs
         variables = [rv for rv in observed if not isinstance(rv.owner.op, ObservedRV)]
         if variables or self.model.potentials:

@@ -163,7 +163,7 @@ def draw_posterior(
         findings: Findings = ()
         for round_ in range(MAX_ROUNDS + 1):
             target = posterior_target(evaluator, optimum)
-            modes = modes_of(target)
+            modes = modes_of(target.log_posterior, target.starts, target.scale)
             if modes is None:
                 break
             chains = importance_chains(target, modes, settings)

@@ -577,9 +577,9 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     """Return draws that are resampled to the masses of their modes, and report these."""
     hyperparameters = target.evaluator.hyperparameters
     draws = chains.thetas.reshape(-1, hyperparameters.size)
-    modes = bridged_modes(
-        target.log_posterior, draws, hyperparameters.prior_sd, modes_of(target) or [], rng
-    )
+    unit = hyperparameters.prior_sd
+    laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
+    modes = bridged_modes(target.log_posterior, draws, unit, laplace_modes, rng)
     if modes is None:
         return chains
     error = f" (standard error {modes.errors.max():.1g})"

@@ -137,10 +137,10 @@ def posterior_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     return estimate_target(evaluator, optimum)
 
 
-def modes_of(target: Target) -> list[Laplace] | None:
+def modes_of(log_density: LogDensity, starts: Floats, scale: Floats) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
     try:
-        (modes,) = modes_each(of_one(target.log_posterior), [target.starts], target.scale)
+        (modes,) = modes_each(of_one(log_density), [starts], scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
     return modes or None

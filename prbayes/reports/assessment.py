@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
-from prbayes._finding import counted, from_json
+from prbayes._finding import counted, from_json, sentences_of
 from prbayes._validate import Floats
 from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
@@ -163,7 +163,8 @@ def population_in_units(m: Material) -> list[Section]:
         "deviation (sd), coefficient of variation (cv) and quantiles. 90% of the specimens exceed "
         "the B-basis value, 99% the A-basis value, with 95% confidence."
     )
-    return [Section("Population of the inputs", about, rows_table(rows), level=3)]
+    text = [about, *sentences_of(table.attrs)]
+    return [Section("Population of the inputs", text, rows_table(rows), level=3)]
 
 
 # -- decision --------------------------------------------------------------------------------
@@ -298,7 +299,8 @@ def next_steps(m: Material) -> list[Section]:
     tables = [] if m.rejected else list(m.decisions.values())
     kinds = set(map(kind_of_decision, tables))
     undecided = [t for t in tables if t.attrs.get("verdict") == "not decided"]
-    if any(from_json(str(table.attrs.get("findings", "[]"))) for table in undecided):
+    findings = [f for t in undecided for f in from_json(str(t.attrs.get("findings", "[]")))]
+    if any(finding.code != "two-families" for finding in findings):
         steps.append(
             "A requirement is not decided, as the error of the computation is too large: see "
             "Diagnostics for the number of runs."

@@ -424,7 +424,7 @@ class SpecimenFleet(Fleet):
         evaluator = replace(self.evaluator, emulated=emulated, has_graph=False)
         # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
-        modes = modes_of(target)
+        modes = modes_of(target.log_posterior, target.starts, target.scale)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
         if modes is None or chains is None:
             values, pareto_k, finding = self._samples(evaluator)

@@ -116,7 +116,7 @@ def test_chains_of_nuts_that_disagree_are_replaced(monkeypatch: pytest.MonkeyPat
 def test_an_optimum_with_another_mode_is_sampled_by_smc(monkeypatch: pytest.MonkeyPatch) -> None:
     module = import_module("prbayes.posterior.sample")
     found = module.modes_of
-    monkeypatch.setattr(module, "modes_of", lambda target: found(target)[:1])
+    monkeypatch.setattr(module, "modes_of", lambda *arguments: found(*arguments)[:1])
     x = np.random.default_rng(1).normal(1.5, 0.3, 15)
     with pm.Model() as model:
         inputs = pm.Normal.dist(pm.Normal("mu", 0, 1.5), pm.HalfNormal("sigma", 1))
