@@ -62,4 +62,4 @@ def test_smoothed_weights_are_those_of_arviz(n: int, scale: float) -> None:
         expected, expected_k = arviz_stats.base.array_stats.psislw(-row)
         np.testing.assert_allclose(weights, expected, atol=1e-9)
         assert shape == pytest.approx(expected_k, abs=1e-9)
-    assert np.isnan(pareto_smoothed(np.zeros(n))[1])
+    assert np.isnan(pareto_smoothed(np.zeros((1, n)))[1]).all()
