@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,25 +13,35 @@ from scipy.special import log_ndtr
 
 from prbayes._stats import positive_scale
 from prbayes._validate import Bools, Floats, Indices
+from prbayes.readings import COUNTS
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Readings of m outputs of N specimens; all arrays have the shape (N, m)."""
 
-    values: Floats  # readings; NaN if an output was not measured, or is censored
+    # Estimates of the outputs: readings without known bias, counts divided by their exposure; NaN
+    # if an output was not measured, or is censored.
+    values: Floats
     error: Floats  # standard deviation of the normal error; zero if the reading is exact
+    relative: Floats  # further standard deviation, as a share of the output
     step: Floats  # width to which the reading was rounded; zero if it was not
     lower: Floats  # lower bound of a censored reading, perhaps infinite; NaN if not censored
     upper: Floats  # upper bound, likewise
-    is_relative: Bools  # whether the error is a share of the output
+    bias: Floats  # known mean of the error
+    # Code of the distribution of a count in `prbayes.readings.COUNTS`; zero for a normal error,
+    # which is otherwise the normal approximation of the count's likelihood.
+    family: Indices
+    size: Floats  # exposure of a count
+    parameter: Floats  # parameter of the distribution of a count
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
-        zero = np.zeros_like(values)
+        zero, one = np.zeros_like(values), np.ones_like(values)
         missing = np.full_like(values, np.nan)
-        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
+        family = np.zeros(values.shape, dtype=np.intp)
+        return cls(values, zero, zero, zero, missing, missing, zero, family, one, one)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -57,15 +68,66 @@ class Readings:
         """Which readings are intervals, (N, m)."""
         return ~np.isnan(self.lower)
 
+    @cached_property
+    def located(self) -> Floats:
+        """Readings, (N, m); of an output that is censored throughout, the finite limits."""
+        limits = np.where(np.isfinite(self.lower), self.lower, self.upper)
+        return np.where(self.is_measured.any(axis=0), self.values, limits)
+
     def error_sd(self, outputs: Any) -> Any:
         """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
-        return self.error * np.where(self.is_relative, np.abs(outputs), 1.0)
+        return np.hypot(self.error, self.relative * np.abs(outputs))
+
+    @cached_property
+    def codes(self) -> tuple[int, ...]:
+        """Codes of the distributions of counts among the readings."""
+        return tuple(code for code in np.unique(self.family).tolist() if code)
+
+    def observing(self, readings: Floats) -> Readings:
+        """Return the same readings with other numbers, (N, m), none of them censored.
+
+        Missing readings stay missing. The normal approximation of counts follows the new ones.
+        """
+        missing = np.full_like(self.values, np.nan)
+        values = np.where(self.is_measured, readings / self.size - self.bias, np.nan)
+        result = replace(self, values=values, lower=missing, upper=missing)
+        for code in self.codes:
+            counts = np.where(self.is_measured, readings, 0.0)
+            sd = COUNTS[code].sd(counts, self.size, self.parameter) / self.size
+            result = replace(result, error=np.where(self.family == code, sd, result.error))
+        return result
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        outputs: Floats,
+        error: Any = 1.0,
+        relative: Any = 1.0,
+        bias: Any = 0.0,
+    ) -> Floats:
+        """Draw readings of outputs, (P, N, m), with their errors and rounding.
+
+        ``error`` and ``relative`` are factors of the errors, the first one also of the parameter of
+        counts, and ``bias`` is added to the known one; they broadcast to the outputs.
+        """
+        sd = np.hypot(error * self.error, relative * self.relative * np.abs(outputs))
+        result = outputs + sd * rng.standard_normal(outputs.shape) + (self.bias + bias)
+        if (self.step > 0).any():
+            unit = positive_scale(self.step)
+            result = np.where(self.step > 0, np.round(result / unit) * unit, result)
+        for code in self.codes:
+            is_count = np.broadcast_to(self.family == code, outputs.shape)
+            numbers = (self.size * outputs, self.size, error * self.parameter)
+            mean, size, parameter = (np.broadcast_to(x, outputs.shape)[is_count] for x in numbers)
+            result[is_count] = COUNTS[code].draw(rng, mean, size, parameter)
+        return np.asarray(result)
 
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero.
 
         Few readings do not determine a scale. Outputs with fewer than eight readings share the
-        standard deviation of all their readings.
+        standard deviation of all their readings. An output that is censored throughout has a tenth
+        of the limit, and at least the error.
         """
         count = np.maximum(self.is_measured.sum(axis=0), 1)
         values = np.where(self.is_measured, self.values, 0.0)
@@ -76,6 +138,8 @@ class Readings:
         pooled = self.values[:, few][self.is_measured[:, few]]
         if few.sum() > 1 and pooled.size > 1:
             sd[few] = pooled.std()
+        for j in np.flatnonzero(~self.is_measured.any(axis=0)):
+            sd[j] = max(0.1 * np.nanmax(np.abs(self.located[:, j])), self.error[:, j].max())
         return positive_scale(sd)
 
     def relative_error(self, error: Floats) -> Floats:
@@ -114,14 +178,22 @@ class Readings:
 
     def scaled(self, factor: float) -> Readings:
         """Return the readings with their errors multiplied by a factor."""
-        return replace(self, error=factor * self.error)
+        power = np.ones(self.family.shape)
+        for code in self.codes:
+            power[self.family == code] = 1.0 if COUNTS[code].widens else -2.0
+        return replace(
+            self,
+            error=factor * self.error,
+            relative=factor * self.relative,
+            parameter=factor**power * self.parameter,
+        )
 
     def log_density(self, outputs: Floats, emulator_error: Floats) -> Floats:
         """Return the log-density of each specimen's readings given outputs, (N, K, m) -> (N, K).
 
         The log-density is -inf if an output is NaN.
         """
-        if self.is_relative.any():
+        if self.relative.any():
             by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
             variance = np.moveaxis(emulator_error**2 + self.error_sd(by_point) ** 2, 0, 1)
         else:
@@ -130,11 +202,14 @@ class Readings:
             result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
 
-    def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
+    def symbolic_log_density(
+        self, outputs: Any, variance: Any, xp: Any, parameter: Any = None
+    ) -> Any:
         """Return the log-density, (N, K), as an array or a graph of the comparison's variance.
 
         A censored reading has the probability of its interval, a rounded one the mean density over
-        its step. The variance broadcasts against the outputs, (N, K, m).
+        its step, a count that of its distribution with the ``parameter``, without an error of the
+        emulator. Variance and parameter broadcast against the outputs, (N, K, m).
         """
         sd = xp.sqrt(variance)
         values = np.where(self.is_measured, self.values, 0.0)[:, None]
@@ -153,6 +228,13 @@ class Readings:
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
+        for code in self.codes:
+            is_count = ((self.family == code) & self.is_measured)[:, None]
+            size = self.size[:, None]
+            counts = np.where(is_count, np.round(values * size), 0.0)
+            parameter = self.parameter[:, None] if parameter is None else parameter
+            logs = COUNTS[code].log_density(counts, size * outputs, size, parameter, xp)
+            terms = xp.where(is_count, logs, terms)
         # In NumPy a matrix product is five times faster than a sum over a short axis.
         return terms @ np.ones(terms.shape[-1]) if xp is np else terms.sum(axis=-1)
 
@@ -214,7 +296,11 @@ def averaged(
         step=by_specimen(readings.step, np.median(readings.step, axis=0)),
         lower=by_specimen(readings.lower, np.nan),
         upper=by_specimen(readings.upper, np.nan),
-        is_relative=np.broadcast_to(readings.is_relative[:1], count.shape),
+        relative=by_specimen(readings.relative, np.median(readings.relative, axis=0)),
+        bias=by_specimen(readings.bias, np.median(readings.bias, axis=0)),
+        family=np.broadcast_to(readings.family[:1], count.shape),
+        size=by_specimen(readings.size, np.median(readings.size, axis=0)),
+        parameter=by_specimen(readings.parameter, np.median(readings.parameter, axis=0)),
     )
     single_scale = by_specimen(scale, np.median(scale, axis=0))
     is_repeated = count > 1

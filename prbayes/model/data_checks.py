@@ -506,12 +506,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
             output, leave = f"output {j} of {outputs.shape[1]}", ", or leave the output out"
         if is_constant[j]:
             raise DesignError(f"{name}: {output}: {_constant(finite[:, j])}{leave}")
-        values = readings.values[np.isfinite(readings.values[:, j]), j]
-        if not values.size and readings.is_censored[:, j].any():
-            raise DesignError(
-                f"{name}: got no reading of {output} within the limits of censored=, expected at "
-                f"least one; check the limits{leave}"
-            )
+        values = readings.located[np.isfinite(readings.located[:, j]), j]
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():
             raise DesignError(

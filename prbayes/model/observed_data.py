@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -214,17 +214,13 @@ def observed_at_conditions(
     coords = {k: v for k, v in getattr(observed, "coords", {}).items() if v.dims == (first,)}
     coords[dim] = condition.data
     scattered = xr.DataArray(_at_columns(readings, condition), dims=(first, dim), coords=coords)
-    changed: dict[str, Any] = {}
-    for role in ("error", "rounded", "censored"):
-        value = getattr(metric, role, None)
-        if value is None or isinstance(value, Variable):
-            continue
-        parts = [
-            _at_columns(x, condition, float(np.median(x))) if np.shape(x) == shape else x
-            for x in (value if role == "censored" else [value])
-        ]
-        changed[role] = tuple(parts) if role == "censored" else parts[0]
-    return scattered, replace(cast(LogLikelihood, metric), **changed) if changed else metric
+
+    def at_columns(value: Any) -> Any:
+        if isinstance(value, Variable) or np.shape(value) != shape:
+            return value
+        return _at_columns(value, condition, float(np.median(value)))
+
+    return scattered, metric.mapped(at_columns) if isinstance(metric, LogLikelihood) else metric
 
 
 def _refuse_other_order(

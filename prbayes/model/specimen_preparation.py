@@ -45,7 +45,6 @@ from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import RunCost
-from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
 from prbayes.specimens.design import (
     emulate,
@@ -248,10 +247,11 @@ def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
     """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
-        if "error" in m.extras:
-            (draws,) = PriorSampler([m.extras["error"]])(2048, seed=0)
-            low, middle, high = np.quantile(draws, [0.01, 0.84, 0.99], axis=0)
-            ends.append((np.min(low / middle), np.max(high / middle)))
+        if m.unknown:
+            sd = [m.readings_at(prob, 2048) for prob in (0.01, 0.84, 0.99)]
+            low, middle, high = (r.error_sd(np.nan_to_num(r.values)) for r in sd)
+            usable = middle > 0
+            ends.append((np.min((low / middle)[usable]), np.max((high / middle)[usable])))
     if not ends:
         return (1.0,)
     lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
@@ -267,6 +267,9 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     if conditions is not None:
         known[:, coordinates.is_condition] = conditions
     options = replace(likelihood.options, n_first=first_run_count(likelihood))
+    if any("bias" in m.unknown for m in likelihood.measurements):
+        # Errors of all specimens add up if they have a bias in common, which halves do not show.
+        options = replace(options, points=4 * options.points)
     if np.isfinite(coordinates.ends).any() and len(coordinates.inputs_of_population) == 1:
         # Near the end of an input's range, the error of the input counts relative to the distance
         # from the end, so that the surface has to be more accurate. With several inputs the normal
@@ -442,7 +445,8 @@ def _data_findings(
     findings: list[Finding] = []
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
-        values = m.readings.values
+        # Counts have ties and outliers that are no errors.
+        values = np.where(m.readings.family == 0, m.readings.values, np.nan)
         simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
         has_gross_errors = m.gross_errors is not False
         findings += outlier_findings(

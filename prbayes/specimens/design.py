@@ -515,8 +515,8 @@ def _explored(
     error = np.sqrt(emulation.surface.variance(z))
     deviation = spread + 3 * error
     values = emulation.surface.values(z)
-    low = np.nanmin(readings.values, axis=0) - deviation
-    high = np.nanmax(readings.values, axis=0) + deviation
+    low = np.nanmin(readings.located, axis=0) - deviation
+    high = np.nanmax(readings.located, axis=0) + deviation
     is_possible = ((values >= low) & (values <= high)).all(axis=1)
     if is_possible.sum() >= count:
         z, error = z[is_possible], error[is_possible]

@@ -210,9 +210,8 @@ class SpecimenData:
 def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -> Residuals:
     """Return the residuals of an emulator's outputs."""
     readings, is_read = data.readings, data.readings.is_measured
-    relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
-    error = np.where(readings.is_relative, 0.0, readings.error)
-    error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
+    relative = np.where(is_read, readings.relative, 0.0)
+    error = np.where(is_read, np.sqrt(readings.error**2 + readings.step**2 / 12), np.inf)
     target = np.where(is_read, readings.values, 0.0)
     if emulation.offsets is not None:
         target = target - emulation.offsets
