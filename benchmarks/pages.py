@@ -236,6 +236,24 @@ def measurement_error() -> Iterator[Row]:
         yield [label, text, f"{value:g}", *moments, held, sets]
 
 
+def kinds_of_readings() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors by kind of reading."""
+    names = {
+        "gaver": "the ten pumps",
+        "poisson": "Poisson",
+        "negative binomial": "negative binomial, alpha unknown",
+        "binomial": "binomial, 5 to 39 trials",
+        "combined": "error with two unknown parts, two readings",
+        "bias": "unknown bias",
+        "limit": "all readings of the second output at a limit",
+    }
+    for cell, figures in summary("kinds_of_readings").items():
+        low, high = figures["widths"]
+        widths = f"{low:.2f} to {high:.2f}"
+        seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+        yield [names[cell], f"{figures['largest offset']:.2f}", widths, seconds, sets]
+
+
 def data_sheets() -> Iterator[Row]:
     """Yield the coverage of intervals from data sheets."""
     table = summary("data_sheets")
@@ -675,6 +693,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "partial pooling": partial_pooling,
     "small groups": small_groups,
     "measurement error": measurement_error,
+    "kinds of readings": kinds_of_readings,
     "data sheets": data_sheets,
     "gross errors": gross_errors,
     "readings, coverage": partial(coverage_of, "readings_coverage"),

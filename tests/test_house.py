@@ -44,6 +44,7 @@ _GROUND = (
 LAYERS = (
     _GROUND,
     ("numerics",),
+    ("readings",),
     ("metrics", "response"),
     ("emulators",),
     ("propagation",),
@@ -82,6 +83,7 @@ WITHOUT_EXAMPLE = {
     "Optimum",
     "Propagation",
     "Quantity",
+    "ReadingDistribution",
     "ResponseError",
     "Store",
     "StoreError",

@@ -29,10 +29,11 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.description import labelled
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.locking import locked
+from prbayes.model.measurement import unit_readings
 from prbayes.model.parameters import split_elements, table_elements, variables_at
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.numerics.modes import rows_by_mode
@@ -434,11 +435,11 @@ class ReadingErrors:
         roles = measurement.extras if metric is None else likelihood.roles
         roles = {role: roles[role] for role in likelihood.roles if role in roles}
         variables = [x for x in roles.values() if isinstance(x, Variable)]
-        readings = measurement.unit
+        readings = unit_readings(measurement)
         if metric is not None:
             readings = likelihood.readings(np.zeros((1, sample.outputs[0].size)), None, event)
-        is_single = len(likelihood.roles) == 1 and not readings.codes and "bias" not in roles
-        if variables and not is_single:
+        is_normal = (readings.family < 0).all() and "bias" not in roles
+        if variables and not (is_normal and len(likelihood.roles) == 1):
             raise ValueError(
                 f"{label}: got readings with the unknown {', '.join(map(str, variables))}, "
                 "expected known parameters, or one unknown error; pass a metric with numbers to "
@@ -477,7 +478,7 @@ class ReadingErrors:
             by_output = np.broadcast_to(slopes(logs, step), (shape[1], step.size))
             scores = scores + (normal**2 - 1) @ by_output
         like = self.readings.rows(np.resize(np.arange(len(self.readings)), len(outputs)))
-        result = like.draw(np.random.default_rng(0), outputs[None], factor, factor)[0]
+        result = add_errors(like, np.random.default_rng(0), outputs[None], factor, factor)[0]
         lowest, highest = (np.resize(limit, shape) for limit in self.limits)
         return np.clip(result, lowest, highest), scores
 

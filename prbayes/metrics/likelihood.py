@@ -17,7 +17,7 @@ from prbayes.metrics.density import (
     density_estimator,
     likelihood_bandwidth,
 )
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, with_values
 from prbayes.readings import COUNTS
 from prbayes.readings.base import Count, ReadingDistribution, as_tuples, fixed
 
@@ -136,7 +136,7 @@ class LogLikelihood(Metric):
         }
         for name, value in measurement.items():
             object.__setattr__(self, name, value)
-        self._refuse_conflicts()
+        _refuse_conflicts(self)
         if self.density is None:
             return
         unused = [name for name, value in measurement.items() if value is not None]
@@ -148,23 +148,6 @@ class LogLikelihood(Metric):
             )
         density = density_estimator(self.density, likelihood_bandwidth)
         object.__setattr__(self, "density", density)
-
-    def _refuse_conflicts(self) -> None:
-        """Raise if arguments do not describe one distribution of the readings."""
-        others = {name: getattr(self, name) for name in ("bias", "censored", "rounded")}
-        others |= {"relative": self.relative or None, "gross_errors": self.gross_errors or None}
-        given = [f"{name}=" for name, value in others.items() if value is not None]
-        kept = given if self.count is not None else ["relative="] * self.relative
-        if isinstance(self.error, ReadingDistribution) and kept:
-            raise ValueError(
-                f"LogLikelihood: got error={self.error!r:.60} with {', '.join(kept)}, expected the "
-                f"distribution alone; leave {', '.join(kept)} out"
-            )
-        if hasattr(self.bias, "owner") and self.error is None:
-            raise ValueError(
-                "LogLikelihood: bias: got a variable without error=, expected both: exact readings "
-                "with an unknown bias have no density; pass error= with the standard deviation"
-            )
 
     @property
     def count(self) -> Count | None:
@@ -256,15 +239,15 @@ class LogLikelihood(Metric):
             lower=lower,
             upper=upper,
             bias=bias,
-            family=np.zeros(values.shape, dtype=np.intp),
+            family=np.full(values.shape, -1),
             size=full(None if count is None else count.size, "error", 1.0),
             parameter=np.ones(values.shape) if count is None else full(sd, "error", 1.0),
         )
         if count is None:
             return readings
         _refuse_impossible(values, count.highest(readings.size))
-        code = next(code for code, kind in COUNTS.items() if isinstance(count, kind))
-        return replace(readings, family=np.full(values.shape, code)).observing(values)
+        code = COUNTS.index(type(count))
+        return with_values(replace(readings, family=np.full(values.shape, code)), values)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:
@@ -277,6 +260,24 @@ class LogLikelihood(Metric):
         density = cells.density(observed, weights)
         reading = cells.reading(observed, weights)
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
+
+
+def _refuse_conflicts(metric: LogLikelihood) -> None:
+    """Raise if arguments do not describe one distribution of the readings."""
+    arguments = {name: getattr(metric, name) for name in ("bias", "censored", "rounded")}
+    arguments |= {"relative": metric.relative or None, "gross_errors": metric.gross_errors or None}
+    given = [f"{name}=" for name, value in arguments.items() if value is not None]
+    refused = ", ".join(given if metric.count is not None else ["relative="] * metric.relative)
+    if isinstance(metric.error, ReadingDistribution) and refused:
+        raise ValueError(
+            f"LogLikelihood: got error={metric.error!r:.60} with {refused}, expected the "
+            f"distribution alone; leave {refused} out"
+        )
+    if hasattr(metric.bias, "owner") and metric.error is None:
+        raise ValueError(
+            "LogLikelihood: bias: got a variable without error=, expected both: exact readings "
+            "with an unknown bias have no density; pass error= with the standard deviation"
+        )
 
 
 def _refuse_impossible(values: Floats, highest: Floats) -> None:

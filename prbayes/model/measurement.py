@@ -78,32 +78,10 @@ class Measurement:
         """Unknown parameters of the readings' distribution, by role."""
         return {role: self.extras[role] for role in ROLES if role in self.extras}
 
-    def readings_at(self, prob: float, draws: int) -> Readings:
-        """Return readings with a scatter that has this quantile in the prior of its parameters.
-
-        An unknown bias has its prior's median, from which it scatters.
-        """
-        prior = PriorSampler(list(self.unknown.values()))(draws, seed=0) if self.unknown else []
-        samples = dict(zip(self.unknown, prior, strict=True))
-        bias = samples.pop("bias", np.zeros(1))
-        middle = np.median(bias, axis=0)
-        scatter = np.quantile(np.abs(bias - middle), prob, axis=0)
-        count = self.metric.count
-        prob = prob if count is None or count.widens else 1 - prob
-        unknown = {role: np.quantile(x, prob, axis=0) for role, x in samples.items()}
-        unknown |= {"bias": middle} if "bias" in self.unknown else {}
-        readings = self.metric.readings(self.rows, unknown, self.event)
-        return replace(readings, error=np.hypot(readings.error, scatter))
-
     @cached_property
     def readings(self) -> Readings:
         """Observed values and their errors; unknown parameters have their prior's 84 % quantile."""
-        return self.readings_at(0.84, 512)
-
-    @cached_property
-    def unit(self) -> Readings:
-        """Readings with errors in units of the unknown ones."""
-        return self.metric.readings(self.rows, None, self.event) if self.unknown else self.readings
+        return readings_at(self, 0.84, 512)
 
     def observing(self, data: Any) -> Measurement:
         """Return the measurement with other observed values; the same object for equal ones."""
@@ -114,6 +92,30 @@ class Measurement:
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
         aligned = "groups, conditions, weights= or specimens="
         return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
+
+
+def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
+    """Return readings with a scatter that has this quantile in the prior of its parameters.
+
+    An unknown bias has its prior's median, from which it scatters.
+    """
+    variables = measurement.unknown
+    prior = PriorSampler(list(variables.values()))(draws, seed=0) if variables else []
+    samples = dict(zip(variables, prior, strict=True))
+    bias = samples.pop("bias", np.zeros(1))
+    middle = np.median(bias, axis=0)
+    scatter = np.quantile(np.abs(bias - middle), prob, axis=0)
+    count = measurement.metric.count
+    prob = prob if count is None or count.widens else 1 - prob
+    unknown = {role: np.quantile(x, prob, axis=0) for role, x in samples.items()}
+    unknown |= {"bias": middle} if "bias" in variables else {}
+    readings = measurement.metric.readings(measurement.rows, unknown, measurement.event)
+    return replace(readings, error=np.hypot(readings.error, scatter))
+
+
+def unit_readings(measurement: Measurement) -> Readings:
+    """Return readings with errors in units of the unknown ones, and without an unknown bias."""
+    return measurement.metric.readings(measurement.rows, None, measurement.event)
 
 
 def observed_range(measurement: Measurement) -> Floats:
@@ -209,7 +211,7 @@ def _averaged(
     count = np.zeros((size, present.shape[1]), dtype=np.intp)
     np.add.at(count, numbers, present)
     is_repeated = present & (count > 1)[numbers]
-    is_normal = (readings.step == 0) & ~readings.is_censored & (readings.family == 0)
+    is_normal = (readings.step == 0) & ~readings.is_censored & (readings.family < 0)
     is_normal &= readings.relative == 0
     of_kind = (
         "with rounded or censored readings, counts or a relative error, expected repeated readings "
@@ -220,7 +222,7 @@ def _averaged(
         "without error=, expected it once: exact readings of one specimen would be equal; pass "
         "metric=prb.LogLikelihood(error=...) with their standard deviation"
     )
-    scale = measurement.unit.error
+    scale = unit_readings(measurement).error
     for is_bad, problem in ((~is_normal, of_kind), (scale == 0, of_error)):
         where = is_repeated & is_bad
         if where.any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -220,7 +220,9 @@ def observed_at_conditions(
             return value
         return _at_columns(value, condition, float(np.median(value)))
 
-    return scattered, metric.mapped(at_columns) if isinstance(metric, LogLikelihood) else metric
+    if isinstance(metric, Metric):
+        metric = cast(LogLikelihood, metric).mapped(at_columns)
+    return scattered, metric
 
 
 def _refuse_other_order(

@@ -25,7 +25,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats, Indices, called
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     ROLES,
@@ -36,6 +36,7 @@ from prbayes.model.measurement import (
     rows_by_context,
     rows_by_group,
     specimen_numbers,
+    unit_readings,
 )
 from prbayes.model.random_variable import (
     TERMS,
@@ -414,7 +415,7 @@ def draw_readings(
             rng, outputs, likelihood.readings, likelihood.measurements, values
         )
     outputs = outputs[..., output_columns(likelihood, measurement)]
-    readings = _with_reading_errors(rng, outputs, measurement.unit, [measurement], values)
+    readings = _with_reading_errors(rng, outputs, unit_readings(measurement), [measurement], values)
     return readings.reshape(size, n, *measurement.event)
 
 
@@ -429,7 +430,7 @@ def _with_reading_errors(
     size, n, _ = outputs.shape
     unknown = _unknown_of(measurements, values).swapaxes(0, 1)[:, :, None]
     like = readings.rows(np.resize(np.arange(len(readings)), n))
-    result = like.draw(rng, outputs, *unknown)
+    result = add_errors(like, rng, outputs, *unknown)
     share = _gross_share(measurements[0], values)
     if share is not False:
         low, high = np.concatenate([observed_range(m) for m in measurements], axis=1)

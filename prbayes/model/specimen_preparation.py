@@ -34,6 +34,7 @@ from prbayes.model.measurement import (
     SpecimenLikelihood,
     is_exchangeable,
     output_columns,
+    readings_at,
     rows_by_context,
     specimen_labels,
 )
@@ -248,7 +249,7 @@ def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
     ends = []
     for m in likelihood.measurements:
         if m.unknown:
-            sd = [m.readings_at(prob, 2048) for prob in (0.01, 0.84, 0.99)]
+            sd = [readings_at(m, prob, 2048) for prob in (0.01, 0.84, 0.99)]
             low, middle, high = (r.error_sd(np.nan_to_num(r.values)) for r in sd)
             usable = middle > 0
             ends.append((np.min((low / middle)[usable]), np.max((high / middle)[usable])))
@@ -446,7 +447,7 @@ def _data_findings(
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
         # Counts have ties and outliers that are no errors.
-        values = np.where(m.readings.family == 0, m.readings.values, np.nan)
+        values = np.where(m.readings.family < 0, m.readings.values, np.nan)
         simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
         has_gross_errors = m.gross_errors is not False
         findings += outlier_findings(

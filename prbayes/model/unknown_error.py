@@ -67,16 +67,16 @@ class ReadingDensity:
                 constant -= log_scale
                 is_missing[:, columns] = True
         scales = [stacked.scale, stacked.relative, stacked.parameter, stacked.bias]
-        variance, kept = emulator_error**2, None
+        variance, places = emulator_error**2, None
         size = (~is_missing).sum(axis=1).max()
         if size < outputs.shape[-1]:
-            kept = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
-            is_outside = np.take_along_axis(is_missing, kept, axis=1)
-            readings = readings.at_columns(kept)
+            places = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
+            is_outside = np.take_along_axis(is_missing, places, axis=1)
+            readings = readings.at_columns(places)
             readings = replace(readings, values=np.where(is_outside, np.nan, readings.values))
-            outputs = np.take_along_axis(outputs, kept[:, None], axis=2)
-            scales = [np.take_along_axis(x, kept, 1) for x in scales]
-            variance = variance[kept][:, None]
+            outputs = np.take_along_axis(outputs, places[:, None], axis=2)
+            scales = [np.take_along_axis(x, places, 1) for x in scales]
+            variance = variance[places][:, None]
         unit, relative, parameter, bias = (x[:, None] for x in scales)
         return cls(
             readings,
@@ -86,7 +86,7 @@ class ReadingDensity:
             parameter,
             bias if any("bias" in m.extras for m in likelihood.measurements) else None,
             variance,
-            kept,
+            places,
             sums,
             constant,
         )
@@ -157,7 +157,7 @@ def _sums_of_squares(
     is_measured = readings.is_measured
     unit = np.where(is_measured, likelihood.stacked.scale[:, columns], 1.0)
     relative = (emulator_error[columns] / unit) ** 2
-    is_special = (readings.step != 0) | (readings.family != 0) | readings.is_censored
+    is_special = (readings.step != 0) | (readings.family >= 0) | readings.is_censored
     # With this tolerance a log-density changes by less than 1e-4 at an eighth of the largest
     # plausible error.
     is_special |= relative > 1e-6 * (readings.error / unit) ** 2

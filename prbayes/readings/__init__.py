@@ -6,7 +6,7 @@ from prbayes.readings.combined import Combined
 from prbayes.readings.negative_binomial import NegativeBinomial
 from prbayes.readings.poisson import Poisson
 
-# Distributions of counts by their code in `prbayes.metrics.readings`; zero is a normal error.
-COUNTS: dict[int, type[Count]] = {1: Poisson, 2: NegativeBinomial, 3: Binomial}
+# Distributions of counts, by their index in `prbayes.metrics.readings`.
+COUNTS: tuple[type[Count], ...] = (Poisson, NegativeBinomial, Binomial)
 
 __all__ = ["Binomial", "Combined", "NegativeBinomial", "Poisson", "ReadingDistribution"]

@@ -58,7 +58,8 @@ class Binomial(Count):
     def draw(rng: np.random.Generator, mean: Floats, size: Floats, parameter: Floats) -> Floats:
         """Draw counts with the given means."""
         share = np.clip(mean / size, 0, 1)
-        return rng.binomial(np.round(size).astype(int), share).astype(np.float64)
+        trials = np.round(size).astype(np.intp)
+        return np.asarray(rng.binomial(trials, share), dtype=np.float64)
 
     @staticmethod
     def highest(size: Floats) -> Floats:

@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, scaled_errors
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
@@ -466,7 +466,8 @@ def at_scale(
     """Return points with weights for readings whose errors are larger by a factor."""
     if scale == 1.0:
         return points
-    log_a = data.readings.scaled(scale).log_density(points.outputs, error) - points.log_proposal
+    readings = scaled_errors(data.readings, scale)
+    log_a = readings.log_density(points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 

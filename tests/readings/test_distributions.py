@@ -13,7 +13,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, add_errors, with_values
 from prbayes.readings import Binomial, Combined, NegativeBinomial, Poisson, ReadingDistribution
 
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
@@ -107,7 +107,7 @@ def test_the_normal_approximation_has_the_width_of_the_likelihood(
 @pytest.mark.parametrize("distribution", [c[0] for c in CASES], ids=NAMES)
 def test_draws_have_the_mean_and_the_variance(distribution: ReadingDistribution) -> None:
     readings, f, n = read(distribution), 0.4, 20000
-    drawn = readings.draw(np.random.default_rng(0), np.full((n, 4, 1), f))[..., 0]
+    drawn = add_errors(readings, np.random.default_rng(0), np.full((n, 4, 1), f))[..., 0]
     frozen = {
         "Poisson": stats.poisson(SIZE * f),
         "NegativeBinomial": stats.nbinom(3.0, 3.0 / (3.0 + SIZE * f)),
@@ -118,7 +118,7 @@ def test_draws_have_the_mean_and_the_variance(distribution: ReadingDistribution)
     kurtosis = np.asarray(frozen.stats("k"))
     error = frozen.var() * np.sqrt((kurtosis + 2) / n)
     assert (np.abs(drawn.var(axis=0) - frozen.var()) < 5 * error).all()
-    assert (readings.observing(drawn[:1].T).values * readings.size == drawn[:1].T).all()
+    assert (with_values(readings, drawn[:1].T).values * readings.size == drawn[:1].T).all()
 
 
 def test_a_large_alpha_is_the_poisson_distribution() -> None:
@@ -138,10 +138,10 @@ def test_parts_of_a_combined_error_add_and_a_bias_shifts() -> None:
     expected = stats.norm.logpdf(y, f + 0.5, sd)
     expected[2] = stats.norm.logsf(4.0, f + 0.5, sd)
     np.testing.assert_allclose(density, expected, rtol=1e-12)
-    drawn = readings.draw(np.random.default_rng(0), np.full((20000, 4, 1), f))
+    drawn = add_errors(readings, np.random.default_rng(0), np.full((20000, 4, 1), f))
     assert drawn.mean() == pytest.approx(f + 0.5, abs=5 * 0.46 / np.sqrt(80000))
     assert drawn.std() == pytest.approx(np.hypot(0.3, 0.2 * f), rel=0.02)
-    np.testing.assert_allclose(readings.observing(y[:, None]).values[:2, 0], y[:2] - 0.5)
+    np.testing.assert_allclose(with_values(readings, y[:, None]).values[:2, 0], y[:2] - 0.5)
 
 
 @pytest.mark.parametrize(
