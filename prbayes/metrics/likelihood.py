@@ -59,6 +59,10 @@ class LogLikelihood(Metric):
     censored : tuple of (lower, upper), optional
         Limits of the readings, numbers or arrays as for ``error``, None for no limit: a value at or
         beyond a limit means only that the output is there.
+    selected : tuple of (lower, upper), optional
+        Limits within which a specimen was measured at all, such as those of a proof test: numbers,
+        or one for each output, None for no limit. Specimens whose reading, error included, lies
+        beyond a limit were never seen. It needs known errors, the same for all specimens.
     rounded : float or array_like, optional
         Width to which values were rounded, as for ``error``. Also the width of an interval whose
         middle is the reading.
@@ -95,6 +99,7 @@ class LogLikelihood(Metric):
     bias: Any = None
     gross_errors: Any = False
     censored: tuple[Any, Any] | None = None
+    selected: tuple[Any, Any] | None = None
     rounded: Any = None
     density: DensityEstimator | None = None
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
@@ -119,19 +124,11 @@ class LogLikelihood(Metric):
                 f"LogLikelihood: gross_errors: got {gross!r}, expected True, a share in (0, 1) or "
                 "a variable of the model"
             )
-        if limits is not None:
-            is_pair = isinstance(limits, tuple | list) and len(limits) == 2
-            if not is_pair or all(x is None for x in limits):
-                raise ValueError(
-                    f"LogLikelihood: censored: got {limits!r}, expected (lower, upper), one of "
-                    "which may be None"
-                )
-            arrays = [x if x is None else real_array(x, "LogLikelihood: censored") for x in limits]
-            limits = tuple(x if x is None else as_tuples(x) for x in arrays)
         measurement = {
             "error": fixed(self.error, "LogLikelihood: error"),
             "bias": fixed(self.bias, "LogLikelihood: bias", positive=False),
-            "censored": limits,
+            "censored": _limits(limits, "censored"),
+            "selected": _limits(self.selected, "selected"),
             "rounded": fixed(self.rounded, "LogLikelihood: rounded"),
         }
         for name, value in measurement.items():
@@ -262,16 +259,39 @@ class LogLikelihood(Metric):
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 
+def _limits(limits: Any, name: str) -> tuple[Any, Any] | None:
+    """Return a pair of limits, numbers or nested tuples; raise if it is none."""
+    if limits is None:
+        return None
+    is_pair = isinstance(limits, tuple | list) and len(limits) == 2
+    if not is_pair or all(x is None for x in limits):
+        raise ValueError(
+            f"LogLikelihood: {name}: got {limits!r}, expected (lower, upper), one of which may be "
+            "None"
+        )
+    label = f"LogLikelihood: {name}"
+    low, high = (x if x is None else as_tuples(real_array(x, label)) for x in limits)
+    return low, high
+
+
 def _refuse_conflicts(metric: LogLikelihood) -> None:
     """Raise if arguments do not describe one distribution of the readings."""
-    arguments = {name: getattr(metric, name) for name in ("bias", "censored", "rounded")}
+    arguments = {
+        name: getattr(metric, name) for name in ("bias", "censored", "selected", "rounded")
+    }
     arguments |= {"relative": metric.relative or None, "gross_errors": metric.gross_errors or None}
-    given = [f"{name}=" for name, value in arguments.items() if value is not None]
-    refused = ", ".join(given if metric.count is not None else ["relative="] * metric.relative)
+    labels = [f"{name}=" for name, value in arguments.items() if value is not None]
+    refused = ", ".join(labels if metric.count is not None else ["relative="] * metric.relative)
     if isinstance(metric.error, ReadingDistribution) and refused:
         raise ValueError(
             f"LogLikelihood: got error={metric.error!r:.60} with {refused}, expected the "
             f"distribution alone; leave {refused} out"
+        )
+    variables = [x for x in (*metric.roles.values(), metric.gross_errors) if hasattr(x, "owner")]
+    if metric.selected is not None and (variables or metric.gross_errors is True):
+        raise ValueError(
+            "LogLikelihood: selected: got an unknown error or gross errors beside it, expected "
+            "known errors, with which the share of measured specimens is computed; pass numbers"
         )
     if hasattr(metric.bias, "owner") and metric.error is None:
         raise ValueError(

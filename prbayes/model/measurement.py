@@ -31,6 +31,7 @@ from prbayes.response.response import Responses
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import SpecimenOptions
+from prbayes.specimens.selection import Selection
 
 # Roles of unknown parameters of the readings' distribution: factors of the standard deviation, or
 # parameter of a count, and of the share of the output; and a number that is added to the output.
@@ -116,6 +117,41 @@ def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
 def unit_readings(measurement: Measurement) -> Readings:
     """Return readings with errors in units of the unknown ones, and without an unknown bias."""
     return measurement.metric.readings(measurement.rows, None, measurement.event)
+
+
+def selection_of(measurements: Sequence[Measurement]) -> Selection | None:
+    """Return the limits within which specimens were measured; None without limits."""
+    if all(m.metric.selected is None for m in measurements):
+        return None
+    parts: list[list[Floats]] = []
+    for m in measurements:
+        ends = m.metric.selected or (None, None)
+        defaults = zip(ends, (-np.inf, np.inf), strict=True)
+        low, high = (default if end is None else end for end, default in defaults)
+        readings, shape = unit_readings(m), m.rows.shape
+        try:
+            limits = [np.broadcast_to(np.asarray(x, float), shape[1:]) for x in (low, high)]
+        except ValueError:
+            raise ValueError(
+                f"{m.name}: metric: selected: got limits of shape {np.shape(low)} and "
+                f"{np.shape(high)}, expected numbers, or shape {shape[1:]}, one for each output"
+            ) from None
+        with np.errstate(invalid="ignore"):
+            is_outside = (m.rows < limits[0]) | (m.rows > limits[1])
+        if is_outside.any():
+            row, column = np.argwhere(is_outside)[0].tolist()
+            raise ValueError(
+                f"{m.name}: metric: selected: got the reading {m.rows[row, column]:g} of specimen "
+                f"{row}, expected readings within the limits: others are never seen; widen the "
+                "limits, or leave selected= out"
+            )
+        if any(np.ptp(x, axis=0).any() for x in (readings.error, readings.relative, readings.bias)):
+            raise ValueError(
+                f"{m.name}: metric: error: got errors that differ between specimens beside "
+                "selected=, expected the same for all: those that were never seen need one too"
+            )
+        parts.append([*limits, readings.error[0], readings.relative[0], readings.bias[0]])
+    return Selection(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def observed_range(measurement: Measurement) -> Floats:

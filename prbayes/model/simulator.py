@@ -40,7 +40,12 @@ from prbayes.metrics.summary_likelihood import SummaryLikelihood
 from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
-from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
+from prbayes.model.measurement import (
+    Measurement,
+    SpecimenLikelihood,
+    selection_of,
+    specimen_labels,
+)
 from prbayes.model.observed_data import ObservedData, observed_at_conditions, read_data
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -461,7 +466,7 @@ def _joint_likelihood(
     """
     name = measurement.name
     try:
-        _ = measurement.readings
+        _ = measurement.readings, selection_of([measurement])
     except ValueError as error:
         raise ValueError(f"{name}: metric: {error}") from None
     joined = {m for partner in partners for m in partner.measurements}

@@ -35,6 +35,7 @@ from prbayes.model.measurement import (
     output_columns,
     rows_by_context,
     rows_by_group,
+    selection_of,
     specimen_numbers,
     unit_readings,
 )
@@ -410,13 +411,22 @@ def draw_readings(
         if not is_missing.any():
             break
         outputs[is_missing] = draw_outputs()[is_missing]
-    if measurement is None:
-        return _with_reading_errors(
-            rng, outputs, likelihood.readings, likelihood.measurements, values
-        )
-    outputs = outputs[..., output_columns(likelihood, measurement)]
-    readings = _with_reading_errors(rng, outputs, unit_readings(measurement), [measurement], values)
-    return readings.reshape(size, n, *measurement.event)
+    columns, measurements, like_read = slice(None), likelihood.measurements, likelihood.readings
+    if measurement is not None:
+        columns, measurements = output_columns(likelihood, measurement), (measurement,)
+        like_read = unit_readings(measurement)
+
+    def read(outputs: Floats) -> Floats:
+        return _with_reading_errors(rng, outputs[..., columns], like_read, measurements, values)
+
+    readings, selection = read(outputs), selection_of(measurements)
+    # Specimens beyond the limits of a selection are drawn again, too.
+    for _ in range(0 if selection is None else 256):
+        is_unseen = ~selection.is_seen(readings)
+        if not is_unseen.any():
+            break
+        readings[is_unseen] = read(draw_outputs())[is_unseen]
+    return readings if measurement is None else readings.reshape(size, n, *measurement.event)
 
 
 def _with_reading_errors(

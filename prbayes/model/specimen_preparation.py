@@ -36,6 +36,7 @@ from prbayes.model.measurement import (
     output_columns,
     readings_at,
     rows_by_context,
+    selection_of,
     specimen_labels,
 )
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
@@ -161,6 +162,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     runs = CheckedRuns(likelihood)
     try:
         data = specimen_data(likelihood)
+        selection = selection_of(likelihood.measurements)
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
         refined, share = response_share(
@@ -171,17 +173,22 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             lambda share: SpecimenPopulations(likelihood).posterior(
                 points.z, points.log_a, share=share
             ),
+            selection,
         )
         if share is not None and likelihood.inputs.conditions:
             raise DesignError(
-                f"{likelihood.name}: got NaN from the response for a share of the specimens that "
-                "is not negligible, expected a response of all specimens with "
+                f"{likelihood.name}: got selected=, or NaN from the response for a share of the "
+                "specimens that is not negligible, expected a response of all specimens with "
                 "prb.response.condition, since the share depends on the condition; return a "
                 "number there, such as the limit of the measurement, or narrow the priors"
             )
         if refined is not first.emulation and not likelihood.has_table:
             # The refined emulator is accurate beside the region where runs fail, so that points of
-            # specimens there are on the right side of its boundary.
+            # specimens there are on the right side of its boundary. Populations of a selection are
+            # wider than those of the measured specimens.
+            if selection is not None:
+                of_share = partial(SpecimenPopulations(likelihood).posterior, share=share)
+                data = replace(data, posterior=of_share)
             first = _emulate(runs, data, refined)
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
