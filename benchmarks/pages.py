@@ -254,6 +254,17 @@ def kinds_of_readings() -> Iterator[Row]:
         yield [names[cell], f"{figures['largest offset']:.2f}", widths, seconds, sets]
 
 
+def selection() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors of selected specimens."""
+    for cell, figures in summary("selection").items():
+        share, error, way = cell.split("/")
+        low, high = figures["widths"]
+        label = f"{float(share):.0%}" + (", ignored" if way == "ignored" else "")
+        seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+        offset, widths = f"{figures['largest offset']:.2f}", f"{low:.2f} to {high:.2f}"
+        yield [label, error, offset, widths, seconds, sets]
+
+
 def data_sheets() -> Iterator[Row]:
     """Yield the coverage of intervals from data sheets."""
     table = summary("data_sheets")
@@ -694,6 +705,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "kinds of readings": kinds_of_readings,
+    "selection": selection,
     "data sheets": data_sheets,
     "gross errors": gross_errors,
     "readings, coverage": partial(coverage_of, "readings_coverage"),
