@@ -180,18 +180,7 @@ class LogLikelihood(Metric):
             array = np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else np.empty(0)
             return as_tuples(array[rows]) if len(array) == n else value
 
-        return self.mapped(of_specimens)
-
-    def mapped(self, function: Callable[[Any], Any]) -> LogLikelihood:
-        """Return the likelihood with a function applied to the numbers that describe readings."""
-        is_plain = not isinstance(self.error, ReadingDistribution)
-        return replace(
-            self,
-            error=function(self.error) if is_plain else self.error.mapped(function),
-            bias=function(self.bias),
-            rounded=function(self.rounded),
-            censored=self.censored and tuple(map(function, self.censored)),
-        )
+        return mapped_metric(self, of_specimens)
 
     def readings(
         self, values: Floats, unknown: Mapping[str, Any] | None = None, event: Shape = ()
@@ -257,6 +246,18 @@ class LogLikelihood(Metric):
         density = cells.density(observed, weights)
         reading = cells.reading(observed, weights)
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
+
+
+def mapped_metric(metric: LogLikelihood, function: Callable[[Any], Any]) -> LogLikelihood:
+    """Return the likelihood with a function applied to the numbers that describe readings."""
+    is_plain = not isinstance(metric.error, ReadingDistribution)
+    return replace(
+        metric,
+        error=function(metric.error) if is_plain else metric.error.mapped(function),
+        bias=function(metric.bias),
+        rounded=function(metric.rounded),
+        censored=metric.censored and tuple(map(function, metric.censored)),
+    )
 
 
 def _limits(limits: Any, name: str) -> tuple[Any, Any] | None:

@@ -37,10 +37,10 @@ class Readings:
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
-        zero, one = np.zeros_like(values), np.ones_like(values)
+        zero, unit = np.zeros_like(values), np.ones_like(values)
         missing = np.full_like(values, np.nan)
         family = np.full(values.shape, -1)
-        return cls(values, zero, zero, zero, missing, missing, zero, family, one, one)
+        return cls(values, zero, zero, zero, missing, missing, zero, family, unit, unit)
 
     def __len__(self) -> int:
         return len(self.values)

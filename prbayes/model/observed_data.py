@@ -17,7 +17,7 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
 from prbayes.metrics.base import Metric
-from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
 from prbayes.model.random_variable import known_value
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
@@ -221,7 +221,7 @@ def observed_at_conditions(
         return _at_columns(value, condition, float(np.median(value)))
 
     if isinstance(metric, Metric):
-        metric = cast(LogLikelihood, metric).mapped(at_columns)
+        metric = mapped_metric(cast(LogLikelihood, metric), at_columns)
     return scattered, metric
 
 
