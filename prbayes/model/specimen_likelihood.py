@@ -421,8 +421,8 @@ def draw_readings(
 
     readings, selection = read(outputs), selection_of(measurements)
     # Specimens beyond the limits of a selection are drawn again, too.
-    for _ in range(0 if selection is None else 256):
-        is_unseen = ~selection.is_seen(readings)
+    for _ in range(256):
+        is_unseen = np.array(False) if selection is None else ~selection.is_seen(readings)
         if not is_unseen.any():
             break
         readings[is_unseen] = read(draw_outputs())[is_unseen]
