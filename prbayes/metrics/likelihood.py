@@ -211,7 +211,8 @@ class LogLikelihood(Metric):
         count = self.count
         sd = full(roles.get("error"), "error", 0.0)
         low, high = self.censored or (None, None)
-        lowest, highest = full(low, "censored", -np.inf), full(high, "censored", np.inf)
+        lowest = full(low, "censored", -np.inf)
+        highest = full(high, "censored", np.inf)
         is_low = values <= lowest
         is_high = values >= highest
         bias = full(roles.get("bias"), "bias", 0.0)

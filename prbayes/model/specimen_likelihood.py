@@ -419,7 +419,8 @@ def draw_readings(
     def read(outputs: Floats) -> Floats:
         return _with_reading_errors(rng, outputs[..., columns], like_read, measurements, values)
 
-    readings, selection = read(outputs), selection_of(measurements)
+    readings = read(outputs)
+    selection = selection_of(measurements)
     # Specimens beyond the limits of a selection are drawn again, too.
     for _ in range(256):
         is_unseen = np.array(False) if selection is None else ~selection.is_seen(readings)

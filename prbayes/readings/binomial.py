@@ -45,14 +45,18 @@ class Binomial(Count):
     def sd(count: Floats, size: Floats, parameter: Floats) -> Floats:
         """Return the standard deviation of the mean given a count, that of a beta density."""
         a, b = count + 1, size - count + 1
-        return np.asarray(size * np.sqrt(a * b / (a + b + 1)) / (a + b))
+        total = a + b
+        sd = np.sqrt(a * b / (total + 1)) / total
+        return np.asarray(size * sd)
 
     @staticmethod
     def log_density(count: Floats, mean: Any, size: Floats, parameter: Any, xp: Any) -> Any:
         """Return the log-probability of counts, as an array or a graph."""
         share = xp.clip(mean / size, 1e-300, 1 - 1e-16)
-        constant = gammaln(size + 1) - gammaln(count + 1) - gammaln(size - count + 1)
-        return constant + count * xp.log(share) + (size - count) * xp.log1p(-share)
+        rest = size - count
+        constant = gammaln(size + 1) - gammaln(count + 1) - gammaln(rest + 1)
+        logs = count * xp.log(share) + rest * xp.log1p(-share)
+        return constant + logs
 
     @staticmethod
     def draw(rng: np.random.Generator, mean: Floats, size: Floats, parameter: Floats) -> Floats:

@@ -57,20 +57,24 @@ class NegativeBinomial(Count):
     @staticmethod
     def sd(count: Floats, size: Floats, parameter: Floats) -> Floats:
         """Return the standard deviation of the mean given a count."""
-        return np.sqrt(count + 1 + (count + 1) ** 2 / parameter)
+        mean = count + 1
+        return np.sqrt(mean + mean**2 / parameter)
 
     @staticmethod
     def log_density(count: Floats, mean: Any, size: Floats, parameter: Any, xp: Any) -> Any:
         """Return the log-probability of counts, as an array or a graph."""
         log_gamma = gammaln if xp is np else pt.gammaln
         mean = xp.maximum(mean, 1e-300)
-        constant = log_gamma(count + parameter) - log_gamma(parameter) - gammaln(count + 1)
+        constant = log_gamma(count + parameter) - log_gamma(parameter)
+        constant = constant - gammaln(count + 1)
         # log1p keeps the digits of large parameters, near the Poisson distribution.
         excess = parameter * xp.log1p(mean / parameter)
-        return constant + count * (xp.log(mean) - xp.log(mean + parameter)) - excess
+        log_share = xp.log(mean) - xp.log(mean + parameter)
+        return constant + count * log_share - excess
 
     @staticmethod
     def draw(rng: np.random.Generator, mean: Floats, size: Floats, parameter: Floats) -> Floats:
         """Draw counts with the given means."""
-        rate = np.maximum(mean, 0) * rng.gamma(parameter, 1 / parameter, mean.shape)
+        factor = rng.gamma(parameter, 1 / parameter, mean.shape)
+        rate = np.maximum(mean, 0) * factor
         return rng.poisson(rate).astype(np.float64)

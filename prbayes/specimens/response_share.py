@@ -182,7 +182,8 @@ def _sorted(
     """
     is_missing = emulation.is_missing(z)
     order = np.argsort(is_missing, kind="stable")
-    z, log_b, count = z[order], log_b[order], int((~is_missing).sum())
+    count = int((~is_missing).sum())
+    z, log_b = z[order], log_b[order]
     if selection is None:
         return ResponseShare(z, log_b, count)
     # Beyond the runs' range the response is that at the end of the range.

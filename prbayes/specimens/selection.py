@@ -38,10 +38,13 @@ class Selection:
     def log_probability(self, outputs: Floats, emulator_error: Floats) -> Floats:
         """Return the log-probability that specimens with these outputs are measured, (..., M)."""
         mean = outputs + self.bias
-        sd = np.sqrt(emulator_error**2 + self.error**2 + (self.relative * outputs) ** 2)
+        variance = emulator_error**2 + self.error**2 + (self.relative * outputs) ** 2
+        sd = np.sqrt(variance)
         sd = np.maximum(sd, 1e-12 * np.abs(mean) + 1e-300)
+        low = (self.low - mean) / sd
+        high = (self.high - mean) / sd
         with np.errstate(divide="ignore"):
-            logs = log_interval_probability((self.low - mean) / sd, (self.high - mean) / sd)
+            logs = log_interval_probability(low, high)
         return np.asarray(np.minimum(logs, 0.0).sum(axis=-1))
 
     def uncertain_points(
@@ -53,7 +56,8 @@ class Selection:
         being measured changes by more than ``largest`` within two standard deviations of the
         emulator's prediction.
         """
-        values, deviation = emulation.surface.values(z), np.sqrt(emulation.surface.variance(z))
+        values = emulation.surface.values(z)
+        deviation = np.sqrt(emulation.surface.variance(z))
         at_ends = [
             np.exp(self.log_probability(values + shift * deviation, emulation.error))
             for shift in (-2.0, 0.0, 2.0)
