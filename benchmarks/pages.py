@@ -253,6 +253,35 @@ def measurement_error() -> Iterator[Row]:
         yield [label, text, f"{value:g}", *moments, held, sets]
 
 
+def kinds_of_readings() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors by kind of reading."""
+    names = {
+        "gaver": "the ten pumps",
+        "poisson": "Poisson",
+        "negative binomial": "negative binomial, alpha unknown",
+        "binomial": "binomial, 5 to 39 trials",
+        "combined": "error with two unknown parts, two readings",
+        "bias": "unknown bias",
+        "limit": "all readings of the second output at a limit",
+    }
+    for cell, figures in summary("kinds_of_readings").items():
+        low, high = figures["widths"]
+        widths = f"{low:.2f} to {high:.2f}"
+        seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+        yield [names[cell], f"{figures['largest offset']:.2f}", widths, seconds, sets]
+
+
+def selection() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors of selected specimens."""
+    for cell, figures in summary("selection").items():
+        share, error, way = cell.split("/")
+        low, high = figures["widths"]
+        label = f"{float(share):.0%}" + (", ignored" if way == "ignored" else "")
+        seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+        offset, widths = f"{figures['largest offset']:.2f}", f"{low:.2f} to {high:.2f}"
+        yield [label, error, offset, widths, seconds, sets]
+
+
 def sizes() -> Iterator[Row]:
     """Yield the area test's size."""
     table = summary("validity")
@@ -612,6 +641,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "tails": tails,
+    "kinds of readings": kinds_of_readings,
+    "selection": selection,
     "gross errors": gross_errors,
     "readings, coverage": partial(coverage_of, "readings_coverage"),
     "covariates": partial(coverage_of, "covariates"),

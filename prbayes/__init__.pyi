@@ -7,6 +7,7 @@ from prbayes import metrics as metrics
 from prbayes import plots as plots
 from prbayes import posterior as posterior
 from prbayes import propagation as propagation
+from prbayes import readings as readings
 from prbayes import reports as reports
 from prbayes import response as response
 from prbayes import surrogate as surrogate

@@ -41,6 +41,7 @@ _GROUND = (
 LAYERS = (
     _GROUND,
     ("numerics",),
+    ("readings",),
     ("metrics", "response"),
     ("emulators", "families"),
     ("propagation",),
@@ -79,6 +80,7 @@ WITHOUT_EXAMPLE = {
     "Optimum",
     "Propagation",
     "Quantity",
+    "ReadingDistribution",
     "ResponseError",
     "Store",
     "StoreError",

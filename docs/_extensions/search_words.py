@@ -27,6 +27,8 @@ WORDS = {  # by page, or page#heading
     "virkler": ["correlation", "correlated inputs"],
     "distributions": ["bounded", "bounded inputs", "truncated", "uniform", "limits of an input"],
     "measurement_error": ["noise", "measurement error", "repeated readings", "gauge"],
+    "selection": ["selection", "truncated data", "proof test", "survivorship"],
+    "counts": ["poisson", "binomial", "count data", "failures", "proportional error"],
     "optimum_or_abc": ["mirror", "mirror solution", "two solutions", "multimodal"],
     "choosing_metric": ["robust", "contaminated"],
     "validity": ["validation", "goodness of fit", "model check"],

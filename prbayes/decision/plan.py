@@ -29,10 +29,11 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.description import labelled
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.locking import locked
+from prbayes.model.measurement import unit_readings
 from prbayes.model.parameters import split_elements, table_elements, variables_at
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.numerics.modes import rows_by_mode
@@ -431,14 +432,21 @@ class ReadingErrors:
                 "specimen, whose posterior uses the whole information of the readings; leave "
                 "metric= out, or pass prb.LogLikelihood(error=...)"
             )
-        unknown = likelihood.error if isinstance(likelihood.error, Variable) else None
-        readings = measurement.readings
+        roles = measurement.extras if metric is None else likelihood.roles
+        roles = {role: roles[role] for role in likelihood.roles if role in roles}
+        variables = [x for x in roles.values() if isinstance(x, Variable)]
+        readings = unit_readings(measurement)
         if metric is not None:
-            error = None if unknown is None else 0.0
-            readings = likelihood.readings(np.zeros((1, sample.outputs[0].size)), error, event)
-        elif unknown is not None:
-            unknown = measurement.extras["error"]
-        has_error = unknown is not None or readings.error.any()
+            readings = likelihood.readings(np.zeros((1, sample.outputs[0].size)), None, event)
+        is_normal = (readings.family < 0).all() and "bias" not in roles
+        if variables and not (is_normal and len(likelihood.roles) == 1):
+            raise ValueError(
+                f"{label}: got readings with the unknown {', '.join(map(str, variables))}, "
+                "expected known parameters, or one unknown error; pass a metric with numbers to "
+                "prb.decision.Condition"
+            )
+        unknown = variables[0] if variables else None
+        has_error = readings.error.any() or readings.relative.any()
         if not (has_error or readings.step.any() or likelihood.censored):
             return None
         size = sample.outputs[0].size
@@ -462,22 +470,15 @@ class ReadingErrors:
         ``values`` are the variables at a cross of thetas with steps (d,), ``scores`` those of
         inputs.
         """
-        shape = outputs.shape
-        normal = np.random.default_rng(0).standard_normal(shape)
-        sd = np.resize(self.readings.error, shape)
+        shape, factor = outputs.shape, np.ones(())
         if self.unknown is not None:
+            normal = np.random.default_rng(0).standard_normal(shape)
             logs = np.log(values[str(self.unknown.name)]).reshape(1 + 2 * step.size, -1)
-            sd = np.exp(logs[0])
+            factor = np.exp(logs[0])
             by_output = np.broadcast_to(slopes(logs, step), (shape[1], step.size))
             scores = scores + (normal**2 - 1) @ by_output
-        is_relative = np.resize(self.readings.is_relative, shape)
-        unit = np.where(is_relative, np.abs(outputs), 1.0)
-        result = outputs + sd * unit * normal
-        width = np.resize(self.readings.step, shape)
-        is_rounded = width > 0
-        width = np.where(is_rounded, width, 1.0)
-        steps = np.round(result / width)
-        result = np.where(is_rounded, steps * width, result)
+        like = self.readings.rows(np.resize(np.arange(len(self.readings)), len(outputs)))
+        result = add_errors(like, np.random.default_rng(0), outputs[None], factor, factor)[0]
         lowest, highest = (np.resize(limit, shape) for limit in self.limits)
         return np.clip(result, lowest, highest), scores
 

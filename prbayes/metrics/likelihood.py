@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -16,7 +17,9 @@ from prbayes.metrics.density import (
     density_estimator,
     likelihood_bandwidth,
 )
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, with_values
+from prbayes.readings import COUNTS
+from prbayes.readings.base import Count, ReadingDistribution, as_tuples, fixed
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -39,18 +42,27 @@ class LogLikelihood(Metric):
 
     Parameters
     ----------
-    error : float, array_like or model variable, optional
+    error : float, array_like, model variable or ReadingDistribution, optional
         Standard deviation of the normal error of a reading, in units of the output: one number, one
         for each output, (m,), or one for each reading, (N,) or (N, m). A variable of the model is
-        estimated. Readings are exact by default.
+        estimated. Readings are exact by default. `prbayes.readings` has errors with two parts and
+        counts.
     relative : bool
         Whether ``error`` is a share of the output.
+    bias : float, array_like or model variable, optional
+        Mean of the error, as for ``error``: a reading is the response plus this number plus a
+        normal error. A variable needs an ``error``, and a prior that is narrower than the
+        population of responses, from which data do not distinguish it.
     gross_errors : bool, float or model variable
         Share of specimens with a gross error, whose readings are uniform over twice the range of
         each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
     censored : tuple of (lower, upper), optional
         Limits of the readings, numbers or arrays as for ``error``, None for no limit: a value at or
         beyond a limit means only that the output is there.
+    selected : tuple of (lower, upper), optional
+        Limits within which a specimen was measured at all, such as those of a proof test: numbers,
+        or one for each output, None for no limit. Specimens whose reading, error included, lies
+        beyond a limit were never seen. It needs known errors, the same for all specimens.
     rounded : float or array_like, optional
         Width to which values were rounded, as for ``error``. Also the width of an interval whose
         middle is the reading.
@@ -84,8 +96,10 @@ class LogLikelihood(Metric):
 
     error: Any = None
     relative: bool = False
+    bias: Any = None
     gross_errors: Any = False
     censored: tuple[Any, Any] | None = None
+    selected: tuple[Any, Any] | None = None
     rounded: Any = None
     density: DensityEstimator | None = None
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
@@ -99,8 +113,10 @@ class LogLikelihood(Metric):
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
         limits: Any = self.censored
-        parts = [self.error, self.rounded, *(limits if isinstance(limits, tuple | list) else ())]
+        parts = [self.error, self.bias, self.rounded]
+        parts += limits if isinstance(limits, tuple | list) else ()
         labelled = tuple(x for x in parts if hasattr(x, "iloc") or hasattr(x, "indexes"))
+        labelled += getattr(self.error, "labelled", ())
         object.__setattr__(self, "_labelled", labelled)
         gross = self.gross_errors
         if isinstance(gross, int | float) and not isinstance(gross, bool) and not 0 < gross < 1:
@@ -108,22 +124,16 @@ class LogLikelihood(Metric):
                 f"LogLikelihood: gross_errors: got {gross!r}, expected True, a share in (0, 1) or "
                 "a variable of the model"
             )
-        if limits is not None:
-            is_pair = isinstance(limits, tuple | list) and len(limits) == 2
-            if not is_pair or all(x is None for x in limits):
-                raise ValueError(
-                    f"LogLikelihood: censored: got {limits!r}, expected (lower, upper), one of "
-                    "which may be None"
-                )
-            arrays = [x if x is None else real_array(x, "LogLikelihood: censored") for x in limits]
-            limits = tuple(x if x is None else _as_tuples(x) for x in arrays)
         measurement = {
-            "error": _hashable(self.error, "error"),
-            "censored": limits,
-            "rounded": _hashable(self.rounded, "rounded"),
+            "error": fixed(self.error, "LogLikelihood: error"),
+            "bias": fixed(self.bias, "LogLikelihood: bias", positive=False),
+            "censored": _limits(limits, "censored"),
+            "selected": _limits(self.selected, "selected"),
+            "rounded": fixed(self.rounded, "LogLikelihood: rounded"),
         }
         for name, value in measurement.items():
             object.__setattr__(self, name, value)
+        _refuse_conflicts(self)
         if self.density is None:
             return
         unused = [name for name, value in measurement.items() if value is not None]
@@ -135,6 +145,19 @@ class LogLikelihood(Metric):
             )
         density = density_estimator(self.density, likelihood_bandwidth)
         object.__setattr__(self, "density", density)
+
+    @property
+    def count(self) -> Count | None:
+        """Distribution of the readings if these are counts."""
+        return self.error if isinstance(self.error, Count) else None
+
+    @property
+    def roles(self) -> dict[str, Any]:
+        """Parameters of the readings' distribution by role: numbers, or variables of the model."""
+        role = "relative" if self.relative else "error"
+        is_plain = not isinstance(self.error, ReadingDistribution)
+        roles = {role: self.error} if is_plain else self.error.roles
+        return {key: x for key, x in (roles | {"bias": self.bias}).items() if x is not None}
 
     def __repr__(self) -> str:
         """Show the arguments that differ from their defaults."""
@@ -155,22 +178,25 @@ class LogLikelihood(Metric):
 
         def of_specimens(value: Any) -> Any:
             array = np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else np.empty(0)
-            return _as_tuples(array[rows]) if len(array) == n else value
+            return as_tuples(array[rows]) if len(array) == n else value
 
-        error = self.error if hasattr(self.error, "owner") else of_specimens(self.error)
-        censored = self.censored and tuple(map(of_specimens, self.censored))
-        return replace(self, error=error, rounded=of_specimens(self.rounded), censored=censored)
+        return mapped_metric(self, of_specimens)
 
-    def readings(self, values: Floats, error: Any = None, event: Shape = ()) -> Readings:
+    def readings(
+        self, values: Floats, unknown: Mapping[str, Any] | None = None, event: Shape = ()
+    ) -> Readings:
         """Return measured outputs, (N, m), with their errors, limits and rounding.
 
-        ``error`` replaces an error that is a model variable; ``event`` is () for one output without
-        an axis, else (m,). Raises ValueError if an argument does not fit the shape of the values.
+        ``unknown`` has numbers for the `roles` that are model variables; without them an error is
+        one, and a bias zero. ``event`` is () for one output without an axis, else (m,). Raises
+        ValueError if an argument does not fit the shape of the values, or a count is impossible.
         """
-        error = self.error if error is None else error
+        roles = self.roles | dict(unknown or {})
 
-        def full(value: Any, name: str) -> Floats:
-            array = np.asarray(value, dtype=np.float64)
+        def full(value: Any, name: str, default: float) -> Floats:
+            if hasattr(value, "owner"):
+                value = float(name != "bias")
+            array = np.asarray(default if value is None else value, dtype=np.float64)
             # With one output an array with a number for each reading has the shape (N,).
             array = array[:, None] if not event and array.ndim == 1 else array
             try:
@@ -182,23 +208,33 @@ class LogLikelihood(Metric):
                     + (f", or {event}, one for each output" if event else "")
                 ) from None
 
-        sd = np.zeros(values.shape) if error is None else full(error, "error")
-        step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
+        count = self.count
+        sd = full(roles.get("error"), "error", 0.0)
         low, high = self.censored or (None, None)
-        lowest = full(-np.inf if low is None else low, "censored")
-        highest = full(np.inf if high is None else high, "censored")
+        lowest = full(low, "censored", -np.inf)
+        highest = full(high, "censored", np.inf)
         is_low = values <= lowest
         is_high = values >= highest
-        lower = np.where(is_high, highest, np.where(is_low, -np.inf, np.nan))
-        upper = np.where(is_high, np.inf, np.where(is_low, lowest, np.nan))
-        return Readings(
-            values=np.where(is_low | is_high, np.nan, values),
-            error=np.where(np.isfinite(sd), sd, 0.0),
-            step=step,
+        bias = full(roles.get("bias"), "bias", 0.0)
+        lower = np.where(is_high, highest, np.where(is_low, -np.inf, np.nan)) - bias
+        upper = np.where(is_high, np.inf, np.where(is_low, lowest, np.nan)) - bias
+        readings = Readings(
+            values=np.where(is_low | is_high, np.nan, values - bias),
+            error=np.where(np.isfinite(sd), sd, 0.0) if count is None else np.zeros(values.shape),
+            relative=full(roles.get("relative"), "error", 0.0),
+            step=full(self.rounded, "rounded", 0.0),
             lower=lower,
             upper=upper,
-            is_relative=np.full(values.shape, self.relative),
+            bias=bias,
+            family=np.full(values.shape, -1),
+            size=full(None if count is None else count.size, "error", 1.0),
+            parameter=np.ones(values.shape) if count is None else full(sd, "error", 1.0),
         )
+        if count is None:
+            return readings
+        _refuse_impossible(values, count.highest(readings.size))
+        code = COUNTS.index(type(count))
+        return with_values(replace(readings, family=np.full(values.shape, code)), values)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:
@@ -213,19 +249,71 @@ class LogLikelihood(Metric):
         return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 
-def _hashable(value: Any, name: str) -> Any:
-    """Return a number, nested tuples of a positive array, or a variable of a model."""
-    if value is None or hasattr(value, "owner"):
-        return value
-    array = real_array(value, f"LogLikelihood: {name}")
-    if not (array > 0).all():
-        raise ValueError(f"LogLikelihood: {name}: got {value!r}, expected positive numbers")
-    return _as_tuples(array)
+def mapped_metric(metric: LogLikelihood, function: Callable[[Any], Any]) -> LogLikelihood:
+    """Return the likelihood with a function applied to the numbers that describe readings."""
+    is_plain = not isinstance(metric.error, ReadingDistribution)
+    return replace(
+        metric,
+        error=function(metric.error) if is_plain else metric.error.mapped(function),
+        bias=function(metric.bias),
+        rounded=function(metric.rounded),
+        censored=metric.censored and tuple(map(function, metric.censored)),
+    )
 
 
-def _as_tuples(array: Floats) -> Any:
-    """Return an array as a number or nested tuples, which compare as values."""
-    return float(array) if array.ndim == 0 else tuple(_as_tuples(row) for row in array)
+def _limits(limits: Any, name: str) -> tuple[Any, Any] | None:
+    """Return a pair of limits, numbers or nested tuples; raise if it is none."""
+    if limits is None:
+        return None
+    is_pair = isinstance(limits, tuple | list) and len(limits) == 2
+    if not is_pair or all(x is None for x in limits):
+        raise ValueError(
+            f"LogLikelihood: {name}: got {limits!r}, expected (lower, upper), one of which may be "
+            "None"
+        )
+    label = f"LogLikelihood: {name}"
+    low, high = (x if x is None else as_tuples(real_array(x, label)) for x in limits)
+    return low, high
+
+
+def _refuse_conflicts(metric: LogLikelihood) -> None:
+    """Raise if arguments do not describe one distribution of the readings."""
+    arguments = {
+        name: getattr(metric, name) for name in ("bias", "censored", "selected", "rounded")
+    }
+    arguments |= {"relative": metric.relative or None, "gross_errors": metric.gross_errors or None}
+    labels = [f"{name}=" for name, value in arguments.items() if value is not None]
+    refused = ", ".join(labels if metric.count is not None else ["relative="] * metric.relative)
+    if isinstance(metric.error, ReadingDistribution) and refused:
+        raise ValueError(
+            f"LogLikelihood: got error={metric.error!r:.60} with {refused}, expected the "
+            f"distribution alone; leave {refused} out"
+        )
+    variables = [x for x in (*metric.roles.values(), metric.gross_errors) if hasattr(x, "owner")]
+    if metric.selected is not None and (variables or metric.gross_errors is True):
+        raise ValueError(
+            "LogLikelihood: selected: got an unknown error or gross errors beside it, expected "
+            "known errors, with which the share of measured specimens is computed; pass numbers"
+        )
+    if hasattr(metric.bias, "owner") and metric.error is None:
+        raise ValueError(
+            "LogLikelihood: bias: got a variable without error=, expected both: exact readings "
+            "with an unknown bias have no density; pass error= with the standard deviation"
+        )
+
+
+def _refuse_impossible(values: Floats, highest: Floats) -> None:
+    """Raise if measured values, (N, m), are no counts up to the highest ones."""
+    is_bad = (values < 0) | (values > highest) | (values != np.round(values))
+    is_bad &= np.isfinite(values)
+    if is_bad.any():
+        row, column = np.argwhere(is_bad)[0].tolist()
+        most = highest[row, column]
+        limit = f" up to {most:g}" if np.isfinite(most) else ""
+        raise ValueError(
+            f"error: got the reading {values[row, column]:g} of specimen {row}, expected whole "
+            f"numbers from 0{limit}, as counts are; pass counts and their exposure, not shares"
+        )
 
 
 @dataclass(frozen=True, eq=False)

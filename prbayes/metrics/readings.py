@@ -12,40 +12,46 @@ from scipy.special import log_ndtr
 
 from prbayes._stats import positive_scale
 from prbayes._validate import Bools, Floats, Indices
+from prbayes.readings import COUNTS
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Readings of m outputs of N specimens; all arrays have the shape (N, m)."""
 
-    values: Floats  # readings; NaN if an output was not measured, or is censored
+    # Estimates of the outputs: readings without known bias, counts divided by their exposure; NaN
+    # if an output was not measured, or is censored.
+    values: Floats
     error: Floats  # standard deviation of the normal error; zero if the reading is exact
+    relative: Floats  # further standard deviation, as a share of the output
     step: Floats  # width to which the reading was rounded; zero if it was not
     lower: Floats  # lower bound of a censored reading, perhaps infinite; NaN if not censored
     upper: Floats  # upper bound, likewise
-    is_relative: Bools  # whether the error is a share of the output
+    bias: Floats  # known mean of the error
+    # Index of the distribution of a count in `prbayes.readings.COUNTS`; -1 for a normal error. The
+    # error of a count is that of the normal approximation of its likelihood.
+    family: Indices
+    size: Floats  # exposure of a count
+    parameter: Floats  # parameter of the distribution of a count
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
-        zero = np.zeros_like(values)
+        zero, unit = np.zeros_like(values), np.ones_like(values)
         missing = np.full_like(values, np.nan)
-        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
+        family = np.full(values.shape, -1)
+        return cls(values, zero, zero, zero, missing, missing, zero, family, unit, unit)
 
     def __len__(self) -> int:
         return len(self.values)
 
     def rows(self, index: Indices) -> Readings:
         """Return the readings of selected specimens."""
-        return self._mapped(lambda array: array[index])
+        return _mapped(self, lambda array: array[index])
 
     def at_columns(self, columns: Indices) -> Readings:
         """Return the readings of selected outputs of each specimen, (N, k)."""
-        return self._mapped(lambda array: np.take_along_axis(array, columns, axis=1))
-
-    def _mapped(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Readings:
-        """Return the readings with a function applied to each array."""
-        return Readings(*[function(getattr(self, f.name)) for f in fields(self)])
+        return _mapped(self, lambda array: np.take_along_axis(array, columns, axis=1))
 
     @property
     def is_measured(self) -> Bools:
@@ -59,13 +65,14 @@ class Readings:
 
     def error_sd(self, outputs: Any) -> Any:
         """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
-        return self.error * np.where(self.is_relative, np.abs(outputs), 1.0)
+        return np.hypot(self.error, self.relative * np.abs(outputs))
 
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero.
 
         Few readings do not determine a scale. Outputs with fewer than eight readings share the
-        standard deviation of all their readings.
+        standard deviation of all their readings. An output that is censored throughout has a tenth
+        of the limit, and at least the error.
         """
         count = np.maximum(self.is_measured.sum(axis=0), 1)
         values = np.where(self.is_measured, self.values, 0.0)
@@ -76,32 +83,10 @@ class Readings:
         pooled = self.values[:, few][self.is_measured[:, few]]
         if few.sum() > 1 and pooled.size > 1:
             sd[few] = pooled.std()
+        for j in np.flatnonzero(~self.is_measured.any(axis=0)):
+            limits = np.nan_to_num(np.abs(located_values(self)[:, j]))
+            sd[j] = max(0.1 * limits.max(), self.error[:, j].max())
         return positive_scale(sd)
-
-    def relative_error(self, error: Floats) -> Floats:
-        """Return errors of an emulator, (m,), in units of `robust_spread`.
-
-        Outputs with fewer than eight readings share the root mean square of their errors.
-        """
-        count = self.is_measured.sum(axis=0)
-        few = (count > 0) & (count < min(8, len(self)))
-        squares = (count[few] * error[few] ** 2).sum() / np.maximum(count[few].sum(), 1)
-        return np.where(few, np.sqrt(squares), error) / self.robust_spread()
-
-    def robust_spread(self) -> Floats:
-        """Return the standard deviation of each output by its quartiles, (m,).
-
-        Unlike `spread` it does not depend on a few specimens near a pole of the response. If the
-        quartiles are equal, it is `spread`.
-        """
-        widths = np.zeros(self.values.shape[1])
-        for j, column in enumerate(self.values.T):
-            measured = column[self.is_measured[:, j]]
-            if measured.size >= min(8, len(self)):
-                high, low = np.quantile(measured, [0.75, 0.25])
-                widths[j] = high - low
-        scatter = widths / 1.349
-        return np.where(scatter > 0, scatter, self.spread())
 
     def comparison_sd(self, emulator_error: Floats) -> Floats:
         """Return the standard deviation of the comparison with an emulator, (N, m).
@@ -112,16 +97,12 @@ class Readings:
         sd = np.sqrt(emulator_error**2 + error**2 + self.step**2 / 12)
         return np.where(self.is_measured, sd, np.inf)
 
-    def scaled(self, factor: float) -> Readings:
-        """Return the readings with their errors multiplied by a factor."""
-        return replace(self, error=factor * self.error)
-
     def log_density(self, outputs: Floats, emulator_error: Floats) -> Floats:
         """Return the log-density of each specimen's readings given outputs, (N, K, m) -> (N, K).
 
         The log-density is -inf if an output is NaN.
         """
-        if self.is_relative.any():
+        if self.relative.any():
             by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
             variance = np.moveaxis(emulator_error**2 + self.error_sd(by_point) ** 2, 0, 1)
         else:
@@ -130,11 +111,14 @@ class Readings:
             result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
 
-    def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
+    def symbolic_log_density(
+        self, outputs: Any, variance: Any, xp: Any, parameter: Any = None
+    ) -> Any:
         """Return the log-density, (N, K), as an array or a graph of the comparison's variance.
 
         A censored reading has the probability of its interval, a rounded one the mean density over
-        its step. The variance broadcasts against the outputs, (N, K, m).
+        its step, a count that of its distribution with the ``parameter``, without an error of the
+        emulator. Variance and parameter broadcast against the outputs, (N, K, m).
         """
         sd = xp.sqrt(variance)
         values = np.where(self.is_measured, self.values, 0.0)[:, None]
@@ -153,8 +137,112 @@ class Readings:
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
+        for code in _codes(self):
+            is_count = ((self.family == code) & self.is_measured)[:, None]
+            size = self.size[:, None]
+            counts = np.where(is_count, np.round(values * size), 0.0)
+            parameter = self.parameter[:, None] if parameter is None else parameter
+            logs = COUNTS[code].log_density(counts, size * outputs, size, parameter, xp)
+            terms = xp.where(is_count, logs, terms)
         # In NumPy a matrix product is five times faster than a sum over a short axis.
         return terms @ np.ones(terms.shape[-1]) if xp is np else terms.sum(axis=-1)
+
+
+def _codes(readings: Readings) -> tuple[int, ...]:
+    """Return the codes of the distributions of counts among the readings."""
+    return tuple(code for code in np.unique(readings.family).tolist() if code >= 0)
+
+
+def _mapped(readings: Readings, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Readings:
+    """Return the readings with a function applied to each array."""
+    return Readings(*[function(getattr(readings, f.name)) for f in fields(readings)])
+
+
+def located_values(readings: Readings) -> Floats:
+    """Return readings, (N, m); of an output that is censored throughout, the finite limits."""
+    limits = np.where(np.isfinite(readings.lower), readings.lower, readings.upper)
+    return np.where(readings.is_measured.any(axis=0), readings.values, limits)
+
+
+def robust_spread(readings: Readings) -> Floats:
+    """Return the standard deviation of each output by its quartiles, (m,).
+
+    Unlike `Readings.spread` it does not depend on a few specimens near a pole of the response. If
+    the quartiles are equal, it is `Readings.spread`.
+    """
+    widths = np.zeros(readings.values.shape[1])
+    for j, column in enumerate(readings.values.T):
+        measured = column[readings.is_measured[:, j]]
+        if measured.size >= min(8, len(readings)):
+            high, low = np.quantile(measured, [0.75, 0.25])
+            widths[j] = high - low
+    scatter = widths / 1.349
+    return np.where(scatter > 0, scatter, readings.spread())
+
+
+def relative_error(readings: Readings, error: Floats) -> Floats:
+    """Return errors of an emulator, (m,), in units of `robust_spread`.
+
+    Outputs with fewer than eight readings share the root mean square of their errors.
+    """
+    count = readings.is_measured.sum(axis=0)
+    few = (count > 0) & (count < min(8, len(readings)))
+    squares = (count[few] * error[few] ** 2).sum() / np.maximum(count[few].sum(), 1)
+    return np.where(few, np.sqrt(squares), error) / robust_spread(readings)
+
+
+def scaled_errors(readings: Readings, factor: float) -> Readings:
+    """Return the readings with their errors multiplied by a factor."""
+    power = np.ones(readings.family.shape)
+    for code in _codes(readings):
+        power[readings.family == code] = 1.0 if COUNTS[code].widens else -2.0
+    return replace(
+        readings,
+        error=factor * readings.error,
+        relative=factor * readings.relative,
+        parameter=factor**power * readings.parameter,
+    )
+
+
+def with_values(readings: Readings, numbers: Floats) -> Readings:
+    """Return the same readings with other numbers, (N, m), none of them censored.
+
+    Missing readings stay missing. The normal approximation of counts follows the new ones.
+    """
+    missing = np.full_like(readings.values, np.nan)
+    values = np.where(readings.is_measured, numbers / readings.size - readings.bias, np.nan)
+    result = replace(readings, values=values, lower=missing, upper=missing)
+    for code in _codes(readings):
+        counts = np.where(readings.is_measured, numbers, 0.0)
+        sd = COUNTS[code].sd(counts, readings.size, readings.parameter) / readings.size
+        result = replace(result, error=np.where(readings.family == code, sd, result.error))
+    return result
+
+
+def add_errors(
+    readings: Readings,
+    rng: np.random.Generator,
+    outputs: Floats,
+    error: Any = 1.0,
+    relative: Any = 1.0,
+    bias: Any = 0.0,
+) -> Floats:
+    """Draw readings of outputs, (P, N, m), with their errors and rounding.
+
+    ``error`` and ``relative`` are factors of the errors, the first one also of the parameter of
+    counts, and ``bias`` is added to the known one; they broadcast to the outputs.
+    """
+    sd = np.hypot(error * readings.error, relative * readings.relative * np.abs(outputs))
+    result = outputs + sd * rng.standard_normal(outputs.shape) + (readings.bias + bias)
+    if (readings.step > 0).any():
+        unit = positive_scale(readings.step)
+        result = np.where(readings.step > 0, np.round(result / unit) * unit, result)
+    for code in _codes(readings):
+        is_count = np.broadcast_to(readings.family == code, outputs.shape)
+        numbers = (readings.size * outputs, readings.size, error * readings.parameter)
+        mean, size, parameter = (np.broadcast_to(x, outputs.shape)[is_count] for x in numbers)
+        result[is_count] = COUNTS[code].draw(rng, mean, size, parameter)
+    return np.asarray(result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +302,11 @@ def averaged(
         step=by_specimen(readings.step, np.median(readings.step, axis=0)),
         lower=by_specimen(readings.lower, np.nan),
         upper=by_specimen(readings.upper, np.nan),
-        is_relative=np.broadcast_to(readings.is_relative[:1], count.shape),
+        relative=by_specimen(readings.relative, np.median(readings.relative, axis=0)),
+        bias=by_specimen(readings.bias, np.median(readings.bias, axis=0)),
+        family=np.broadcast_to(readings.family[:1], count.shape),
+        size=by_specimen(readings.size, np.median(readings.size, axis=0)),
+        parameter=by_specimen(readings.parameter, np.median(readings.parameter, axis=0)),
     )
     single_scale = by_specimen(scale, np.median(scale, axis=0))
     is_repeated = count > 1

@@ -21,7 +21,7 @@ from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
 from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
-from prbayes.metrics.readings import Readings, Repeats
+from prbayes.metrics.readings import Readings, Repeats, located_values, relative_error
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.proposals import Modes, best_rows
 
@@ -508,12 +508,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
             output, leave = f"output {j} of {outputs.shape[1]}", ", or leave the output out"
         if is_constant[j]:
             raise DesignError(f"{name}: {output}: {_constant(finite[:, j])}{leave}")
-        values = readings.values[np.isfinite(readings.values[:, j]), j]
-        if not values.size and readings.is_censored[:, j].any():
-            raise DesignError(
-                f"{name}: got no reading of {output} within the limits of censored=, expected at "
-                f"least one; check the limits{leave}"
-            )
+        values = located_values(readings)[np.isfinite(located_values(readings)[:, j]), j]
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():
             raise DesignError(
@@ -685,7 +680,7 @@ def emulator_findings(
     The largest error is in robust standard deviations of the readings. Jumps, poles and crossing
     modes with less have posterior means within .1 standard deviations (32 of 33 data sets).
     """
-    share = readings.relative_error(error)
+    share = relative_error(readings, error)
     if not (share > largest).any():
         return []
     return [

@@ -31,6 +31,11 @@ from prbayes.response.response import Responses
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import SpecimenOptions
+from prbayes.specimens.selection import Selection
+
+# Roles of unknown parameters of the readings' distribution: factors of the standard deviation, or
+# parameter of a count, and of the share of the output; and a number that is added to the output.
+ROLES = ("error", "relative", "bias")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ class Measurement:
     covariates: Mapping[str, Floats] = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
     at_conditions: bool = False  # whether outputs are readings at values of a vector condition
-    # Model variables of the measurement: ``error`` and ``gross_errors``.
+    # Model variables of the measurement: `ROLES` of the readings, and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
     @property
@@ -69,19 +74,15 @@ class Measurement:
         """Share of specimens with a gross error: a number, a variable of the model, or False."""
         return self.extras.get("gross_errors", self.metric.gross_errors)
 
+    @property
+    def unknown(self) -> dict[str, TensorVariable]:
+        """Unknown parameters of the readings' distribution, by role."""
+        return {role: self.extras[role] for role in ROLES if role in self.extras}
+
     @cached_property
     def readings(self) -> Readings:
-        """Observed values and their errors; an unknown error has its prior's 84 % quantile."""
-        error = None
-        if "error" in self.extras:
-            (draws,) = PriorSampler([self.extras["error"]])(512, seed=0)
-            error = np.asarray(np.quantile(draws, 0.84, axis=0))
-        return self.metric.readings(self.rows, error, self.event)
-
-    @property
-    def scale(self) -> Floats:
-        """Standard deviation of the error of a reading, (N, m), in units of an unknown error."""
-        return np.ones_like(self.rows) if "error" in self.extras else self.readings.error
+        """Observed values and their errors; unknown parameters have their prior's 84 % quantile."""
+        return readings_at(self, 0.84, 512)
 
     def observing(self, data: Any) -> Measurement:
         """Return the measurement with other observed values; the same object for equal ones."""
@@ -92,6 +93,65 @@ class Measurement:
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
         aligned = "groups, conditions, weights= or specimens="
         return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
+
+
+def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
+    """Return readings with a scatter that has this quantile in the prior of its parameters.
+
+    An unknown bias has its prior's median, from which it scatters.
+    """
+    variables = measurement.unknown
+    prior = PriorSampler(list(variables.values()))(draws, seed=0) if variables else []
+    samples = dict(zip(variables, prior, strict=True))
+    bias = samples.pop("bias", np.zeros(1))
+    middle = np.median(bias, axis=0)
+    scatter = np.quantile(np.abs(bias - middle), prob, axis=0)
+    count = measurement.metric.count
+    prob = prob if count is None or count.widens else 1 - prob
+    unknown = {role: np.quantile(x, prob, axis=0) for role, x in samples.items()}
+    unknown |= {"bias": middle} if "bias" in variables else {}
+    readings = measurement.metric.readings(measurement.rows, unknown, measurement.event)
+    return replace(readings, error=np.hypot(readings.error, scatter))
+
+
+def unit_readings(measurement: Measurement) -> Readings:
+    """Return readings with errors in units of the unknown ones, and without an unknown bias."""
+    return measurement.metric.readings(measurement.rows, None, measurement.event)
+
+
+def selection_of(measurements: Sequence[Measurement]) -> Selection | None:
+    """Return the limits within which specimens were measured; None without limits."""
+    if all(m.metric.selected is None for m in measurements):
+        return None
+    parts: list[list[Floats]] = []
+    for m in measurements:
+        ends = m.metric.selected or (None, None)
+        defaults = zip(ends, (-np.inf, np.inf), strict=True)
+        low, high = (default if end is None else end for end, default in defaults)
+        readings, shape = unit_readings(m), m.rows.shape
+        try:
+            limits = [np.broadcast_to(np.asarray(x, float), shape[1:]) for x in (low, high)]
+        except ValueError:
+            raise ValueError(
+                f"{m.name}: metric: selected: got limits of shape {np.shape(low)} and "
+                f"{np.shape(high)}, expected numbers, or shape {shape[1:]}, one for each output"
+            ) from None
+        with np.errstate(invalid="ignore"):
+            is_outside = (m.rows < limits[0]) | (m.rows > limits[1])
+        if is_outside.any():
+            row, column = np.argwhere(is_outside)[0].tolist()
+            raise ValueError(
+                f"{m.name}: metric: selected: got the reading {m.rows[row, column]:g} of specimen "
+                f"{row}, expected readings within the limits: others are never seen; widen the "
+                "limits, or leave selected= out"
+            )
+        if any(np.ptp(x, axis=0).any() for x in (readings.error, readings.relative, readings.bias)):
+            raise ValueError(
+                f"{m.name}: metric: error: got errors that differ between specimens beside "
+                "selected=, expected the same for all: those that were never seen need one too"
+            )
+        parts.append([*limits, readings.error[0], readings.relative[0], readings.bias[0]])
+    return Selection(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def observed_range(measurement: Measurement) -> Floats:
@@ -108,6 +168,9 @@ class StackedReadings:
     # (S, M): standard deviation of the reading error, relative to the unknown error if there is
     # one.
     scale: Floats
+    relative: Floats  # (S, M): likewise, of the relative error
+    parameter: Floats  # (S, M): likewise, of the parameter of counts
+    bias: Floats  # (S, M): the bias that `readings` lack, where it is unknown
     repeats: Repeats | None  # scatter of repeated readings; None if there are none
     # For each simulator, (N,): index of the specimen of each row.
     numbers: tuple[Indices, ...]
@@ -135,6 +198,12 @@ class StackedReadings:
                 conditions[:, k] = _value_by_specimen(kind, measurements, of_rows, numbers, size)
                 coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
         readings, scales, repeats = zip(*parts, strict=True)
+        stacked = side_by_side(readings)
+        unknown = [
+            np.tile([role in m.extras for role in ROLES], (m.rows.shape[1], 1)).T
+            for m in measurements
+        ]
+        is_error, is_relative, is_bias = np.concatenate(unknown, axis=1)
         groups = None
         if first.groups is not None:
             of_rows = [np.asarray(m.groups) for m in measurements]
@@ -154,8 +223,11 @@ class StackedReadings:
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
             np.subtract.at(log_gross, index, logs)
         return cls(
-            side_by_side(readings),
+            stacked,
             np.concatenate(scales, axis=1),
+            np.where(is_relative, 1.0, stacked.relative),
+            np.where(is_error, 1.0, stacked.parameter),
+            np.where(is_bias, stacked.bias, 0.0),
             side_by_side(repeats) if any(part.count.any() for part in repeats) else None,
             tuple(numbers),
             groups,
@@ -175,17 +247,19 @@ def _averaged(
     count = np.zeros((size, present.shape[1]), dtype=np.intp)
     np.add.at(count, numbers, present)
     is_repeated = present & (count > 1)[numbers]
-    is_normal = (readings.step == 0) & ~readings.is_censored & ~readings.is_relative
+    is_normal = (readings.step == 0) & ~readings.is_censored & (readings.family < 0)
+    is_normal &= readings.relative == 0
     of_kind = (
-        "with rounded or censored readings or a relative error, expected repeated readings with a "
-        "normal error; leave rounded=, censored= and relative= out, and pass an error= that covers "
-        "them"
+        "with rounded or censored readings, counts or a relative error, expected repeated readings "
+        "with a normal error; pass one count for each specimen, with its whole exposure, or leave "
+        "rounded=, censored= and relative= out, and pass an error= that covers them"
     )
     of_error = (
         "without error=, expected it once: exact readings of one specimen would be equal; pass "
         "metric=prb.LogLikelihood(error=...) with their standard deviation"
     )
-    for is_bad, problem in ((~is_normal, of_kind), (measurement.scale == 0, of_error)):
+    scale = unit_readings(measurement).error
+    for is_bad, problem in ((~is_normal, of_kind), (scale == 0, of_error)):
         where = is_repeated & is_bad
         if where.any():
             row = int(np.argmax(where.any(axis=1)))
@@ -194,7 +268,7 @@ def _averaged(
             raise ValueError(
                 f"{measurement.name}: specimens: got the label {label!r} several times {problem}"
             )
-    return averaged(readings, measurement.scale, numbers, count)
+    return averaged(readings, scale, numbers, count)
 
 
 def _value_by_specimen(
@@ -273,8 +347,8 @@ class SpecimenLikelihood:
 
     @property
     def error_is_known(self) -> bool:
-        """Whether no error of a reading is a variable of the model."""
-        return not any("error" in m.extras for m in self.measurements)
+        """Whether no parameter of the readings' distribution is a variable of the model."""
+        return not any(m.unknown for m in self.measurements)
 
     @property
     def calls_response(self) -> bool:

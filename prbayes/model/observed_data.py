@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +17,7 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
 from prbayes.metrics.base import Metric
-from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
 from prbayes.model.random_variable import known_value
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
@@ -214,17 +214,15 @@ def observed_at_conditions(
     coords = {k: v for k, v in getattr(observed, "coords", {}).items() if v.dims == (first,)}
     coords[dim] = condition.data
     scattered = xr.DataArray(_at_columns(readings, condition), dims=(first, dim), coords=coords)
-    changed: dict[str, Any] = {}
-    for role in ("error", "rounded", "censored"):
-        value = getattr(metric, role, None)
-        if value is None or isinstance(value, Variable):
-            continue
-        parts = [
-            _at_columns(x, condition, float(np.median(x))) if np.shape(x) == shape else x
-            for x in (value if role == "censored" else [value])
-        ]
-        changed[role] = tuple(parts) if role == "censored" else parts[0]
-    return scattered, replace(cast(LogLikelihood, metric), **changed) if changed else metric
+
+    def at_columns(value: Any) -> Any:
+        if isinstance(value, Variable) or np.shape(value) != shape:
+            return value
+        return _at_columns(value, condition, float(np.median(value)))
+
+    if isinstance(metric, Metric):
+        metric = mapped_metric(cast(LogLikelihood, metric), at_columns)
+    return scattered, metric
 
 
 def _refuse_other_order(

@@ -40,7 +40,12 @@ from prbayes.metrics.summary_likelihood import SummaryLikelihood
 from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
-from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
+from prbayes.model.measurement import (
+    Measurement,
+    SpecimenLikelihood,
+    selection_of,
+    specimen_labels,
+)
 from prbayes.model.observed_data import ObservedData, observed_at_conditions, read_data
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -461,7 +466,7 @@ def _joint_likelihood(
     """
     name = measurement.name
     try:
-        _ = measurement.readings
+        _ = measurement.readings, selection_of([measurement])
     except ValueError as error:
         raise ValueError(f"{name}: metric: {error}") from None
     joined = {m for partner in partners for m in partner.measurements}
@@ -507,16 +512,16 @@ def _measurement_variables(
     Simulators with the same specimens use the same share of gross errors.
     """
     extras: dict[str, TensorVariable] = {}
-    for role in ("error", "gross_errors"):
-        value = getattr(metric, role)
+    for role, value in (metric.roles | {"gross_errors": metric.gross_errors}).items():
         if role == "gross_errors" and value is True:
             value = partners[0].measurements[0].extras.get(role) if partners else None
             value = pm.Beta(f"{name}_gross_errors", 1, 9) if value is None else value
         if not isinstance(value, Variable):
             continue
+        label = "error" if role == "relative" else role
         if value not in (*model.free_RVs, *model.deterministics):
             raise TypeError(
-                f"{name}: metric: {role}: got {value}, expected a named variable of the model, "
+                f"{name}: metric: {label}: got {value}, expected a named variable of the model, "
                 "such as pm.HalfNormal('error', 0.1), or a number"
             )
         extras[role] = values_of(value)

@@ -13,6 +13,7 @@ from scipy.spatial.distance import cdist
 
 from prbayes._finding import Finding, any_of, report
 from prbayes._validate import Floats, Indices
+from prbayes.metrics.readings import relative_error
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import variables_at
@@ -81,7 +82,7 @@ def audited_likelihood(
     weights = share * counts / len(possible)
     outputs = CheckedRuns(likelihood, [emulation.y])(fresh)
     misfit = np.abs(outputs - emulation.values(fresh))
-    relative = np.array([readings.relative_error(error).max() for error in misfit])
+    relative = np.array([relative_error(readings, error).max() for error in misfit])
     # A wrong input shifts a mean by its distance from the other inputs at most.
     is_free = ~likelihood.coordinates.is_condition
     middle = np.median(z, axis=0)

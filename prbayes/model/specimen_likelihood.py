@@ -23,18 +23,21 @@ from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._stats import log_sum_exp, positive_scale
+from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats, Indices, called
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
+    ROLES,
     Measurement,
     SpecimenLikelihood,
     observed_range,
     output_columns,
     rows_by_context,
     rows_by_group,
+    selection_of,
     specimen_numbers,
+    unit_readings,
 )
 from prbayes.model.random_variable import (
     TERMS,
@@ -92,7 +95,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     Values are those of the model's variables by name, (P, *shape).
     """
     share, repeats = prepared(likelihood).share, likelihood.stacked.repeats
-    errors = _errors(likelihood, values)
+    errors = _unknown_of(likelihood.measurements, values)
     parts = []
     for (group, rows), points in zip(likelihood.by_group, points_by_group(likelihood), strict=True):
         parents = likelihood.parents(values, group, rows)
@@ -105,7 +108,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     if share is not None:
         result = result - log_shares(likelihood, values, share)
     if repeats is not None:
-        result = result + [repeats.log_density(error, np) for error in errors]
+        result = result + [repeats.log_density(error, np) for error, _, _ in errors]
     result = _with_gross_errors(likelihood, values, result, slice(None))
     weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights
@@ -137,7 +140,7 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     if prepared(likelihood).points.is_exact:
         return np.zeros(size)
     variance = np.zeros(size)
-    errors = _errors(likelihood, values)
+    errors = _unknown_of(likelihood.measurements, values)
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(values, group, rows)
         logs = []
@@ -154,16 +157,17 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     return np.sqrt(variance)
 
 
-def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
-    """Return the unknown error of each output, (P, M); one where the error is known."""
+def _unknown_of(measurements: Sequence[Measurement], values: Mapping[str, Floats]) -> Floats:
+    """Return the unknown parameters of the readings, (P, 3, M); one, or zero, if known."""
     size = len(next(iter(values.values())))
-    columns = []
-    for m in likelihood.measurements:
-        error = np.ones((size, m.rows.shape[1]))
-        if "error" in m.extras:
-            error *= values[str(m.extras["error"].name)].reshape(size, -1)
-        columns.append(error)
-    return np.concatenate(columns, axis=1)
+    blocks = []
+    for m in measurements:
+        block = np.zeros((size, len(ROLES), m.rows.shape[1]))
+        block[:, : ROLES.index("bias")] = 1.0
+        for role, variable in m.unknown.items():
+            block[:, ROLES.index(role)] = values[str(variable.name)].reshape(size, -1)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=2)
 
 
 def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
@@ -181,14 +185,14 @@ def _of_points(
     rows: Indices,
     columns: slice = slice(None),
 ) -> Floats:
-    """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M).
+    """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, 3, M).
 
     Only the points in the slice ``columns`` are used.
     """
     if likelihood.error_is_known:
         return points.log_likelihoods(parents)
     result = np.empty((len(errors), len(rows)))
-    order = np.lexsort(errors.T)
+    order = np.lexsort(errors.reshape(len(errors), -1).T)
     of_readings = _reading_density(likelihood).at_errors(errors[order])
     of_points = points.log_densities([p[order] for p in parents])
     for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):
@@ -202,24 +206,26 @@ def log_likelihood_graph(
     """Return the graph of the log-likelihoods of the specimens, (S,), from values by variable."""
     points, log_a = arrays(likelihood)
     share = prepared(likelihood).share
-    stacked = likelihood.stacked
+    stacked, measurements = likelihood.stacked, likelihood.measurements
     n, count = len(likelihood.readings), log_a.shape[1]
     flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
     log_p = _log_density(likelihood, params, flat, pt.repeat(pt.arange(n), count))
     terms = log_p.reshape((n, count)) + log_a
-    errors = []  # (M,): unknown error of each output, one where the error is known
-    for m in likelihood.measurements:
-        error = params[m.extras["error"]] if "error" in m.extras else 1.0
-        errors.append(error + pt.zeros(m.rows.shape[1]))
-    error = pt.concatenate(errors)
+    unknown = []  # (M,) each: unknown parameters of the readings, as of `_unknown_of`
+    for role in ROLES:
+        default = float(role != "bias")
+        rows = [params[m.extras[role]] if role in m.extras else default for m in measurements]
+        widths = [m.rows.shape[1] for m in measurements]
+        filled = [row + pt.zeros(width) for row, width in zip(rows, widths, strict=True)]
+        unknown.append(pt.concatenate(filled))
     if not likelihood.error_is_known:
-        terms = terms + _reading_density(likelihood)(error, pt)
+        terms = terms + _reading_density(likelihood)(unknown, pt)
     result = logsumexp_finite(terms)
     if share is not None:
         result = result - _log_share(likelihood, params, share)
     if stacked.repeats is not None:
-        result = result + stacked.repeats.log_density(error, pt)
-    gross_share = likelihood.measurements[0].gross_errors
+        result = result + stacked.repeats.log_density(unknown[0], pt)
+    gross_share = measurements[0].gross_errors
     if gross_share is not False:
         gross_share = params.get(gross_share, gross_share)
         gross = pt.log(gross_share) + stacked.log_gross
@@ -318,7 +324,7 @@ def draw_inputs(
     ``as_read``. Values are those of the model's variables by name, (P, *shape).
     """
     all_points, log_a = _array_values(likelihood)
-    errors = _errors(likelihood, values)
+    errors = _unknown_of(likelihood.measurements, values)
     size, n = len(errors), len(log_a)
     inputs = [np.empty((size, n, *v.shape[2:])) for v in all_points]
     probability = None
@@ -403,13 +409,23 @@ def draw_readings(
         if not is_missing.any():
             break
         outputs[is_missing] = draw_outputs()[is_missing]
-    if measurement is None:
-        return _with_reading_errors(
-            rng, outputs, likelihood.readings, likelihood.measurements, values
-        )
-    outputs = outputs[..., output_columns(likelihood, measurement)]
-    readings = _with_reading_errors(rng, outputs, measurement.readings, [measurement], values)
-    return readings.reshape(size, n, *measurement.event)
+    columns, measurements, like_read = slice(None), likelihood.measurements, likelihood.readings
+    if measurement is not None:
+        columns, measurements = output_columns(likelihood, measurement), (measurement,)
+        like_read = unit_readings(measurement)
+
+    def read(outputs: Floats) -> Floats:
+        return _with_reading_errors(rng, outputs[..., columns], like_read, measurements, values)
+
+    readings = read(outputs)
+    selection = selection_of(measurements)
+    # Specimens beyond the limits of a selection are drawn again, too.
+    for _ in range(256):
+        is_unseen = np.array(False) if selection is None else ~selection.is_seen(readings)
+        if not is_unseen.any():
+            break
+        readings[is_unseen] = read(draw_outputs())[is_unseen]
+    return readings if measurement is None else readings.reshape(size, n, *measurement.event)
 
 
 def _with_reading_errors(
@@ -420,16 +436,10 @@ def _with_reading_errors(
     values: Mapping[str, Floats],
 ) -> Floats:
     """Return readings of outputs, (P, n, m), with reading errors, rounding and gross errors."""
-    size, n, count = outputs.shape
-    sd: Any = np.resize(readings.error, (n, count))
-    if len(measurements) == 1 and "error" in measurements[0].extras:
-        sd = values[str(measurements[0].extras["error"].name)].reshape(size, 1, -1)
-    is_relative = np.resize(readings.is_relative, (n, count))
-    sd = sd * np.where(is_relative, np.abs(outputs), 1.0)
-    result = outputs + sd * rng.standard_normal(outputs.shape)
-    step = np.resize(readings.step, (n, count))
-    unit = positive_scale(step)
-    result = np.where(step > 0, np.round(result / unit) * unit, result)
+    size, n, _ = outputs.shape
+    unknown = _unknown_of(measurements, values).swapaxes(0, 1)[:, :, None]
+    like = readings.rows(np.resize(np.arange(len(readings)), n))
+    result = add_errors(like, rng, outputs, *unknown)
     share = _gross_share(measurements[0], values)
     if share is not False:
         low, high = np.concatenate([observed_range(m) for m in measurements], axis=1)

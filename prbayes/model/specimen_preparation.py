@@ -34,7 +34,9 @@ from prbayes.model.measurement import (
     SpecimenLikelihood,
     is_exchangeable,
     output_columns,
+    readings_at,
     rows_by_context,
+    selection_of,
     specimen_labels,
 )
 from prbayes.model.parameters import Hyperparameters, log_posterior, variables_at
@@ -45,7 +47,6 @@ from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import RunCost
-from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import aleatory_names
 from prbayes.specimens.design import (
     emulate,
@@ -223,16 +224,21 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     runs = CheckedRuns(likelihood)
     try:
         data = specimen_data(likelihood)
+        selection = selection_of(likelihood.measurements)
         first = _emulate(runs, data, likelihood.shared_emulation)
         points = first.points
 
         def posterior(share: ResponseShare | None) -> PopulationDraws:
             if share is not None and likelihood.inputs.conditions:
+                got, advice = (
+                    "NaN from the response for a share of the population that is not negligible",
+                    "return inf there if these specimens fail, or a number beside all readings",
+                )
+                if selection is not None:
+                    got, advice = "selected=", "pass the condition as a constant, or no limits"
                 raise DesignError(
-                    f"{likelihood.name}: got NaN from the response for a share of the population "
-                    "that is not negligible, expected a response of all specimens with "
-                    "prb.response.condition, since that share depends on the condition; return "
-                    "inf there if these specimens fail, or a number beside all readings"
+                    f"{likelihood.name}: got {got}, expected a response of all specimens with "
+                    f"prb.response.condition, since that share depends on the condition; {advice}"
                 )
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
@@ -243,10 +249,15 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             data,
             first.emulation,
             posterior,
+            selection,
         )
         if refined is not first.emulation and not likelihood.has_table:
             # The refined emulator is accurate beside the region where runs fail, so that points of
-            # specimens there are on the right side of its boundary.
+            # specimens there are on the right side of its boundary. Populations of a selection are
+            # wider than those of the measured specimens.
+            if selection is not None:
+                of_share = partial(SpecimenPopulations(likelihood).posterior, share=share)
+                data = replace(data, posterior=of_share)
             first = _emulate(runs, data, refined)
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
@@ -313,10 +324,11 @@ def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
     """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
     ends = []
     for m in likelihood.measurements:
-        if "error" in m.extras:
-            (draws,) = PriorSampler([m.extras["error"]])(2048, seed=0)
-            low, middle, high = np.quantile(draws, [0.01, 0.84, 0.99], axis=0)
-            ends.append((np.min(low / middle), np.max(high / middle)))
+        if m.unknown:
+            sd = [readings_at(m, prob, 2048) for prob in (0.01, 0.84, 0.99)]
+            low, middle, high = (r.error_sd(np.nan_to_num(r.values)) for r in sd)
+            usable = middle > 0
+            ends.append((np.min((low / middle)[usable]), np.max((high / middle)[usable])))
     if not ends:
         return (1.0,)
     lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
@@ -332,6 +344,9 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
     if conditions is not None:
         known[:, coordinates.is_condition] = conditions
     options = replace(likelihood.options, n_first=first_run_count(likelihood))
+    if any("bias" in m.unknown for m in likelihood.measurements):
+        # Errors of all specimens add up if they have a bias in common, which halves do not show.
+        options = replace(options, points=4 * options.points)
     if np.isfinite(coordinates.ends).any() and len(coordinates.inputs_of_population) == 1:
         # Near the end of an input's range, the error of the input counts relative to the distance
         # from the end, so that the surface has to be more accurate. With several inputs the normal
@@ -507,7 +522,8 @@ def _data_findings(
     findings: list[Finding] = []
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
-        values = m.readings.values
+        # Counts have ties and outliers that are no errors.
+        values = np.where(m.readings.family < 0, m.readings.values, np.nan)
         simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
         has_gross_errors = m.gross_errors is not False
         findings += outlier_findings(

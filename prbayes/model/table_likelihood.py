@@ -17,6 +17,7 @@ import numpy as np
 
 from prbayes._validate import Bools, Floats, Function
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
+from prbayes.metrics.readings import robust_spread
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.remedies import table_advice
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -71,7 +72,7 @@ def points_of_tables(
         # If the error is too large in this comparison, it narrows the population by half its share
         # of the variance. Beside a turning point a linear approximation of the error would be far
         # too large.
-        share = float((error / data.readings.robust_spread()).max())
+        share = float((error / robust_spread(data.readings)).max())
         narrowing = np.sqrt(len(data.readings) / 2) * share**2
         emulation = replace(emulation, error=error, bias=max(bias, narrowing))
     _require_accurate(likelihood, data, emulation)
@@ -180,7 +181,7 @@ def _require_accurate(
     likelihood: SpecimenLikelihood, data: SpecimenData, emulation: Emulation
 ) -> None:
     """Raise if the error of the surface is as large as the scatter, or if it shifts populations."""
-    share = float((emulation.error / data.readings.robust_spread()).max())
+    share = float((emulation.error / robust_spread(data.readings)).max())
     if emulation.bias <= data.options.bias and share < 1:
         return
     shift = f"{emulation.bias:.2g}" if emulation.bias < 100 else "100 and more"

@@ -23,11 +23,18 @@ from prbayes.specimens.points import SpecimenPoints
 
 @dataclass(frozen=True, eq=False)
 class ReadingDensity:
-    """Log-density of the readings of S specimens at their K points, for errors (M,) of outputs."""
+    """Log-density of the readings of S specimens at their K points, for unknown parameters.
+
+    These are the rows of an array (3, M): for each output a standard deviation or parameter of
+    counts, a relative error, and a bias (`ROLES`).
+    """
 
     readings: Readings  # (S, k): readings of the outputs without a sum of squares
     outputs: Floats  # (S, K, k): outputs at the points
     unit: Floats  # standard deviation of a reading in units of its error; broadcasts to outputs
+    relative: Floats | None  # likewise of the relative error; None if there is none
+    parameter: Floats  # likewise of the parameter of counts
+    bias: Floats | None  # the bias that the readings lack, where it is unknown; None if nowhere
     emulator_variance: Floats  # variance of the emulator's error; broadcasts to outputs
     # (S, k): indices of the outputs; None if these are all outputs in their order.
     columns: Indices | None
@@ -42,64 +49,68 @@ class ReadingDensity:
         cls, likelihood: SpecimenLikelihood, points: SpecimenPoints, emulator_error: Floats
     ) -> ReadingDensity:
         """Return the density at points; ``emulator_error``, (M,), is that of the outputs."""
-        readings, scale = likelihood.readings, likelihood.stacked.scale
+        readings, stacked = likelihood.readings, likelihood.stacked
         # Entries that only fill up the array of points get an arbitrary output.
         outputs = np.where(np.isfinite(points.outputs), points.outputs, 1e30)
         is_missing = ~(readings.is_measured | readings.is_censored)
         sums, constant = [], np.zeros((len(readings), 1))
         first = 0
         for m in likelihood.measurements:
-            of_simulator = np.arange(first, first + m.rows.shape[1])
-            first += len(of_simulator)
-            if "error" not in m.extras or m.extras["error"].type.ndim:
+            columns = np.arange(first, first + m.rows.shape[1])
+            first += len(columns)
+            if list(m.unknown) != ["error"] or m.extras["error"].type.ndim:
                 continue
-            of_outputs = readings.at_columns(np.tile(of_simulator, (len(readings), 1)))
-            is_measured = of_outputs.is_measured
-            unit = np.where(is_measured, scale[:, of_simulator], 1.0)
-            relative = (emulator_error[of_simulator] / unit) ** 2
-            is_special = (of_outputs.step != 0) | of_outputs.is_relative | of_outputs.is_censored
-            # With this tolerance a log-density changes by less than 1e-4 at an eighth of the
-            # largest plausible error.
-            is_special |= relative > 1e-6 * (of_outputs.error / unit) ** 2
-            if is_special[is_measured].any():
-                continue
-            measured = np.where(is_measured, of_outputs.values, 0.0)
-            inverse = np.where(is_measured, 1 / unit, 0.0)
-            squares = np.zeros(outputs.shape[:2])
-            for column, y, c in zip(of_simulator, measured.T, inverse.T, strict=True):
-                squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
-            count = is_measured.sum(axis=1, keepdims=True, dtype=float)
-            constant -= np.log(unit).sum(axis=1, keepdims=True)
-            sums.append((int(of_simulator[0]), squares, count, float(relative[is_measured].mean())))
-            is_missing[:, of_simulator] = True
-        variance, columns = emulator_error**2, None
+            plain = _sums_of_squares(likelihood, columns, outputs, emulator_error)
+            if plain is not None:
+                of_sums, log_scale = plain
+                sums.append(of_sums)
+                constant -= log_scale
+                is_missing[:, columns] = True
+        scales = [stacked.scale, stacked.relative, stacked.parameter, stacked.bias]
+        variance, places = emulator_error**2, None
         size = (~is_missing).sum(axis=1).max()
         if size < outputs.shape[-1]:
-            columns = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
-            is_outside = np.take_along_axis(is_missing, columns, axis=1)
-            readings = readings.at_columns(columns)
+            places = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
+            is_outside = np.take_along_axis(is_missing, places, axis=1)
+            readings = readings.at_columns(places)
             readings = replace(readings, values=np.where(is_outside, np.nan, readings.values))
-            outputs = np.take_along_axis(outputs, columns[:, None], axis=2)
-            scale, variance = np.take_along_axis(scale, columns, 1), variance[columns][:, None]
-        unit = scale[:, None]
-        if readings.is_relative.any():
-            unit = unit * np.where(readings.is_relative[:, None], np.abs(outputs), 1.0)
-        return cls(readings, outputs, unit, variance, columns, sums, constant)
+            outputs = np.take_along_axis(outputs, places[:, None], axis=2)
+            scales = [np.take_along_axis(x, places, 1) for x in scales]
+            variance = variance[places][:, None]
+        unit, relative, parameter, bias = (x[:, None] for x in scales)
+        return cls(
+            readings,
+            outputs,
+            unit,
+            relative * np.abs(outputs) if relative.any() else None,
+            parameter,
+            bias if any("bias" in m.extras for m in likelihood.measurements) else None,
+            variance,
+            places,
+            sums,
+            constant,
+        )
 
-    def __call__(self, error: Any, xp: Any) -> Any:
+    def __call__(self, parameters: Any, xp: Any) -> Any:
         """Return the log-density, (S, K), as an array or a graph."""
         total: Any = self.constant
         for column, squares, count, variance in self.sums:
-            v = error[column] ** 2 + variance
+            v = parameters[0][column] ** 2 + variance
             total = total - 0.5 * (squares / v + count * xp.log(2 * np.pi * v))
         if not self.outputs.shape[-1]:
             return total
-        by_output = error if self.columns is None else error[self.columns][:, None]
-        variance = self.emulator_variance + (by_output * self.unit) ** 2
-        return total + self.readings.symbolic_log_density(self.outputs, variance, xp)
+        error, relative, bias = (
+            row if self.columns is None else row[self.columns][:, None] for row in parameters
+        )
+        variance = self.emulator_variance + (error * self.unit) ** 2
+        if self.relative is not None:
+            variance = variance + (relative * self.relative) ** 2
+        outputs = self.outputs if self.bias is None else self.outputs + (bias - self.bias)
+        parameter = error * self.parameter
+        return total + self.readings.symbolic_log_density(outputs, variance, xp, parameter)
 
     def at_errors(self, errors: Floats, spacing: float = 0.05) -> Iterator[Floats]:
-        """Yield the log-density, (S, K), at errors (P, M), which ascend.
+        """Yield the log-density, (S, K), at parameters (P, 3, M), of which the first ascend.
 
         Between values of one unknown error whose logarithms differ by ``spacing`` a cubic
         polynomial replaces the density where that takes fewer evaluations.
@@ -107,6 +118,7 @@ class ReadingDensity:
         varies = np.ptp(errors, axis=0) > 0
         columns = errors[:, varies].T
         is_one = len(columns) > 0 and (columns == columns[0]).all() and (columns[0] > 0).all()
+        is_one &= not varies[2].any()
         places = np.log(columns[0]) / spacing if is_one else np.zeros(len(errors))
         cells = np.floor(places).astype(int)
         needed = np.unique(cells[:, None] + np.arange(-1, 3))
@@ -132,3 +144,30 @@ class ReadingDensity:
             result -= inner * u * third
             result += outer * (u + 1) * fourth
             yield result
+
+
+def _sums_of_squares(
+    likelihood: SpecimenLikelihood, columns: Indices, outputs: Floats, emulator_error: Floats
+) -> tuple[tuple[int, Floats, Floats, float], Floats] | None:
+    """Return `ReadingDensity.sums` of a simulator, and logarithms of scales summed, (S, 1).
+
+    None if the readings are not plain, or the error of the emulator is not negligible.
+    """
+    readings = likelihood.readings.at_columns(np.tile(columns, (len(outputs), 1)))
+    is_measured = readings.is_measured
+    unit = np.where(is_measured, likelihood.stacked.scale[:, columns], 1.0)
+    relative = (emulator_error[columns] / unit) ** 2
+    is_special = (readings.step != 0) | (readings.family >= 0) | readings.is_censored
+    # With this tolerance a log-density changes by less than 1e-4 at an eighth of the largest
+    # plausible error.
+    is_special |= relative > 1e-6 * (readings.error / unit) ** 2
+    if is_special[is_measured].any():
+        return None
+    measured = np.where(is_measured, readings.values, 0.0)
+    inverse = np.where(is_measured, 1 / unit, 0.0)
+    squares = np.zeros(outputs.shape[:2])
+    for column, y, c in zip(columns, measured.T, inverse.T, strict=True):
+        squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
+    count = is_measured.sum(axis=1, keepdims=True, dtype=float)
+    sums = (int(columns[0]), squares, count, float(relative[is_measured].mean()))
+    return sums, np.log(unit).sum(axis=1, keepdims=True)

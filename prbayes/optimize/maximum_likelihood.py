@@ -29,6 +29,7 @@ from prbayes.inference.checks.population import (
 from prbayes.inference.checks.prior import elements_at_prior_ends
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.prior_continuation import ends_of_prior
+from prbayes.metrics.readings import with_values
 from prbayes.model.evaluator import (
     Evaluator,
     compiled_objective,
@@ -644,9 +645,7 @@ def specimen_pool(
     copies = max(1, -(-size // n))
     drawn = draw_readings(likelihood, rng, values, copies * n)[0].reshape(copies * n, -1)
     observed = likelihood.readings.rows(np.tile(np.arange(n), copies))
-    missing = np.full(drawn.shape, np.nan)
-    drawn = np.where(observed.is_measured, drawn, np.nan)
-    readings = replace(observed, values=drawn, lower=missing, upper=missing)
+    readings = with_values(observed, drawn)
     data, preparation = specimen_data(likelihood), prepared(likelihood)
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
     tolerance = data.options.half_difference * np.sqrt(copies)

@@ -14,6 +14,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
 from prbayes._validate import ArrayFunction, Bools, Floats, Indices
+from prbayes.metrics.readings import located_values, relative_error
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
@@ -515,8 +516,8 @@ def _explored(
     error = np.sqrt(emulation.surface.variance(z))
     deviation = spread + 3 * error
     values = emulation.surface.values(z)
-    low = np.nanmin(readings.values, axis=0) - deviation
-    high = np.nanmax(readings.values, axis=0) + deviation
+    low = np.nanmin(located_values(readings), axis=0) - deviation
+    high = np.nanmax(located_values(readings), axis=0) + deviation
     is_possible = ((values >= low) & (values <= high)).all(axis=1)
     if is_possible.sum() >= count:
         z, error = z[is_possible], error[is_possible]
@@ -555,12 +556,12 @@ def audited(
     audited_z = z[: len(specimens)]
     error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
     bias = max(bias, _bias_of_possible(data, at_possible), emulation.bias)
-    pooled = data.readings.relative_error
-    if (pooled(error) <= 2 * pooled(emulation.error)).all() and bias <= 1.5 * data.options.bias:
+    measured, stated = (relative_error(data.readings, e) for e in (error, emulation.error))
+    if (measured <= 2 * stated).all() and bias <= 1.5 * data.options.bias:
         # Eight runs may miss the places where the emulator is wrong, so that the new error is the
         # geometric mean of the stated and the measured one.
-        measured = np.sqrt(((error / emulation.error) ** 2).mean())
-        error = np.sqrt(min(measured, 1.0)) * emulation.error
+        ratio = np.sqrt(((error / emulation.error) ** 2).mean())
+        error = np.sqrt(min(ratio, 1.0)) * emulation.error
         return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
     grown, left_out = _refitted(data, grown, likely.population)
     if bias <= 1.5 * data.options.bias:
@@ -573,7 +574,7 @@ def audited(
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:
     """Return whether the emulator's error is not small beside the scatter of the readings."""
-    return bool((data.readings.relative_error(emulation.error) > 0.03).any())
+    return bool((relative_error(data.readings, emulation.error) > 0.03).any())
 
 
 def most_corrections(specimens: int, dimensions: int) -> int:

@@ -14,7 +14,7 @@ from scipy.special import ndtri
 
 from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.emulator import Emulator, fit_emulator
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, located_values
 from prbayes.propagation.base import DesignError
 
 type Columns = Indices | None
@@ -191,7 +191,7 @@ def fit_surface(
     rounded = np.round(z[rows], 9)
     _, first, copies = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     zg, yg = z[rows[first]], y[rows[first]]
-    center = np.nanmean(readings.values, axis=0)
+    center = np.nanmean(located_values(readings), axis=0)
     inside = near_readings(yg, readings)
     largest = np.abs(yg - center).max(axis=0)
     # If all outputs are within 100 standard deviations of the data, the unit is so large that they
@@ -211,8 +211,9 @@ def near_readings(y: Floats, readings: Readings) -> Bools:
 
     If these are less than a quarter, the nearest quarter, and at least eight.
     """
-    spread, center = readings.spread(), np.nanmean(readings.values, axis=0)
-    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    spread, values = readings.spread(), located_values(readings)
+    center = np.nanmean(values, axis=0)
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
     margin = np.maximum((high - low) / 2, spread)
     is_near = ((y >= low - margin) & (y <= high + margin)).all(axis=1)
     if is_near.sum() < len(y) // 4:

@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp, positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, scaled_errors
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
@@ -236,9 +236,8 @@ class SpecimenData:
 def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -> Residuals:
     """Return the residuals of an emulator's outputs."""
     readings, is_read = data.readings, data.readings.is_measured
-    relative = np.where(readings.is_relative & is_read, readings.error, 0.0)
-    error = np.where(readings.is_relative, 0.0, readings.error)
-    error = np.where(is_read, np.sqrt(error**2 + readings.step**2 / 12), np.inf)
+    relative = np.where(is_read, readings.relative, 0.0)
+    error = np.where(is_read, np.sqrt(readings.error**2 + readings.step**2 / 12), np.inf)
     target = np.where(is_read, readings.values, 0.0)
     if emulation.offsets is not None:
         target = target - emulation.offsets
@@ -493,7 +492,8 @@ def at_scale(
     """Return points with weights for readings whose errors are larger by a factor."""
     if scale == 1.0:
         return points
-    log_a = data.readings.scaled(scale).log_density(points.outputs, error) - points.log_proposal
+    readings = scaled_errors(data.readings, scale)
+    log_a = readings.log_density(points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 

@@ -27,8 +27,9 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.design import first_runs
-from prbayes.specimens.emulation import Emulation
+from prbayes.specimens.emulation import Emulation, fit_surface
 from prbayes.specimens.points import SpecimenData
+from prbayes.specimens.selection import Selection
 from prbayes.specimens.weighted_points import WeightedPoints
 
 
@@ -65,6 +66,7 @@ def response_share(
     data: SpecimenData,
     emulation: Emulation,
     posterior: Callable[[ResponseShare | None], Any],
+    selection: Selection | None = None,
     *,
     count: int = 4096,
     batches: int = 6,
@@ -75,38 +77,48 @@ def response_share(
     error of the points of the specimens. ``posterior`` maps a share to draws of the
     hyperparameters, with ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has
     ``count`` points at first, and there are at most ``batches`` batches of runs at the boundary.
+    With a ``selection`` the share is that of the specimens that are measured.
 
     Raise DesignError if boundary or points do not determine the share.
     """
-    if not np.isnan(emulation.y).any():
+    if selection is None and not np.isnan(emulation.y).any():
         return emulation, None
     seed, name, options = data.seed, data.name, data.options
     largest = options.half_difference
     draws = posterior(None)
 
     def draw(number: int, half: int) -> ResponseShare:
-        return _points(emulation, (data.prior, draws.specimens()), number, 2 * seed + half)
+        samples = (data.prior, draws.specimens())
+        return _points(emulation, samples, number, 2 * seed + half, selection)
 
     share = draw(count, 0)
-    if np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
+    if selection is None and np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
         return emulation, None
     draws = posterior(share)
     _, other_metric = data.remedies()
+    # Probabilities are smooth beside a boundary, so that fewer points suffice.
+    count = count if selection is None else count // 2
+    subject = "a failing region (NaN)" if selection is None else "limits of selected="
     batch = max(2 * first_runs(emulation.z.shape[1]), 32)
     for _ in range(batches):
         fresh = boundary_points(emulation, draws.specimens(), batch, seed)
+        if selection is not None:
+            uncertain = selection.uncertain_points(emulation, draws.specimens(), batch)
+            fresh = np.concatenate([fresh, uncertain])
         previous = draws.log_share(share)
         if len(fresh):
-            z = np.concatenate([emulation.z, fresh])
-            y = np.concatenate([emulation.y, run(fresh)])
-            emulation = replace(emulation, z=z, y=y)
+            emulation = emulation.with_runs(fresh, run(fresh))
+        if selection is not None:
+            z, y = emulation.z, emulation.y
+            surface, *_ = fit_surface(z, y, data.readings, name, emulation.surface)
+            emulation = replace(emulation, surface=surface)
         share = draw(count, 0)
         change = float(np.std(draws.log_share(share) - previous))
         if change <= largest / 4:
             break
     else:
         raise DesignError(
-            f"{name}: got a failing region (NaN) whose boundary still changes the log-likelihood "
+            f"{name}: got {subject} whose boundary still changes the log-likelihood "
             f"by {change:.2g} nats after {batches} batches of {batch} runs there, expected at most "
             f"{largest / 4}; {any_of('repair the response', 'narrow the priors', other_metric)}"
         )
@@ -125,11 +137,20 @@ def response_share(
                 f"{any_of('narrow the priors', other_metric)}"
             )
     z = np.concatenate([half.z for half in halves])
-    return emulation, _sorted(z, np.concatenate([half.log_b for half in halves]), emulation)
+    log_b = np.concatenate([half.log_b for half in halves])
+    # Each half has the points with a response, or its part that is measured, first.
+    first = [np.arange(len(half.z)) < half.with_response for half in halves]
+    order = np.argsort(~np.concatenate(first), kind="stable")
+    return emulation, ResponseShare(z[order], log_b[order], sum(h.with_response for h in halves))
 
 
 def _points(
-    emulation: Emulation, samples: tuple[Floats, ...], count: int, seed: int, degrees: float = 5.0
+    emulation: Emulation,
+    samples: tuple[Floats, ...],
+    count: int,
+    seed: int,
+    selection: Selection | None,
+    degrees: float = 5.0,
 ) -> ResponseShare:
     """Draw Sobol points from a mixture around samples: whitened, t distributed elements."""
     size = count // len(samples)
@@ -148,14 +169,32 @@ def _points(
         standard = np.linalg.solve(root, (z - mean).T)
         log_t = -(degrees + 1) / 2 * np.log1p(standard**2 / degrees)
         log_q.append(log_t.sum(axis=0) - np.log(np.diag(root)).sum())
-    return _sorted(z, -logsumexp(log_q, axis=0), emulation)
+    return _sorted(z, -logsumexp(log_q, axis=0), emulation, selection)
 
 
-def _sorted(z: Floats, log_b: Floats, emulation: Emulation) -> ResponseShare:
-    """Return the share with the points that have a response first."""
+def _sorted(
+    z: Floats, log_b: Floats, emulation: Emulation, selection: Selection | None
+) -> ResponseShare:
+    """Return the share with the points that have a response first.
+
+    With a selection a point is there twice: with the probability that it is measured, and with that
+    of the contrary.
+    """
     is_missing = emulation.is_missing(z)
     order = np.argsort(is_missing, kind="stable")
-    return ResponseShare(z[order], log_b[order], int((~is_missing).sum()))
+    count = int((~is_missing).sum())
+    z, log_b = z[order], log_b[order]
+    if selection is None:
+        return ResponseShare(z, log_b, count)
+    # Beyond the runs' range the response is that at the end of the range.
+    inside = np.clip(z[:count], emulation.box[0], emulation.box[1])
+    log_seen = selection.log_probability(emulation.surface.values(inside), emulation.error)
+    with np.errstate(divide="ignore"):
+        log_unseen = np.log(-np.expm1(log_seen))
+    is_seen, is_unseen = log_seen > -100, log_unseen > -100
+    points = np.concatenate([z[:count][is_seen], z[:count][is_unseen], z[count:]])
+    logs = [(log_b[:count] + log_seen)[is_seen], (log_b[:count] + log_unseen)[is_unseen]]
+    return ResponseShare(points, np.concatenate([*logs, log_b[count:]]), int(is_seen.sum()))
 
 
 def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) -> Floats:

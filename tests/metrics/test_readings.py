@@ -56,12 +56,13 @@ def test_outputs_of_all_kinds_multiply_and_missing_ones_have_no_influence() -> N
 def test_variances_of_reading_emulator_and_rounding_add() -> None:
     absolute = readings([[1.0], [-2.0]], error=[[0.3], [0.1]])
     points, error = np.array([[[1.2], [-0.5]], [[-1.5], [0.0]]]), np.array([0.4])
-    for y, size in ((absolute, 1.0), (replace(absolute, is_relative=np.full((2, 1), True)), None)):
-        own = y.error * (np.abs(points[..., 0]) if size is None else size)
+    share = replace(absolute, error=0 * absolute.error, relative=absolute.error)
+    for y, size in ((absolute, 1.0), (share, None)):
+        own = absolute.error * (np.abs(points[..., 0]) if size is None else size)
         expected = norm.logpdf(y.values, points[..., 0], np.hypot(0.4, own))
         np.testing.assert_allclose(y.log_density(points, error), expected, rtol=1e-12)
         # Roots are searched with the error at the reading.
-        at_reading = y.error * (np.abs(y.values) if size is None else size)
+        at_reading = absolute.error * (np.abs(y.values) if size is None else size)
         np.testing.assert_allclose(y.comparison_sd(error), np.hypot(0.4, at_reading))
     rounded = readings([[1.0]], error=[[0.3]], step=[[0.6]])
     assert rounded.comparison_sd(error) == pytest.approx(np.sqrt(0.25 + 0.36 / 12))

@@ -12,7 +12,7 @@ from scipy.special import logsumexp, ndtr
 from scipy.stats import multivariate_normal, norm
 
 from prbayes._validate import Floats
-from prbayes.metrics.readings import Readings
+from prbayes.metrics.readings import Readings, scaled_errors
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import DifferencedResponse, Emulation
 from prbayes.specimens.points import (
@@ -185,7 +185,7 @@ def test_the_log_proposal_serves_another_error() -> None:
     readings = with_error(response(specimens_of(draws)), 0.1)
     points = points_of(response, readings, draws, scales=(0.6, 1.0, 1.6))
     for scale in (0.6, 1.0, 1.6):
-        other = readings.scaled(scale)
+        other = scaled_errors(readings, scale)
         log_a = other.log_density(points.outputs, np.full(3, 1e-5)) - points.log_proposal
         error = draws.log_likelihoods(points.z, log_a) - exact_log_likelihoods(a, other, draws)
         assert error.sum(axis=1).std() <= 0.2

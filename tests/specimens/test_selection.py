@@ -1,0 +1,102 @@
+"""Specimens that are seen within limits only: probabilities, log-likelihoods, draws, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy import stats
+
+import prbayes as prb
+from benchmarks import selection as study
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import selection_of
+from prbayes.response.compile import PLAIN
+from prbayes.specimens.selection import Selection
+
+
+def test_probabilities_of_being_seen() -> None:
+    limits = Selection(
+        np.array([1.0, -np.inf]),
+        np.array([np.inf, 3.0]),
+        np.array([0.5, 0.0]),
+        np.array([0.1, 0.0]),
+        np.array([0.2, 0.0]),
+    )
+    outputs = np.array([[0.6, 2.0], [2.0, 2.9], [-4.0, 2.0], [2.0, 3.1]])
+    found = np.exp(limits.log_probability(outputs, np.array([0.0, 0.1])))
+    sd = np.hypot(0.5, 0.1 * outputs[:, 0])
+    first = stats.norm.sf(1.0, outputs[:, 0] + 0.2, sd)
+    np.testing.assert_allclose(found, first * stats.norm.cdf(3.0, outputs[:, 1], 0.1), rtol=1e-9)
+    exact = np.exp(limits.log_probability(outputs, np.zeros(2)))
+    np.testing.assert_allclose(exact, first * (outputs[:, 1] < 3.0), rtol=1e-9)
+    assert limits.is_seen(np.array([[1.5, 2.0], [0.9, 2.0], [1.5, 3.5]])).tolist() == [1, 0, 0]
+    assert limits.is_seen(np.array([[np.nan, 2.0]])).all()
+
+
+@pytest.mark.parametrize(("share", "error"), [(0.6, 0.0), (0.6, 0.9)])
+def test_log_likelihoods_of_a_selection_are_exact(share: float, error: float) -> None:
+    case, limit = study.case_of(share, error, 0)
+    with pm.Model() as model:
+        variables = {p.name: p.variable() for p in case.priors}
+        metric = case.metric(variables)
+        x = case.population(variables)
+        y = prb.Simulator("y", np.exp, x, metric=metric, observed=case.observed)
+    evaluator = Evaluator.of(model)
+    grid = np.linspace(-0.5, 1.5, 9), np.linspace(0.3, 1.2, 9)
+    mu, sigma = (a.ravel() for a in np.meshgrid(*grid))
+    values = {"mu": mu[:, None, None], "sigma": sigma[:, None, None]}
+    theta = np.column_stack([mu, np.log(sigma)])
+    exact = case.log_likelihood(values).sum(axis=1)
+    difference = evaluator(theta).log_other - exact
+    # The density of exact readings is that of the response, of which the reference has the input.
+    difference += 0.0 if error else np.log(case.observed).sum()
+    weights = np.exp(exact - exact.max())
+    assert np.sqrt(np.average(difference**2, weights=weights)) < 0.05
+    logp = model.compile_logp(vars=[y], mode=PLAIN)
+    at = {"mu": mu[40], "sigma_log__": np.log(sigma[40])}
+    assert float(logp(at)) == pytest.approx(evaluator(theta[40:41]).log_other[0], rel=1e-9)
+    drawn = pm.draw(pm.do(model, {"mu": 0.7, "sigma": 0.6})["y"], 50, random_seed=0, mode=PLAIN)
+    assert drawn.min() >= limit
+
+
+def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
+        error = options.pop("error", None)
+        error = pm.HalfNormal("error", 1) if error == "unknown" else error
+        metric = prb.LogLikelihood(error=error, **options)
+        prb.Simulator("y", np.exp, x, observed=np.array(observed), metric=metric)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"selected": (None, None)}, "expected \\(lower, upper\\)"),
+        ({"selected": 1.0}, "expected \\(lower, upper\\)"),
+        ({"selected": (1.5, None)}, "got the reading 1 of specimen 0"),
+        ({"selected": (None, 2.5)}, "got the reading 3 of specimen 2"),
+        ({"selected": ([0.0, 0.0], None)}, "got limits of shape"),
+        ({"selected": (0.5, None), "error": [0.1, 0.2, 0.3]}, "the same for all"),
+        ({"selected": (0.5, None), "error": "unknown"}, "pass numbers"),
+        ({"selected": (0.5, None), "gross_errors": True}, "pass numbers"),
+        ({"selected": (0.5, None), "error": prb.readings.Poisson()}, "leave selected= out"),
+        ({"selected": (0.5, None), "density": prb.GaussianKDE()}, "leave density= out"),
+    ],
+)
+def test_refused_selections(options: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        simulator(**options)
+
+
+def test_a_model_without_limits_has_no_selection() -> None:
+    assert selection_of([]) is None
+
+
+@pytest.mark.long
+def test_posteriors_of_a_selection_are_exact() -> None:
+    row = study.row("0.6/0.9/selected", 1)
+    assert np.abs(row["offset"]).max() < 0.1
+    assert 0.9 < min(row["width"]) <= max(row["width"]) < 1.1
