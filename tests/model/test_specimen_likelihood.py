@@ -25,7 +25,6 @@ from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     specimen_likelihoods,
 )
-from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
 
 N = 20
