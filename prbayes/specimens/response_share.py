@@ -123,6 +123,15 @@ def response_share(
             f"{largest / 4}; {any_of('repair the response', 'narrow the priors', other_metric)}"
         )
     draws = posterior(share)
+    return emulation, _agreeing_share(data, draws, draw, count)
+
+
+def _agreeing_share(
+    data: SpecimenData, draws: Any, draw: Callable[[int, int], ResponseShare], count: int
+) -> ResponseShare:
+    """Return a share whose halves agree at draws, doubled from ``count`` points in each."""
+    largest = data.options.half_difference
+    _, other_metric = data.remedies()
     while True:
         halves = [draw(count, half) for half in (0, 1)]
         logs = [draws.log_share(half) for half in halves]
@@ -132,7 +141,7 @@ def response_share(
         count *= 2
         if count > 2**16:
             raise DesignError(
-                f"{name}: got two halves of {count // 2} points whose shares without response "
+                f"{data.name}: got two halves of {count // 2} points whose shares without response "
                 f"change the log-likelihood by {difference:.2g} nats, expected at most {largest}; "
                 f"{any_of('narrow the priors', other_metric)}"
             )
@@ -141,7 +150,7 @@ def response_share(
     # Each half has the points with a response, or its part that is measured, first.
     first = [np.arange(len(half.z)) < half.with_response for half in halves]
     order = np.argsort(~np.concatenate(first), kind="stable")
-    return emulation, ResponseShare(z[order], log_b[order], sum(h.with_response for h in halves))
+    return ResponseShare(z[order], log_b[order], sum(h.with_response for h in halves))
 
 
 def _points(

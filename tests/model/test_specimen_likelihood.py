@@ -25,7 +25,6 @@ from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     specimen_likelihoods,
 )
-from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
 
 N = 20
@@ -438,10 +437,11 @@ def test_readings_may_have_limits_of_their_own() -> None:
         assert values(model).sum() == pytest.approx(expected, abs=0.1)
 
 
-def test_censored_readings_alone_are_refused() -> None:
-    model = build(metric=prb.LogLikelihood(censored=(None, Y.min())))
-    with pytest.raises(DesignError, match="got no reading of the output within the limits"):
-        model.compile_logp()
+def test_censored_readings_alone_have_the_probability_of_their_tail() -> None:
+    limit = float(Y.min())
+    model = build(metric=prb.LogLikelihood(censored=(None, limit)))
+    tail = stats.norm.logsf(limit, 1 + 2 * POINT["mu"], 2 * np.exp(POINT["sigma_log__"]))
+    assert values(model).sum() == pytest.approx(N * tail, abs=0.1)
 
 
 @cache
