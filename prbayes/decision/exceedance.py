@@ -736,12 +736,16 @@ def _first_parts(points: _Points, limit: float) -> list[_Part]:
     directions of points are all different there.
     """
     values = np.where(np.isnan(points.values), -np.inf, points.values)
-    level = min(float(np.quantile(values, 0.8, method="lower")), limit)
+    highest_fifth = float(np.quantile(values, 0.8, method="lower"))
+    level = min(highest_fifth, limit)
     above = points.z[values >= level]
-    above = above[np.argsort((above**2).sum(axis=1))]
+    distance = (above**2).sum(axis=1)
+    above = above[np.argsort(distance)]
     d = above.shape[1]
-    rows = farthest_rows(above, min(6 if d <= 5 else 3 if d <= 20 else 1, len(above)))
-    return _moved([_Part(level, _Normal(z, np.eye(d))) for z in above[rows]], points, limit)
+    most = 6 if d <= 5 else 3 if d <= 20 else 1
+    rows = farthest_rows(above, min(most, len(above)))
+    parts = [_Part(level, _Normal(z, np.eye(d))) for z in above[rows]]
+    return _moved(parts, points, limit)
 
 
 def _moved(parts: list[_Part], points: _Points, limit: float) -> list[_Part]:

@@ -166,10 +166,15 @@ class Runs(Shown):
         of it away. At a few runs at the ends of the ranges left-out errors are far larger.
         """
         data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
-        low, high, sd = np.nanmin(data, axis=0), np.nanmax(data, axis=0), np.nanstd(data, axis=0)
-        values, margin = self.responses.reshape(len(self), -1), (high - low) / 2
-        is_near = ((values >= low - margin) & (values <= high + margin)).all(axis=1)
-        rows = is_near if is_near.sum() >= 8 else np.isfinite(values).all(axis=1)
+        low = np.nanmin(data, axis=0)
+        high = np.nanmax(data, axis=0)
+        sd = np.nanstd(data, axis=0)
+        margin = (high - low) / 2
+        values = self.responses.reshape(len(self), -1)
+        is_inside = (values >= low - margin) & (values <= high + margin)
+        is_near = is_inside.all(axis=1)
+        is_finite = np.isfinite(values).all(axis=1)
+        rows = is_near if is_near.sum() >= 8 else is_finite
         residuals = self.error.residuals.reshape(values.shape)[rows]
         errors = np.quantile(np.abs(residuals), 0.9, axis=0)
         return float((errors / positive_scale(sd, np.inf)).max())

@@ -232,8 +232,11 @@ def add_errors(
     ``error`` and ``relative`` are factors of the errors, the first one also of the parameter of
     counts, and ``bias`` is added to the known one; they broadcast to the outputs.
     """
-    sd = np.hypot(error * readings.error, relative * readings.relative * np.abs(outputs))
-    result = outputs + sd * rng.standard_normal(outputs.shape) + (readings.bias + bias)
+    additive = error * readings.error
+    proportional = relative * readings.relative * np.abs(outputs)
+    sd = np.hypot(additive, proportional)
+    noise = rng.standard_normal(outputs.shape)
+    result = outputs + sd * noise + (readings.bias + bias)
     if (readings.step > 0).any():
         unit = positive_scale(readings.step)
         result = np.where(readings.step > 0, np.round(result / unit) * unit, result)

@@ -320,12 +320,16 @@ def count_at_ends(
         at_end = np.array([np.sum(y == high), np.sum(y == low)])
         # Copied specimens also repeat values between the ends, so that these repeats are the
         # reference.
-        _, repeats = np.unique(y[(y > low) & (y < high)], return_counts=True)
-        p_values = np.where(at_end > repeats.max(initial=1), 1 / (draws + 1), 1.0)
+        between = y[(y > low) & (y < high)]
+        _, repeats = np.unique(between, return_counts=True)
+        is_pile = at_end > repeats.max(initial=1)
+        p_values = np.where(is_pile, 1 / (draws + 1), 1.0)
     else:
-        is_high, is_low = y > high - step / 2, y < low + step / 2
+        is_high = y > high - step / 2
+        is_low = y < low + step / 2
         at_end = np.array([is_high.sum(), is_low.sum()])
-        samples = np.random.default_rng(seed).normal(y.mean(), y.std(), (draws, n))
+        rng = np.random.default_rng(seed)
+        samples = rng.normal(y.mean(), y.std(), (draws, n))
         cells_of = np.round((samples - low) / step)
         largest = cells_of == cells_of.max(axis=1, keepdims=True)
         smallest = cells_of == cells_of.min(axis=1, keepdims=True)
@@ -333,8 +337,11 @@ def count_at_ends(
         bootstrap = adjusted_p_values(at_end.astype(np.float64), null.astype(np.float64))
         cells = max(1, int(0.5 * y.std() / step))
         width = (cells + 0.5) * step
-        near = np.array([np.sum(y > high - width), np.sum(y < low + width)])
-        p_values = np.maximum(bootstrap, bdtrc(at_end - 1, near, 1 / (1 + cells)))
+        near_high = y > high - width
+        near_low = y < low + width
+        near = np.array([near_high.sum(), near_low.sum()])
+        binomial = bdtrc(at_end - 1, near, 1 / (1 + cells))
+        p_values = np.maximum(bootstrap, binomial)
     return at_end, p_values
 
 

@@ -125,21 +125,31 @@ def audit_points(
     others. Each point represents the candidates that are nearest to it.
     """
     scale = np.maximum(np.ptp(candidates, axis=0), 1e-12)
-    worst = candidates[np.argsort(-uncertainty)[: max(count, len(uncertainty) // 20)]]
-    worst = np.random.default_rng(0).permutation(worst)[: count // 2]
-    distant = farthest(np.concatenate([emulation.z, worst]), candidates, count // 2, scale)
+    least_certain = np.argsort(-uncertainty)
+    n_worst = max(count, len(uncertainty) // 20)
+    worst = candidates[least_certain[:n_worst]]
+    rng = np.random.default_rng(0)
+    worst = rng.permutation(worst)[: count // 2]
+    present = np.concatenate([emulation.z, worst])
+    distant = farthest(present, candidates, count // 2, scale)
     points = np.unique(np.concatenate([worst, distant]), axis=0)
-    nearest = cdist(candidates / scale, points / scale).argmin(axis=1)
+    distances = cdist(candidates / scale, points / scale)
+    nearest = distances.argmin(axis=1)
     return points, np.bincount(nearest, minlength=len(points))
 
 
 def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:
     """Return coordinates of inputs of the specimens under posterior draws, (n, d)."""
     count = int(np.clip(2**15 // len(likelihood.readings), 16, 256))
-    rows = np.unique(np.linspace(0, len(thetas) - 1, count).round().astype(int))
+    even = np.linspace(0, len(thetas) - 1, count)
+    rows = np.unique(even.round().astype(int))
     values = variables_at(likelihood.hyperparameters, thetas[rows])
-    inputs, is_gross = draw_inputs(likelihood, np.random.default_rng(0), values, as_read=True)
-    z = likelihood.coordinates.of([x.reshape(-1, *x.shape[2:]) for x in inputs], 1)
-    # Readings with gross errors do not determine the population.
-    is_regular = np.isfinite(z).all(axis=1) & (True if is_gross is None else is_gross.ravel() < 0.5)
+    rng = np.random.default_rng(0)
+    inputs, is_gross = draw_inputs(likelihood, rng, values, as_read=True)
+    of_specimens = [x.reshape(-1, *x.shape[2:]) for x in inputs]
+    z = likelihood.coordinates.of(of_specimens, 1)
+    is_regular = np.isfinite(z).all(axis=1)
+    if is_gross is not None:
+        # Readings with gross errors do not determine the population.
+        is_regular &= is_gross.ravel() < 0.5
     return z[is_regular]

@@ -40,14 +40,18 @@ def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
     size = log_w.shape[1]
     result = log_w - log_w.max(axis=1, keepdims=True)
     n = int(3 * np.sqrt(size)) if size > 225 else size // 5
-    order = np.argsort(result, axis=1)[:, -n - 1 :]
-    tail = np.exp(np.take_along_axis(result, order, axis=1))
+    order = np.argsort(result, axis=1)
+    order = order[:, -n - 1 :]
+    weights = np.exp(np.take_along_axis(result, order, axis=1))
     order = order[:, 1:]
-    cutoff, tail = tail[:, :1], tail[:, 1:] - tail[:, :1]
+    cutoff = weights[:, :1]
+    tail = weights[:, 1:] - cutoff
     m = 30 + int(np.sqrt(n))
-    quarter, largest = tail[:, int(n / 4 + 0.5) - 1, None], tail[:, -1:]
+    quarter = tail[:, int(n / 4 + 0.5) - 1, None]
+    largest = tail[:, -1:]
     grid = 1 - np.sqrt(m / (np.arange(m) + 0.5))
-    log_p = np.log1p(-(np.arange(n) + 0.5) / n)
+    levels = (np.arange(n) + 0.5) / n
+    log_p = np.log1p(-levels)
     with np.errstate(all="ignore"):
         # Profile likelihoods of candidates b = -k / sigma, (rows, m).
         b = grid / (3 * quarter) + 1 / largest
@@ -63,7 +67,8 @@ def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
         smoothed = np.log(cutoff + sigma * quantiles)
     k[quarter <= tail[:, :1]] = np.nan
     is_smoothed = np.isfinite(smoothed).all(axis=1)
-    rows = np.flatnonzero(is_smoothed & np.isfinite(k[:, 0]))
+    is_smoothed &= np.isfinite(k[:, 0])
+    rows = np.flatnonzero(is_smoothed)
     result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)
     result -= logsumexp(result, axis=1, keepdims=True)
     return result, k[:, 0]
@@ -147,9 +152,11 @@ class StudentMixture:
         """
         nu, d = self.degrees, points.shape[-1]
         log_det = np.log(np.einsum("mdd->md", self.roots)).sum(axis=1)
-        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
+        constant = gammaln((nu + d) / 2) - gammaln(nu / 2)
+        constant -= d / 2 * np.log(nu * np.pi)
+        at_center = np.log(self.shares) + constant - log_det
         tail = (nu + d) / 2 * np.log1p(self.squares(points) / nu)
-        return np.asarray((np.log(self.shares) + constant - log_det)[:, None] - tail).T
+        return np.asarray(at_center[:, None] - tail).T
 
     def log_density(self, points: Floats) -> Floats:
         """Return the log-density, (S,)."""

@@ -181,14 +181,21 @@ def ridge_between(log_density: LogDensity, first: Laplace, second: Laplace) -> L
     middle = (first.mode + second.mode) / 2
     scale = np.sqrt(np.diag(first.covariance + second.covariance) / 2)
     # (d, d - 1): basis of the plane, orthogonal in units of the modes' standard deviations
-    plane = np.linalg.svd((difference / scale)[None])[2][1:].T * scale[:, None]
+    direction = (difference / scale)[None]
+    _, _, axes = np.linalg.svd(direction)
+    plane = axes[1:].T * scale[:, None]
     size = plane.shape[1]
-    (top,) = laplace(
-        lambda u: log_density(middle + u @ plane.T), np.zeros((1, size)), np.ones(size)
-    )
-    height = top.log_mass - np.linalg.slogdet(2 * np.pi * top.covariance)[1] / 2
-    covariance = plane @ top.covariance @ plane.T + np.outer(difference, difference) / 12
-    log_mass = float(height + np.linalg.slogdet(2 * np.pi * covariance)[1] / 2)
+
+    def on_plane(u: Floats) -> Floats:
+        return log_density(middle + u @ plane.T)
+
+    (top,) = laplace(on_plane, np.zeros((1, size)), np.ones(size))
+    along = np.outer(difference, difference) / 12  # variance of a uniform density
+    covariance = plane @ top.covariance @ plane.T + along
+    _, log_det_on_plane = np.linalg.slogdet(2 * np.pi * top.covariance)
+    _, log_det = np.linalg.slogdet(2 * np.pi * covariance)
+    height = top.log_mass - log_det_on_plane / 2
+    log_mass = float(height + log_det / 2)
     return Laplace(middle + plane @ top.mode, covariance, log_mass, top.converged)
 
 

@@ -276,9 +276,12 @@ def _log_likelihood_totals(
     totals = {m.name: np.zeros(len(rows)) for m in evaluator.measurements}
     sizes = {} if by_specimen is None else by_specimen.sizes
     if by_specimen is not None and sizes["chain"] * sizes["draw"] == len(rows):
-        sums = {name: logs.sum(str(logs.dims[-1])) for name, logs in by_specimen.data_vars.items()}
-        return totals | {str(name): total.values.ravel() for name, total in sums.items()}
-    step = max(1, AT_ONCE // sum(len(likelihood.readings) for likelihood in evaluator.likelihoods))
+        for variable, values in by_specimen.data_vars.items():
+            over_specimens = values.sum(str(values.dims[-1]))
+            totals[str(variable)] = over_specimens.values.ravel()
+        return totals
+    n_specimens = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+    step = max(1, AT_ONCE // n_specimens)
     for first in range(0, len(rows), step):
         block = slice(first, first + step)
         for name, logs in specimen_log_likelihoods(evaluator, rows[block]).items():

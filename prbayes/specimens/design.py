@@ -57,8 +57,10 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
     u = sobol(n, d, data.seed)
     population = normal_of(data.inner[:, data.free])
     z = np.empty((n, d))
-    z[:, data.free] = population.mean + 1.5 * ndtri(u[:, : len(data.free)]) @ population.root.T
-    low, high = data.prior.min(axis=0), data.prior.max(axis=0)
+    normal = ndtri(u[:, : len(data.free)])
+    z[:, data.free] = population.mean + 1.5 * normal @ population.root.T
+    low = data.prior.min(axis=0)
+    high = data.prior.max(axis=0)
     z = np.clip(z, low, high)
     conditions = np.flatnonzero(~np.isnan(data.known[0]))
     # Runs have the conditions of the specimens.
@@ -68,11 +70,15 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
     y = run(z)
     while np.isfinite(y).all(axis=1).sum() < 8 and len(z) < 8 * n:
         rng = np.random.default_rng([data.seed, len(z)])
-        more = data.inner[rng.integers(0, len(data.inner), n)]
-        z, y = np.concatenate([z, more]), np.concatenate([y, run(more)])
+        rows = rng.integers(0, len(data.inner), n)
+        more = data.inner[rows]
+        z = np.concatenate([z, more])
+        y = np.concatenate([y, run(more)])
     surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
-    rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
-    error = np.maximum(2 * rms, data.options.floor * data.readings.spread())
+    square = left_out[is_near] ** 2
+    rms = np.sqrt(square.mean(axis=0))
+    least = data.options.floor * data.readings.spread()
+    error = np.maximum(2 * rms, least)
     return Emulation(z, y, surface, error, np.inf)
 
 

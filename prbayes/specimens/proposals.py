@@ -201,13 +201,16 @@ def find_modes(
     # Accurate readings make a narrow curved valley, in which the method takes tiny steps. The first
     # search therefore has a larger reading error, and the second one starts at its result.
     change = 0.03 * _typical_change(residuals, starts)
-    change = change if residuals.columns is None else change[residuals.columns]
-    soft = replace(residuals, emulator_error=np.maximum(residuals.emulator_error, change))
-    a = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)[0]
+    if residuals.columns is not None:
+        change = change[residuals.columns]
+    larger = np.maximum(residuals.emulator_error, change)
+    soft = replace(residuals, emulator_error=larger)
+    a, *_ = _minimised(soft, specimen, starts.reshape(-1, d), precision, 40, scale)
     a, value, e, slopes = _minimised(residuals, specimen, a, precision, 20, scale)
     misfit = (e**2).sum(axis=1) / 2
     # Modes far from the reference population are kept, because another population may be likely.
-    least = _lowest(specimen, np.where(np.isfinite(value), misfit, np.inf), n)
+    finite = np.where(np.isfinite(value), misfit, np.inf)
+    least = _lowest(specimen, finite, n)
     value = np.where(misfit <= least[specimen] + gap, value, np.inf)
     rows = _distinct(specimen, a, value, slopes, precision)
     rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
@@ -465,22 +468,28 @@ class Proposals:
         each, (N, K). The log is infinite where there is no point.
         """
         modes, residuals = self.modes, self.residuals
-        n, d = len(residuals.known), modes.a.shape[1]
+        n = len(residuals.known)
+        d = modes.a.shape[1]
         counts = _point_counts(self.share, modes.table, count)
         mode = np.repeat(np.arange(len(counts)), counts)
         place = _place_among_equals(mode)
-        shifts = np.random.default_rng([seed, 1]).random((len(counts), d))
-        u = (lattice(place, counts[mode], d) + shifts[mode]) % 1.0
+        rng = np.random.default_rng([seed, 1])
+        shifts = rng.random((len(counts), d))
+        points = lattice(place, counts[mode], d)
+        u = (points + shifts[mode]) % 1.0
         u = np.clip(u, 1e-12, 1 - 1e-12)
         xi = np.where(self.open_axes[mode], stdtrit(self.degrees, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
-        drawn = mode[rows], log_det[rows] + self.log_density(mode[rows], value[rows])
+        log_density = self.log_density(mode[rows], value[rows])
+        drawn = mode[rows], log_det[rows] + log_density
         weights = counts.astype(np.float64)
-        log_q[rows] = self.log_mixture(modes.specimen[mode[rows]], a[rows], weights, drawn)
+        owners = modes.specimen[mode[rows]]
+        log_unit = np.log(np.diag(residuals.population.root)).sum()
+        log_q[rows] = self.log_mixture(owners, a[rows], weights, drawn)
         log_q[rows] -= d / 2 * np.log(2 * np.pi)
-        log_q[rows] -= np.log(np.diag(residuals.population.root)).sum()
+        log_q[rows] -= log_unit
         a[~converged] = 0.0
         specimen = modes.specimen[mode]
         # A specimen that no inputs reproduce has its best mode, as if the map were linear there.
@@ -488,7 +497,7 @@ class Proposals:
         lost = best[~np.isin(modes.specimen[best], specimen[rows])]
         first = np.searchsorted(specimen, modes.specimen[lost])
         a[first] = modes.a[lost]
-        log_q[first] = self.log_det[lost] - np.log(np.diag(residuals.population.root)).sum()
+        log_q[first] = self.log_det[lost] - log_unit
         z = np.zeros((n, count, residuals.known.shape[1]))
         by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
         slot = _place_among_equals(specimen)

@@ -49,9 +49,12 @@ def zhang_statistic(z: Floats, weights: Floats) -> Floats:
     uniform = np.random.default_rng(0).random((8 if points > 1 else 1, n, 1))
     drawn = (cumulative < uniform * cumulative[:, -1:]).sum(axis=-1)
     # (draws, N, d): distribution functions of the drawn inputs
-    u = np.sort(ndtr(np.clip(z[np.arange(n), drawn], -6, 6)), axis=1)
+    scores = np.clip(z[np.arange(n), drawn], -6, 6)
+    u = np.sort(ndtr(scores), axis=1)
     rank = np.arange(1, n + 1)[:, None]
-    terms = np.log(u) / (n - rank + 0.5) + np.log1p(-u) / (rank - 0.5)
+    upper = np.log1p(-u) / (rank - 0.5)
+    lower = np.log(u) / (n - rank + 0.5)
+    terms = lower + upper
     statistic: Floats = -terms.sum(axis=1).mean(axis=0)
     return statistic
 
