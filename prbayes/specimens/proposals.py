@@ -213,7 +213,8 @@ def find_modes(
     least = _lowest(specimen, finite, n)
     value = np.where(misfit <= least[specimen] + gap, value, np.inf)
     rows = _distinct(specimen, a, value, slopes, precision)
-    rows = rows[np.lexsort((*a[rows].T[::-1], specimen[rows]))]
+    keys = (*a[rows].T[::-1], specimen[rows])
+    rows = rows[np.lexsort(keys)]
     misfit = misfit[rows]
     scales = np.full(len(rows), scale)
     return Modes(specimen[rows], a[rows], misfit, e[rows], slopes[rows], scales)

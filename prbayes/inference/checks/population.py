@@ -46,7 +46,8 @@ def zhang_statistic(z: Floats, weights: Floats) -> Floats:
     """
     n, points, _ = z.shape
     cumulative = np.cumsum(weights, axis=1)
-    uniform = np.random.default_rng(0).random((8 if points > 1 else 1, n, 1))
+    draws = 8 if points > 1 else 1
+    uniform = np.random.default_rng(0).random((draws, n, 1))
     drawn = (cumulative < uniform * cumulative[:, -1:]).sum(axis=-1)
     # (draws, N, d): distribution functions of the drawn inputs
     scores = np.clip(z[np.arange(n), drawn], -6, 6)
