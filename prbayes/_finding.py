@@ -136,7 +136,7 @@ def help(code: str | None = None) -> Help:
     `prior-misfit`: The data do not fit the population at an optimum with the prior. Look at \
 `prb.minimize` without the prior.
     >>> print(prb.help("rounded-data").splitlines()[2])
-    ### Rounded data
+    ## Rounded data
     """
     rows = dict(re.findall(r"^\| `([\w-]+)` \| (.*) \|$", _page("findings.md"), re.MULTILINE))
     if code is None:

@@ -385,6 +385,15 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         gross_errors=(-1.0, 2.0),
         censored=((1.0,), ("a", "b"), [None, None]),
         rounded=("a", -1.0),
+        bias=("a", np.nan, True),
+    ),
+    "readings.Poisson": Row(exposure=(*POSITIVE, "a", True)),
+    "readings.NegativeBinomial": Row(
+        {"alpha": 2.0}, alpha=(*POSITIVE, "a", True), exposure=(*POSITIVE, "a"), own="alpha"
+    ),
+    "readings.Binomial": Row(n=(*POSITIVE, "a", True)),
+    "readings.Combined": Row(
+        {"additive": 1.0, "proportional": 0.1}, additive=(*POSITIVE, "a"), proportional=(-1.0, "a")
     ),
     "Joint": Row(metric=JOINED),
     "GaussianKDE": Row(bandwidth=POSITIVE),
@@ -604,6 +613,12 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         result=(None, 3, "result", xr.DataTree(), []),
         own="result",
     ),
+    "update": Row(
+        {"result": posterior, "observed": OBSERVED, "model": by_specimen},
+        result=(None, 3, "result", xr.DataTree(), []),
+        observed=([], "a", [1j], None),
+        own="result observed",
+    ),
     "plots.plot_landscape": Row(
         responses=(*ZERO_OR_MORE, None),
         own="responses",
@@ -654,7 +669,12 @@ def cases() -> Iterator[Any]:
 
 
 # What an argument is called in a message, where that is not its name.
-WORDS = {"constant": "input", "result": "expected an optimum", "tests": "expected a validitytest"}
+WORDS = {
+    "constant": "input",
+    "result": "expected an optimum",
+    "tests": "expected a validitytest",
+    "update result": "expected a datatree",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -676,7 +696,8 @@ def test_a_bad_argument_is_refused_before_the_response_is_called(
         with pytest.raises((TypeError, ValueError, KeyError, prb.response.StoreError)) as caught:
             call(**good | {argument: made(value)})
         text = str(caught.value).lower()
-        for word in ("got", "expected", WORDS.get(argument, argument).lower()):
+        named = WORDS.get(f"{name} {argument}", WORDS.get(argument, argument))
+        for word in ("got", "expected", named.lower()):
             assert word in text, (value, text)
         # The outputs of a response are known once its runs are compared with a few new ones.
         assert calls - before <= (3 if argument == "output" else 0), value

@@ -255,7 +255,10 @@ def descent_of(
     # Bound the curvatures from below by a twentieth of the largest, so that the first guess is
     # positive definite.
     curvatures, vectors = np.linalg.eigh(second_differences(mean_objective, r))
-    lowest = 0.05 * max(np.nanmax(curvatures), 1e-300)
+    highest = np.nanmax(curvatures)
+    if not highest > 1e-100:  # a constant objective, as of equal observations
+        return partial(descend, curvature=np.eye(r), tolerance=0.0, step=step)
+    lowest = 0.05 * highest
     positive = np.maximum(np.nan_to_num(curvatures), lowest)
     across = np.linalg.inv(root)
     curvature = across.T @ ((vectors * positive) @ vectors.T) @ across

@@ -226,6 +226,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         data = specimen_data(likelihood)
         selection = selection_of(likelihood.measurements)
         first = _emulate(runs, data, likelihood.shared_emulation)
+        if any(finding.code == "readings-misfit" for finding in first.findings):
+            refuse_unreached(likelihood.name, first.emulation.y, likelihood.readings)
         points = first.points
 
         def posterior(share: ResponseShare | None) -> PopulationDraws:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import shown
-from prbayes._validate import Floats, Seed, real_array, seed_number
+from prbayes._validate import Floats, Seed, real_array, seed_number, wrong_type
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_unchanged_runs
 from prbayes.model.fingerprint import identity_from_attributes, identity_of, require_same
@@ -76,7 +76,7 @@ def update(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described, or if the specimens have groups, labels, weights or
         conditions of their own.
     DesignError
@@ -100,6 +100,12 @@ def update(
     """
     caller = "prb.update"
     model = model_on_context(model, caller)
+    new = real_array(observed, f"{caller}: observed").astype(float)
+    if not new.size:
+        raise ValueError(f"{caller}: observed: got no reading, expected those of new specimens")
+    seed = seed_number(random_seed)
+    if not isinstance(result, xr.DataTree) or "posterior" not in result.children:
+        raise wrong_type(result, caller, "a DataTree with a posterior, as of prb.sample")
     result = one_posterior(result, caller)
     likelihood = _updatable(model, caller)
     latest = likelihood.cache.get("updated")
@@ -108,9 +114,8 @@ def update(
     earlier = _of_result(likelihood, latest, result, thetas, caller)
     identity = identity_from_attributes(result["posterior"].attrs)
     require_same(identity, identity_of(_evaluator(evaluator, earlier)), caller)
-    new = real_array(observed, f"{caller}: observed").astype(float)
     event = likelihood.measurements[0].event
-    if new.shape[1:] != event or not new.size:
+    if new.shape[1:] != event:
         raise ValueError(
             f"{caller}: observed: got shape {new.shape}, expected {('n', *event)}, in the form of "
             "the simulator's observed values"
@@ -123,7 +128,7 @@ def update(
     settings = SamplingSettings(
         draws=posterior.sizes["draw"],
         chains=posterior.sizes["chain"],
-        random_seed=seed_number(random_seed),
+        random_seed=seed,
         with_groups=True,
     )
     with shown(False):
