@@ -160,7 +160,7 @@ def exceedance(
 
     Probabilities are those of specimens that have a response: NaN are left out, and reported.
 
-    If the data do not separate a population of `prbayes.families` from a simpler one, the finding
+    If the data do not separate a population of ``prbayes.families`` from a simpler one, the finding
     ``two-families`` has the probability and the verdict under the latter.
 
     References

@@ -49,8 +49,8 @@ def update(
     The emulator of the first specimens finds the inputs of the new ones, so that the response does
     not run. With the likelihood :math:`p(y_i \mid \theta)` of each new specimen,
 
-    .. math:: p(\theta \mid y_1, \dots, y_{N + n})
-        \propto p(\theta \mid y_1, \dots, y_N) \prod_{i = N + 1}^{N + n} p(y_i \mid \theta) .
+    .. math:: p(\theta \mid y_1, \ldots, y_{N + n})
+        \propto p(\theta \mid y_1, \ldots, y_N) \prod_{i = N + 1}^{N + n} p(y_i \mid \theta) .
 
     All specimens count alike: the posterior is drawn anew from the points of all of them [1]_, and
     does not depend on the order of updates.
