@@ -95,15 +95,15 @@ def test_numbers_are_those_of_plain_variables(build: Callable[[Any], Any]) -> No
 @pytest.mark.long
 def test_numbers_of_a_metric_are_those_of_plain_variables() -> None:
     # Refits end within their tolerance, so that draws agree in units of their spread. Resampling
-    # selects other points where weights differ in the last digits, which shifts the mean of few
-    # draws.
+    # selects other points where weights differ in the last digits: means of 2000 draws then differ
+    # by up to the error of a difference of two samples, as the processor rounds.
     plain, named = [numbers(lognormal, p, prb.AreaMetric(), draws=1000) for p in (pm, pmd)]
     for name, value in plain.items():
         if name.startswith(("optimum", "stderr")):
             np.testing.assert_allclose(named[name], value, rtol=1e-4, err_msg=name)
         else:
             shift = float(abs(named[name].mean() - value.mean()))
-            assert shift < 0.01 * float(value.std()), name
+            assert shift < np.sqrt(2 / 2000) * float(value.std()), name
 
 
 def test_elements_have_the_names_of_coordinates() -> None:
