@@ -107,8 +107,8 @@ def population(
 
     Margins come from inverse distribution functions, or from random draws where there is none.
 
-    If the data do not separate a population of ``prbayes.families`` from a simpler one, rows such as
-    ``"x (normal)"`` have the answer under the latter.
+    If the data do not separate a population of ``prbayes.families`` from a simpler one, rows such
+    as ``"x (normal)"`` have the answer under the latter.
 
     References
     ----------
