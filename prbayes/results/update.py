@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import xarray as xr
 
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import shown
-from prbayes._validate import Floats, Seed, real_array, seed_number, wrong_type
+from prbayes._validate import Floats, Indices, Seed, real_array, seed_number, wrong_type
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_unchanged_runs
 from prbayes.model.fingerprint import identity_from_attributes, identity_of, require_same
@@ -26,6 +25,7 @@ from prbayes.model.specimen_likelihood import (
     specimen_likelihoods,
 )
 from prbayes.model.specimen_preparation import prepared, with_emulator, with_specimens
+from prbayes.numerics.mixtures import pareto_smoothed
 from prbayes.posterior.sample import draw_posterior
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.propagation.base import DesignError
@@ -187,11 +187,20 @@ def _evaluator(evaluator: Evaluator, likelihood: SpecimenLikelihood) -> Evaluato
     return replace(evaluator, emulated=emulated, has_graph=False)
 
 
+def rare_specimens(logs: Floats) -> Indices:
+    """Return specimens whose likelihoods are those of few draws: logs (S, n), Pareto k above .7."""
+    _, tails = pareto_smoothed(logs.T)
+    return np.flatnonzero(tails > 0.7)
+
+
 def _extended(
     likelihood: SpecimenLikelihood, new: Floats, thetas: Floats, caller: str
 ) -> tuple[SpecimenLikelihood, list[Finding]]:
     """Return the likelihood of the specimens and of new ones, and what the new ones contradict."""
-    joint, added = with_specimens(likelihood, new, thetas)
+    try:
+        joint, added = with_specimens(likelihood, new, thetas)
+    except ValueError as error:  # errors, limits or steps by reading
+        raise TypeError(f"{caller}: {error}; {_AGAIN}") from None
     grown, checked = audited_likelihood(added, thetas, is_last=False), added
     if grown is not added:
         # The emulator has got runs, and all specimens new points.
@@ -201,11 +210,11 @@ def _extended(
             raise DesignError(f"{caller}: {finding.text}")
     n = len(likelihood.readings)
     logs = log_likelihoods(added, variables_at(likelihood.hyperparameters, thetas))
-    stats: Any = import_module("arviz_stats")
-    tails = [stats.base.array_stats.psislw(-column)[1] for column in logs.T]
-    unlike = [f"{n + i}" for i, k in enumerate(tails) if k > 0.7]
+    unlike = [f"{n + i}" for i in rare_specimens(logs)]
     findings = []
     if unlike:
+        # The points were to suffice for the first specimens' populations, which may not be likely.
+        joint = with_emulator(joint, grown)
         text = (
             f"{likelihood.name}: {counted(len(unlike), 'new specimen')} (row {', '.join(unlike)}) "
             "would be rare under every population that the first specimens allow (Pareto k above "

@@ -12,6 +12,7 @@ import xarray as xr
 import prbayes as prb
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.propagation.base import DesignError
+from prbayes.results.update import rare_specimens
 
 RNG = np.random.default_rng(5)
 STIFFNESS = RNG.normal(20, 1.5, 40)
@@ -100,10 +101,23 @@ def test_a_specimen_that_contradicts_the_others_is_named(
     model, result = first
     new = [*deflection(STIFFNESS[15:18]), deflection(20 + 12 * 1.5)]
     updated = prb.update(result, observed=new, model=model)
+    assert_alike(updated, drawn(springs(np.append(deflection(STIFFNESS[:15]), new))))
     (finding,) = [f for f in prb.diagnose(updated).findings if f.code == "unlike-specimens"]
     assert "1 new specimen (row 18)" in finding.text
     assert "unlike-specimens" in prb.help("unlike-specimens")
     assert "row 18" in caplog.text
+
+
+def test_a_specimen_is_rare_if_few_draws_have_the_weight() -> None:
+    draws = np.random.default_rng(0).normal(size=1000)
+    logs = np.stack([-0.45 * draws**2, 0.45 * draws**2, np.zeros(1000)], axis=1)
+    assert rare_specimens(logs).tolist() == [1]
+
+
+def test_errors_by_reading_are_refused() -> None:
+    model = springs(deflection(STIFFNESS[:15]), metric=prb.LogLikelihood(error=np.full(15, 0.1)))
+    with pytest.raises(TypeError, match=r"one for each reading; calibrate all specimens together"):
+        prb.update(drawn(model), observed=deflection(STIFFNESS[15:20]), model=model)
 
 
 def test_readings_out_of_reach_are_refused() -> None:
