@@ -281,7 +281,8 @@ def _refuse_conflicts(metric: LogLikelihood) -> None:
     arguments = {
         name: getattr(metric, name) for name in ("bias", "censored", "selected", "rounded")
     }
-    arguments |= {"relative": metric.relative or None, "gross_errors": metric.gross_errors or None}
+    has_gross_errors = metric.gross_errors is not False
+    arguments |= {"relative": metric.relative or None, "gross_errors": has_gross_errors or None}
     labels = [f"{name}=" for name, value in arguments.items() if value is not None]
     refused = ", ".join(labels if metric.count is not None else ["relative="] * metric.relative)
     if isinstance(metric.error, ReadingDistribution) and refused:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 from metric_samples import draw
 from scipy.stats import norm
@@ -14,6 +16,7 @@ from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood, kernel_width
 from prbayes.metrics.multivariate import Joint
+from prbayes.readings import Combined
 
 
 def prepared(density: Any, observed: Floats, weights: Floats | None = None) -> Any:
@@ -87,3 +90,29 @@ def test_no_value_beyond_the_grid_improves_the_likelihood(spread: float) -> None
     without, within = several.of(simulated[None], np.full((1, 2000), 1 / 2000))
     assert without == pytest.approx(inner(simulated), rel=1e-12)
     assert within > without
+
+
+def test_each_combination_of_arguments_describes_the_readings_or_is_refused() -> None:
+    with pm.Model():
+        variable = pm.Beta("variable", 1, 9)
+    arguments: dict[str, list[Any]] = {
+        "error": [None, 0.1, variable, Combined(0.1, 0.05)],
+        "relative": [False, True],
+        "bias": [None, 0.05, variable],
+        "gross_errors": [False, True, 0.05, variable],
+        "rounded": [None, 0.01],
+        "censored": [None, (None, 5.0)],
+        "selected": [None, (-9.0, None)],
+    }
+    accepted, refused = [], []
+    for values in itertools.product(*arguments.values()):
+        options = dict(zip(arguments, values, strict=True))
+        try:
+            accepted.append(LogLikelihood(**options))
+        except ValueError as error:
+            refused.append(options)
+            assert str(error).startswith("LogLikelihood: ")
+    assert any(metric.gross_errors is variable for metric in accepted)
+    assert not any(metric.gross_errors is variable and metric.selected for metric in accepted)
+    assert not any(metric.bias is variable and metric.error is None for metric in accepted)
+    assert any(options["relative"] for options in refused)
