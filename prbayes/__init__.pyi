@@ -56,6 +56,7 @@ from prbayes.results.diagnose import Diagnosis as Diagnosis
 from prbayes.results.diagnose import diagnose as diagnose
 from prbayes.results.individuals import individuals as individuals
 from prbayes.results.predict import predict as predict
+from prbayes.results.residuals import residuals as residuals
 from prbayes.results.update import update as update
 from prbayes.validation.area_test import area_test as area_test
 from prbayes.validation.cross_validation import cross_validate as cross_validate

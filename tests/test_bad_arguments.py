@@ -109,6 +109,7 @@ validity = Later(validity_test)
 by_specimen = Later(lambda: simulated(metric=prb.LogLikelihood(), propagation=prb.Reweighted(64)))
 at_optimum = Later(lambda: prb.minimize(by_specimen(), starts=0, **QUIET))
 specimens = Later(lambda: prb.individuals(at_optimum(), n_draws=20))
+residuals = Later(lambda: prb.residuals(at_optimum(), n_draws=20))
 surrogate = Later(lambda: prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET))
 
 
@@ -595,6 +596,12 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         level=(1, 9, 2.5),
     ),
     "plots.plot_individuals": Row({"individuals": specimens}, individuals=(posterior, comparison)),
+    "plots.plot_predictive_check": Row(
+        {"individuals": specimens},
+        individuals=(posterior, comparison, specimens),  # readings without a horizontal axis
+        own="individuals",
+    ),
+    "plots.plot_residuals": Row({"residuals": residuals}, residuals=(posterior, specimens)),
     "plots.plot_prediction": Row(
         observed=("a", None, [], np.ones((3, 2)), {"a": [1.0]}),
         predicted=(3, None, np.ones((2, 3)), {"a": 3}),
@@ -609,6 +616,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         validation=([1.0], {"zz": [1.0]}, {"a": []}, {"a": np.ones((3, 2))}),
     ),
     "individuals": Row(
+        {"result": at_optimum, "model": by_specimen},
+        result=(None, 3, "result", xr.DataTree(), []),
+        own="result",
+    ),
+    "residuals": Row(
         {"result": at_optimum, "model": by_specimen},
         result=(None, 3, "result", xr.DataTree(), []),
         own="result",

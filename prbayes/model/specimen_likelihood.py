@@ -374,33 +374,19 @@ def draw_readings(
     If n is the number of a simulator's rows, repeated readings have common inputs. NaN in a
     population of which next to nothing has a response.
     """
-    emulation, size = prepared(likelihood).emulation, len(next(iter(values.values())))
     numbers = np.arange(len(likelihood.readings))
     if measurement is not None:
         numbers = specimen_numbers(likelihood, measurement)
     # Observed specimens whose groups and covariates the drawn specimens have.
     like = np.resize(numbers, n)
-    conditions, groups = likelihood.stacked.conditions, likelihood.stacked.groups
-    conditions = None if conditions is None else conditions[like]
-    by_group = rows_by_group(None if groups is None else groups[like], n)
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
         specimens = first[inverse]
 
     def draw_outputs() -> Floats:
-        inputs: list[Floats] = []
-        for group, columns in by_group:
-            parents = likelihood.parents(values, group, like[columns])
-            drawn, _ = likelihood.density.sampler(parents, len(columns), rng)
-            inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
-            for whole, part in zip(inputs, drawn, strict=True):
-                whole[:, columns] = part
-        inputs = at_conditions(likelihood.inputs, inputs, conditions)
-        flat = [x[:, specimens].reshape(-1, *x.shape[2:]) for x in inputs]
-        # Beyond the runs' range the response is that at the end of the range.
-        z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
-        return emulation.values(z).reshape(size, n, -1)
+        inputs = population_inputs(likelihood, values, like, rng)
+        return response_at(likelihood, [x[:, specimens] for x in inputs])
 
     outputs = draw_outputs()
     # Specimens without a response are drawn again, because they would not be measured.
@@ -415,7 +401,7 @@ def draw_readings(
         like_read = unit_readings(measurement)
 
     def read(outputs: Floats) -> Floats:
-        return _with_reading_errors(rng, outputs[..., columns], like_read, measurements, values)
+        return read_outputs(rng, outputs[..., columns], like_read, measurements, values)
 
     readings = read(outputs)
     selection = selection_of(measurements)
@@ -425,10 +411,45 @@ def draw_readings(
         if not is_unseen.any():
             break
         readings[is_unseen] = read(draw_outputs())[is_unseen]
-    return readings if measurement is None else readings.reshape(size, n, *measurement.event)
+    return readings if measurement is None else readings.reshape(-1, n, *measurement.event)
 
 
-def _with_reading_errors(
+def population_inputs(
+    likelihood: SpecimenLikelihood,
+    values: Mapping[str, Floats],
+    like: Indices,
+    rng: np.random.Generator,
+) -> list[Floats]:
+    """Draw the inputs of n specimens of each population, (P, n, *event) by input.
+
+    ``like``, (n,), are the observed specimens whose group and known values the drawn ones have.
+    """
+    groups, n = likelihood.stacked.groups, len(like)
+    inputs: list[Floats] = []
+    for group, columns in rows_by_group(None if groups is None else groups[like], n):
+        parents = likelihood.parents(values, group, like[columns])
+        drawn, _ = likelihood.density.sampler(parents, len(columns), rng)
+        inputs = inputs or [np.empty((len(x), n, *x.shape[2:])) for x in drawn]
+        for whole, part in zip(inputs, drawn, strict=True):
+            whole[:, columns] = part
+    conditions = likelihood.stacked.conditions
+    return at_conditions(
+        likelihood.inputs, inputs, None if conditions is None else conditions[like]
+    )
+
+
+def response_at(likelihood: SpecimenLikelihood, inputs: Sequence[Floats]) -> Floats:
+    """Return the emulated outputs of all simulators at inputs (P, n, *event), (P, n, M).
+
+    Beyond the range of the runs the response is that at the end of the range.
+    """
+    emulation = prepared(likelihood).emulation
+    flat = [x.reshape(-1, *x.shape[2:]) for x in inputs]
+    z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
+    return np.asarray(emulation.values(z)).reshape(*inputs[0].shape[:2], -1)
+
+
+def read_outputs(
     rng: np.random.Generator,
     outputs: Floats,
     readings: Readings,

@@ -8,6 +8,8 @@ from prbayes.plots.outputs import plot_outputs
 from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.prediction import plot_prediction
+from prbayes.plots.predictive_check import plot_predictive_check
+from prbayes.plots.residuals import plot_residuals
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.validity import plot_validity
@@ -21,6 +23,8 @@ __all__ = [
     "plot_population",
     "plot_posterior",
     "plot_prediction",
+    "plot_predictive_check",
+    "plot_residuals",
     "plot_responses",
     "plot_sensitivity",
     "plot_stages",

@@ -86,15 +86,7 @@ def plot_individuals(
     """
     check_options(labels, pc_kwargs)
     share(prob, "prob")
-    trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
-    groups = {name: tree.to_dataset() for name, tree in trees.items()}
-    draws = groups.get("posterior", xr.Dataset())
-    has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
-    if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
-        raise TypeError(
-            f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
-            "returns"
-        )
+    groups = groups_of(individuals)
     dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
     groups = {name: subset(group, coords, dims) for name, group in groups.items()}
     observed, replicates = groups["observed_data"], groups["posterior_predictive"]
@@ -120,6 +112,20 @@ def plot_individuals(
             _draw_curve(axis, observed[name], replicates[name], prob)
             axis.set_xlabel(named(str(observed[name].dims[-1]), labels))
     return finish(figure)
+
+
+def groups_of(individuals: object) -> dict[str, xr.Dataset]:
+    """Return the groups of the result of `individuals`, or raise if it is none."""
+    trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
+    groups = {name: tree.to_dataset() for name, tree in trees.items()}
+    draws = groups.get("posterior", xr.Dataset())
+    has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
+    if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
+        raise TypeError(
+            f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
+            "returns"
+        )
+    return groups
 
 
 def _draw_inputs(axis: Axes, draws: Floats, prob: float) -> None:

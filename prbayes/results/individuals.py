@@ -22,9 +22,6 @@ from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
 from prbayes.results.products import model_of_product, one_posterior
 
-# distribution of inputs whose shrinkage is that of their logarithms
-_LOG_NORMAL = type(pm.LogNormal.rv_op)
-
 
 @locked
 def individuals(
@@ -88,14 +85,7 @@ def individuals(
     array([0.  , 0.5 , 1.25, 2.  , 1.5 , 0.75])
     """
     positive_integer(n_draws, "n_draws")
-    result = one_posterior(result, "prb.individuals")
-    model = model_of_product(result, model_of(result, model, "prb.individuals"))
-    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
-    if not likelihoods:
-        raise TypeError(
-            "prb.individuals: got a model whose metrics compare distributions, expected a "
-            "prb.Simulator with metric=prb.LogLikelihood(), which has a record of each specimen"
-        )
+    result, model, likelihoods = individuals_of(result, model, "prb.individuals")
     points, coords = populations_of(result, model, n_draws, "prb.individuals", copies=n_draws)
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
@@ -120,7 +110,7 @@ def individuals(
                 array = xr.DataArray(conditions[position], specimens, tuple(specimens))
                 groups["constant_data"][name + suffix] = array
                 continue
-            is_log = isinstance(likelihood.inputs.aleatory[position].owner.op, _LOG_NORMAL)
+            is_log = is_log_normal(likelihood.inputs.aleatory[position])
             shrinkage = _shrinkage(values, population[position], is_log=is_log)
             array = _array(name, values, coords | specimens)
             groups["posterior"][name + suffix] = array.assign_attrs(shrinkage=shrinkage.tolist())
@@ -138,6 +128,21 @@ def individuals(
             groups["observed_data"][m.name] = observed
     datasets = {name: xr.Dataset(arrays) for name, arrays in groups.items() if arrays}
     return Individuals.from_dict(datasets)
+
+
+def individuals_of(
+    result: Optimum | xr.DataTree, model: pm.Model | None, caller: str
+) -> tuple[Optimum | xr.DataTree, pm.Model, list[SpecimenLikelihood]]:
+    """Return a result, its model, and the likelihoods that have a record of each specimen."""
+    result = one_posterior(result, caller)
+    model = model_of_product(result, model_of(result, model, caller))
+    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
+    if not likelihoods:
+        raise TypeError(
+            f"{caller}: got a model whose metrics compare distributions, expected a "
+            "prb.Simulator with metric=prb.LogLikelihood(), which has a record of each specimen"
+        )
+    return result, model, list(likelihoods)
 
 
 class Individuals(Tree):
@@ -181,6 +186,11 @@ class Individuals(Tree):
         ]
         header = ["", "mean", "sd", f"{INTERVAL:.0%} interval"]
         return View("Inputs of the measured specimens", header, rows, sentences)
+
+
+def is_log_normal(x: Any) -> bool:
+    """Return whether the shrinkage and the eta of an input are those of its logarithm."""
+    return isinstance(x.owner.op, type(pm.LogNormal.rv_op))
 
 
 def _shrinkage(values: Floats, population: Floats, *, is_log: bool) -> Floats:

@@ -109,9 +109,8 @@ def test_each_combination_of_arguments_describes_the_readings_or_is_refused() ->
         options = dict(zip(arguments, values, strict=True))
         try:
             accepted.append(LogLikelihood(**options))
-        except ValueError as error:
+        except ValueError:
             refused.append(options)
-            assert str(error).startswith("LogLikelihood: ")
     assert any(metric.gross_errors is variable for metric in accepted)
     assert not any(metric.gross_errors is variable and metric.selected for metric in accepted)
     assert not any(metric.bias is variable and metric.error is None for metric in accepted)
