@@ -75,6 +75,14 @@ def lines() -> Callable[[str], None]:
     return write
 
 
+def announce(text: str, *, visible: bool) -> None:
+    """Print a text above the bars of long work; log it where they are hidden or cannot move."""
+    if visible and live() and not _hidden.get():
+        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+    else:
+        _log.info(text)
+
+
 @contextmanager
 def shown(visible: bool) -> Iterator[bool]:
     """Show inner bars only if ``visible`` here and in all outer calls; yield whether they show."""

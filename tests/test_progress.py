@@ -12,7 +12,7 @@ from rich.console import Console
 
 import prbayes as prb
 import prbayes._progress
-from prbayes._progress import _expected, progress, shown
+from prbayes._progress import _expected, announce, progress, shown
 
 
 @pytest.fixture
@@ -114,6 +114,18 @@ def test_a_sampler_without_a_terminal_says_where_it_is(
     said = [line for line in log.getvalue().splitlines() if line.startswith("SMC")]
     assert said[-1].endswith(" chain 2 of 2: beta 1 of 1")
     assert said[0].startswith("SMC stages 1 chain 1 of 2: beta 0.")
+
+
+def test_a_text_is_printed_above_the_bars_or_logged(
+    screen: io.StringIO, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", logger="prbayes"):
+        announce("[why]", visible=True)
+        assert (screen.getvalue(), caplog.messages) == ("[why]\n", [])
+        announce("not asked for", visible=False)
+        with shown(False):
+            announce("hidden", visible=True)
+    assert (screen.getvalue(), caplog.messages) == ("[why]\n", ["not asked for", "hidden"])
 
 
 def test_the_seconds_left_are_those_at_the_pace_so_far() -> None:

@@ -13,7 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import Finding, Findings, report
-from prbayes._progress import shown
+from prbayes._progress import announce, shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
@@ -165,6 +165,7 @@ def draw_posterior(
             target = posterior_target(evaluator, optimum)
             modes = modes_of(target.log_posterior, target.starts, target.scale)
             if modes is None:
+                announce("No mode of the posterior was found.", visible=settings.progressbar)
                 break
             chains = importance_chains(target, modes, settings)
             if chains is None:
@@ -187,6 +188,8 @@ def draw_posterior(
                 break
             evaluator = latest
         if chains is None:
+            text = "The posterior is drawn by sequential Monte Carlo, from the prior."
+            announce(text, visible=settings.progressbar)
             return smc.sample(evaluator, settings)
         if modes is not None:
             findings += report(*mode_findings(target, modes, chains.thetas))
@@ -226,6 +229,13 @@ def importance_chains(
     options = ImportanceOptions()
     sample = importance_sample(target.log_posterior, modes, size, seed, options, prior)
     if not sample.is_reliable:
+        limit = options.effective * size
+        announce(
+            f"Importance sampling is not reliable: {sample.effective_size:.0f} effective draws, "
+            f"at least {limit:.0f} needed, and Pareto k {sample.pareto_k:.2f}, at most "
+            f"{options.pareto_k:g} needed.",
+            visible=settings.progressbar,
+        )
         return None
     log_prior = hyperparameters.log_prior(sample.draws)
     coords = {"chain": np.arange(settings.chains), "draw": np.arange(settings.draws)}
@@ -248,6 +258,8 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
+    text = f"The posterior is drawn by NUTS, in {settings.chains} chains from its mode."
+    announce(text, visible=settings.progressbar)
     # A step that overflows is a divergence, and not an error.
     with evaluator.model, np.errstate(over="ignore"):
         idata = pm.sample(
@@ -265,6 +277,9 @@ def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings
     if settings.chains > 1:
         r_hat = import_module("arviz").rhat(posterior).to_array().max()
         if not r_hat <= 1.1:  # because chains are in different modes
+            announce(
+                f"The chains of NUTS disagree: R-hat {r_hat:.2f}.", visible=settings.progressbar
+            )
             return None
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])

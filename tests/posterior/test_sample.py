@@ -95,9 +95,14 @@ def _unreliable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_unreliable")
-def test_unreliable_importance_sampling_is_replaced() -> None:
-    result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
+def test_unreliable_importance_sampling_is_replaced(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="prbayes"):
+        result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
+    reasons = [text for text in caplog.messages if "runs at first" not in text]
+    assert reasons[0].startswith("Importance sampling is not reliable: ")
+    assert "at least 100000 needed" in reasons[0]
+    assert reasons[1] == "The posterior is drawn by NUTS, in 2 chains from its mode."
     require_exact(result, offset=0.3, widths=(0.8, 1.2))
     result = prb.sample(50, chains=1, model=linear_model(metric=DIVERGENCE), progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
@@ -105,10 +110,15 @@ def test_unreliable_importance_sampling_is_replaced() -> None:
 
 
 @pytest.mark.usefixtures("_unreliable")
-def test_chains_of_nuts_that_disagree_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chains_of_nuts_that_disagree_are_replaced(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     arviz = import_module("arviz")
     monkeypatch.setattr(arviz, "rhat", lambda posterior: posterior.mean() * 0 + 1.5)
-    result = prb.sample(50, chains=2, model=linear_model(), progressbar=False)
+    with caplog.at_level("INFO", logger="prbayes"):
+        result = prb.sample(50, chains=2, model=linear_model(), progressbar=False)
+    assert "The chains of NUTS disagree: R-hat 1.50." in caplog.messages
+    assert "The posterior is drawn by sequential Monte Carlo, from the prior." in caplog.messages
     assert result.posterior.attrs["sampler"] == "SMC"
 
 
