@@ -158,7 +158,8 @@ def exceedance(
     of all by halved steps; one that is much narrower is not found. The result of the calibration is
     the same at all values: vary a constant that the calibration also used there.
 
-    Probabilities are those of specimens that have a response: NaN are left out, and reported.
+    Probabilities are those of specimens that have a response: NaN are left out, and reported. All
+    of them may be within or beyond the limit, so that the interval is wider by their share.
 
     If the data do not separate a population of ``prbayes.families`` from a simpler one, the finding
     ``two-families`` has the probability and the verdict under the latter.
@@ -327,7 +328,8 @@ class _Estimate:
         """Return the interval over populations, with a bound where no or every point counts.
 
         If no (or every) point exceeds the limit, the upper (lower) end is the one-sided bound of
-        that share.
+        that share. Specimens without response are within the limit at the lower end, and beyond it
+        at the upper end.
         """
         low, high = self.of_populations(prob)
         least, most = probability_bounds(self.mean, self.error, (1 - prob) / 2)
@@ -335,12 +337,16 @@ class _Estimate:
             low = least
         if self.mean == 0:
             high = most
-        return np.array([low, high])
+        return self._of_all(np.array([low, high]))
 
     def interval_with_error(self, prob: float) -> Floats:
         """Return the interval over populations, wider by two standard errors on both sides."""
         margins = probability_bounds(self.mean, self.error, float(ndtr(-2))) - self.mean
-        return np.clip(self.of_populations(prob) + margins, 0.0, 1.0)
+        return self._of_all(np.clip(self.of_populations(prob) + margins, 0.0, 1.0))
+
+    def _of_all(self, interval: Floats) -> Floats:
+        """Return the interval of all specimens from that of those with a response."""
+        return np.asarray(interval * (1 - self.lost) + [0.0, self.lost])
 
     def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
         """Return whether the error is above a share of the interval's distance to a requirement."""
@@ -501,7 +507,8 @@ def _error_findings(
     if lost >= SMALLEST_SHARE:
         text = (
             f"{name}: {lost:.1%} of specimens {NO_RESPONSE}: the probability is that of the "
-            "others. A response that returns +inf counts as a specimen that failed."
+            "others, and the upper end of the interval counts all of them as beyond the limit. A "
+            "response that returns +inf counts as a specimen that failed."
         )
         page = "distributed.md#when-a-response-fails"
         findings.append(Finding("specimens-left-out", text, page))

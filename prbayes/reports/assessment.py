@@ -62,7 +62,13 @@ def verdict(m: Material) -> list[Section]:
         tests = m.tests.values()
         p = enumerated([f"{t.p_value:.{p_digits(t.p_value, t.alpha)}g}" for t in tests])
         text.append(f"Measurements of {_tested(m)} agree with the model (p = {p}).")
-        text.append("Small errors can remain.")
+        count = max(np.unique(t.specimens).size for t in tests)
+        # A shift by 1.96 standard errors is found by at most half of all tests with alpha = .05.
+        shift = 1.96 / np.sqrt(count)
+        text.append(
+            f"A shift of the mean by {shift:.1f} standard deviations of the specimens can remain "
+            "unseen."
+        )
     if m.results and mark != "bad" and None in m.diagnoses.values():
         text.append("Not all results were diagnosed: that needs the model.")
     questions = {x: t for x, t in m.decisions.items() if kind_of_decision(t) == "risk"}

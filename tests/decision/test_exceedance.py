@@ -254,6 +254,21 @@ def test_specimens_without_response_are_left_out_and_reported(points: int) -> No
         assert finding.code == "specimens-left-out"
         percent = float(re.findall(r"([\d.]+)% of specimens have no", finding.text)[0])
         assert percent == pytest.approx(100 * lost, rel=0.5)
+        # The specimens without response are within the limit, or all beyond it.
+        low, high = np.nanquantile(table.by_draw, [0.055, 0.945])
+        assert float(table.lower) == pytest.approx(low * (1 - percent / 100), rel=1e-3)
+        assert float(table.upper) == pytest.approx(
+            high * (1 - percent / 100) + percent / 100, rel=1e-3
+        )
+
+
+def test_a_requirement_counts_specimens_without_response() -> None:
+    at = float((MU + 1.8 * SIGMA).mean())  # 3.8 % of the specimens are above
+    answers = {
+        response: ask(at, response, requirement=0.02, n_points=0).attrs["verdict"]
+        for response in (lambda x: np.where(x > at, np.nan, x), lambda x: np.minimum(x, at))
+    }
+    assert list(answers.values()) == ["not decided", "met"]
 
 
 def test_probabilities_stay_between_zero_and_one() -> None:

@@ -209,6 +209,7 @@ def test_problems_are_counted_on_page_one(calibrated: Any, section: Any) -> None
     assert re.fullmatch(r"The calculation has \d problems? \(see Diagnostics\)\..*", front.text[0])
     p = f"{calibrated.test.p_value:.2g}"
     assert re.fullmatch(rf"Measurements of .* agree with the model \(p = {p}\)\.", front.text[1])
+    assert "A shift of the mean by " in front.text[2]
     finding = Finding("not-identified", "The data do not see mu.")
     posterior["posterior"].attrs["findings"] = as_json([finding])
     again = prb.Report("x", posterior=posterior, pictures=False)
