@@ -38,6 +38,7 @@ from prbayes.model.parameters import split_elements, table_elements, variables_a
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.numerics.modes import rows_by_mode
 from prbayes.optimize.optimum import Optimum
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import refuse_uncallable
 from prbayes.results.predict import call_settings
 
@@ -205,6 +206,8 @@ def plan(
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()
     }
+    for condition in candidates.values():
+        findings += findings_of(condition.response)
     sd, specimens = [], []
     for name, condition in candidates.items():
         information = [
@@ -229,7 +232,7 @@ def plan(
         coords={"candidate": list(candidates), "k": numbers, "name": list(now)},
         attrs={
             "responses": count,
-            "findings": as_json(findings),
+            "findings": as_json(dict.fromkeys(findings)),
             **({} if quantity is None else {"quantity": repr(quantity), "value_error": error}),
             **populations.provenance(),
         },

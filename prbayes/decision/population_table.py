@@ -150,6 +150,11 @@ def population(
             "one partition; ask for one input at a time"
         )
     n_groups = max(map(len, groups.values()), default=1)
+    # The table has other coordinates of these names.
+    groups = {
+        f"{dim}_group" if dim in ("name", "quantity", "unit") else dim: labels
+        for dim, labels in groups.items()
+    }
     # (3, elements, groups, quantities): estimates, lower and upper ends
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     for i, x in enumerate(elements):

@@ -95,7 +95,11 @@ class Smooth:
         length = farthest / 2 if self.length is None else float(self.length)
         # The grid has at least ten points in a default length scale.
         grid = np.linspace(low, high, 101)
-        nodes = np.concatenate([np.unique(seen), grid])
+        conditions = np.unique(seen)
+        # More conditions than the grid has determine no further terms.
+        chosen = np.linspace(0, len(conditions) - 1, min(len(conditions), len(grid)))
+        conditions = conditions[chosen.round().astype(np.intp)]
+        nodes = np.concatenate([conditions, grid])
         size = len(nodes) - len(grid)
         covariance = rational_quadratic(nodes, nodes, length)
         of_data = whitening(covariance[:size, :size], 1e-6)

@@ -183,6 +183,8 @@ def terms_of(discrepancy: Any, conditions: Any) -> Any:
         (prb.response.Smooth(0.0), np.array([20.0, 1000.0])),
         (prb.response.Smooth(-1.0, length=0.4, reach=0.3), np.linspace(0, 2, 40)),
         (prb.response.Smooth(0.5), LOADS[[0, 0, 1, 3]]),
+        (prb.response.Smooth(0.0), np.linspace(0, 5, 4000)),
+        (prb.response.Smooth(1e6), LOADS),
     ],
 )
 def test_a_smooth_shape_expands_its_process(shape: Any, conditions: Any) -> None:
@@ -267,3 +269,65 @@ def test_conditions_beyond_the_range_of_a_smooth_shape_are_refused(condition: An
 def test_the_free_shape_without_conditions_is_refused_as_a_function() -> None:
     with pytest.raises(TypeError, match="expected a function of the condition"):
         prb.response.Additive(LOADS, 3.0)  # type: ignore[arg-type]
+
+
+def draws_of(**values: Any) -> xr.DataTree:
+    """A posterior with the given draws, (draw, ...)."""
+    variables = {
+        name: (("chain", "draw", f"{name}_dim")[: x.ndim + 1], x[None])
+        for name, x in values.items()
+    }
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
+
+
+def test_decisions_say_that_they_extrapolate() -> None:
+    drift = prb.response.Additive([0.0, 2.0])
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        b = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        prb.Simulator(
+            "y", drift.of(lambda: 2.0, 2.0), b, observed=rng.normal(3, 0.3, 20),
+            metric=prb.AreaMetric(), propagation=prb.Reweighted(256),
+        )  # fmt: skip
+    result = draws_of(mu=rng.normal(1, 0.05, 50))
+    for condition in (2.0, 3.0):
+        response = drift.of(lambda: 2.0, condition)
+        quantity = prb.decision.Mean(response, b)
+        later = {"later": prb.decision.Condition(response, b)}
+        tables: list[Any] = [
+            prb.exceedance(result, response, 3.0, b, model=model),
+            prb.sensitivity(result, quantity, model=model, n_points=64),
+            prb.plan(result, later, model=model, quantity=quantity),
+            prb.plan(result, later, model=model),
+            prb.decision.p_box(result, response, b, model=model),
+        ]
+        for table in tables:
+            codes = [f.code for f in from_json(table.attrs["findings"])]
+            assert codes.count("extrapolated-discrepancy") == int(condition == 3.0)
+            assert ("extrapolates its model discrepancy" in str(table)) is (condition == 3.0)
+
+
+def test_a_discrepancy_that_all_specimens_share_is_that_of_each_population() -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    (m,) = discrepancy.event
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        b = pm.Normal("b", 0, 1, shape=m)
+        with pytest.raises(TypeError, match="goes into the response as a model variable"):
+            prb.Simulator("y", discrepancy.of(line, 1.0), x, b, observed=[1.0, 2.0, 3.0])
+        prb.Simulator("y", line, x, observed=[1.0, 2.0, 3.0], metric=prb.AreaMetric())
+    mu, coefficients = rng.normal(size=8), rng.normal(size=(8, m))
+    result = draws_of(mu=mu, b=coefficients)
+    for condition in (1.25, 3.0):
+        response = discrepancy.of(line, condition)
+        predicted = prb.predict(result, response, x, b, model=model, n_samples=512, random_seed=1)
+        expected = 2 * mu + coefficients @ terms_of(discrepancy, condition)
+        np.testing.assert_allclose(predicted.mean("sample")[0], expected, atol=0.01)
+        np.testing.assert_allclose(predicted.std("sample")[0], 0.6, rtol=0.02)
+        codes = {f.code for f in from_json(predicted.attrs["findings"])}
+        assert ("extrapolated-discrepancy" in codes) is (condition == 3.0)
+        with pytest.raises(TypeError, match=r"expected the \.dist\(\) objects .* prb.predict"):
+            prb.exceedance(result, response, 3.0, x, b, model=model)
+        with pytest.raises(TypeError, match="compute shares from"):
+            prb.exceedance(result, response, 3.0, x, b, model=model, n_points=100)
