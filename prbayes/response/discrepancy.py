@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,7 @@ class Smooth:
     """
 
     zero_at: float
+    _: KW_ONLY
     length: float | None = None
     reach: float = 0.5
 
@@ -87,28 +88,33 @@ class Smooth:
     def expansion(self, seen: Floats) -> Expansion:
         """Return the orthogonal expansion of the process for conditions with data, (n,)."""
         zero = float(self.zero_at)
-        farthest = float(np.abs(seen - zero).max())
+        conditions = np.unique(seen)
+        first = float(conditions[0])
+        last = float(conditions[-1])
+        farthest = max(abs(first - zero), abs(last - zero))
         margin = self.reach * farthest
         # A zero that is not between conditions is an end of the range.
-        low = zero if zero <= seen.min() else float(seen.min()) - margin
-        high = zero if zero >= seen.max() else float(seen.max()) + margin
+        low = zero if zero <= first else first - margin
+        high = zero if zero >= last else last + margin
         length = farthest / 2 if self.length is None else float(self.length)
         # The grid has at least ten points in a default length scale.
         grid = np.linspace(low, high, 101)
-        conditions = np.unique(seen)
         # More conditions than the grid has determine no further terms.
-        chosen = np.linspace(0, len(conditions) - 1, min(len(conditions), len(grid)))
+        size = min(len(conditions), len(grid))
+        chosen = np.linspace(0, len(conditions) - 1, size)
         conditions = conditions[chosen.round().astype(np.intp)]
         nodes = np.concatenate([conditions, grid])
-        size = len(nodes) - len(grid)
-        covariance = rational_quadratic(nodes, nodes, length)
-        of_data = whitening(covariance[:size, :size], 1e-6)
-        at_grid = covariance[size:, :size] @ of_data
+        covariance = rational_quadratic(conditions, conditions, length)
+        of_data = whitening(covariance, 1e-6)
+        at_grid = rational_quadratic(grid, conditions, length) @ of_data
         # The other terms are those of the process less its regression on the first ones.
-        of_rest = whitening(covariance[size:, size:] - at_grid @ at_grid.T, 0.05)
+        explained = at_grid @ at_grid.T
+        rest = rational_quadratic(grid, grid, length) - explained
+        of_rest = whitening(rest, 0.05)
         regression = of_data @ at_grid.T @ of_rest
-        lower = np.concatenate([np.zeros((len(grid), of_data.shape[1])), of_rest], axis=1)
         upper = np.concatenate([of_data, -regression], axis=1)
+        zeros = np.zeros_like(at_grid)
+        lower = np.concatenate([zeros, of_rest], axis=1)
         weights = np.concatenate([upper, lower])
         return Expansion(zero, farthest, length, low, high, nodes, weights)
 
@@ -129,21 +135,29 @@ class Expansion:
         """Return the m terms at conditions, (...) -> (..., m)."""
         at = np.asarray(condition, dtype=np.float64)
         margin = 1e-9 * (self.high - self.low)
-        if (at < self.low - margin).any() or (at > self.high + margin).any():
+        lowest = self.low - margin
+        highest = self.high + margin
+        is_below = at < lowest
+        is_above = at > highest
+        if (is_below | is_above).any():
             raise ValueError(
                 f"prb.response.Smooth: condition: got {at.min():g} to {at.max():g}, expected "
                 f"conditions from {self.low:g} to {self.high:g}, where the shape is defined; pass "
                 "a larger reach="
             )
-        terms = rational_quadratic(at.ravel(), self.nodes, self.length) @ self.weights
+        covariance = rational_quadratic(at.ravel(), self.nodes, self.length)
+        terms = covariance @ self.weights
+        terms = terms.reshape(*at.shape, -1)
         distance = (at - self.zero) / self.farthest
-        return np.asarray(distance[..., None] * terms.reshape(*at.shape, -1))
+        return np.asarray(distance[..., None] * terms)
 
 
 def rational_quadratic(first: Floats, second: Floats, length: float) -> Floats:
     """Return the rational quadratic covariance of conditions, (n,) and (k,) -> (n, k)."""
-    distance = (first[:, None] - second) / length
-    return np.asarray(1 / (1 + 0.5 * distance**2))
+    difference = first[:, None] - second
+    distance = difference / length
+    ratio = 0.5 * distance**2
+    return np.asarray(1 / (1 + ratio))
 
 
 def whitening(covariance: Floats, dropped: float) -> Floats:
@@ -152,14 +166,19 @@ def whitening(covariance: Floats, dropped: float) -> Floats:
     The others have at most the variance ``dropped`` in each element.
     """
     values, vectors = np.linalg.eigh(covariance)
-    values, vectors = np.maximum(values[::-1], 1e-300), vectors[:, ::-1]
+    values = np.maximum(values[::-1], 1e-300)
+    vectors = vectors[:, ::-1]
     explained = np.cumsum(values * vectors**2, axis=1)
-    lost = (covariance.diagonal()[:, None] - explained).max(axis=0)
+    variance = covariance.diagonal()[:, None]
+    lost = (variance - explained).max(axis=0)
     count = 1 + int((lost > dropped).sum())
     # The sign is fixed, so that coefficients keep their meaning on other machines.
     largest = np.abs(vectors).argmax(axis=0)
-    signs = np.sign(vectors[largest, np.arange(len(values))])
-    return np.asarray((vectors * signs)[:, :count] / np.sqrt(values[:count]))
+    columns = np.arange(len(values))
+    signs = np.sign(vectors[largest, columns])
+    scales = np.sqrt(values)
+    weights = vectors * signs / scales
+    return np.asarray(weights[:, :count])
 
 
 class ModelDiscrepancy(ABC):
