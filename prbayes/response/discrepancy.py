@@ -69,8 +69,8 @@ class Smooth:
     >>> import numpy as np, prbayes as prb
     >>> stiffening = prb.response.Additive([0.5, 1.0, 2.0], prb.response.Smooth(zero_at=0.0))
     >>> stiffening.event
-    (4,)
-    >>> stiffening.value(np.ones(4), 0.0)
+    (5,)
+    >>> stiffening.value(np.ones(5), 0.0)
     array(0.)
     """
 
