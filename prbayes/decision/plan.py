@@ -206,8 +206,7 @@ def plan(
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()
     }
-    for condition in candidates.values():
-        findings += findings_of(condition.response)
+    findings = _with_findings_of(candidates, findings)
     sd, specimens = [], []
     for name, condition in candidates.items():
         information = [
@@ -232,11 +231,20 @@ def plan(
         coords={"candidate": list(candidates), "k": numbers, "name": list(now)},
         attrs={
             "responses": count,
-            "findings": as_json(dict.fromkeys(findings)),
+            "findings": as_json(findings),
             **({} if quantity is None else {"quantity": repr(quantity), "value_error": error}),
             **populations.provenance(),
         },
     )
+
+
+def _with_findings_of(candidates: Mapping[str, Condition], findings: Findings) -> Findings:
+    """Return findings and those of the candidates' responses, each once."""
+    of_candidates = [findings_of(condition.response) for condition in candidates.values()]
+    distinct = dict.fromkeys(findings)
+    for of_response in of_candidates:
+        distinct.update(dict.fromkeys(of_response))
+    return tuple(distinct)
 
 
 def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
