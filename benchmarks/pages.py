@@ -123,6 +123,18 @@ def tails() -> Iterator[Row]:
         ]
 
 
+def discrepancy() -> Iterator[Row]:
+    """Yield coverage and widths by the free shape and by the line, by true discrepancy."""
+    figures = summary("discrepancy")
+    for truth in ("stiffening", "saturating", "periodic", "none"):
+        row = [truth]
+        for place in ("within", "beyond"):
+            for kind in ("smooth", "line"):
+                cell = figures[f"{truth}/{kind}"]
+                row.append(f"{short(cell['inside'][place])} ({cell['width'][place]:.3g})")
+        yield row
+
+
 def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
     for problem, checks in summary("likelihood_guards").items():
@@ -641,6 +653,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "tails": tails,
+    "discrepancy": discrepancy,
     "kinds of readings": kinds_of_readings,
     "selection": selection,
     "gross errors": gross_errors,

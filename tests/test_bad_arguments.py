@@ -323,6 +323,9 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         units=({"nothing": "mm"}, {"x": 3}, {3: "mm"}),
         own="observed",
     ),
+    "response.Smooth": Row(
+        {"zero_at": 0.0}, zero_at=(np.nan, np.inf, "a", True), length=POSITIVE, reach=POSITIVE
+    ),
     "Summary": Row(
         {"n": 20, "mean": 2.0, "sd": 1.0, "minimum": 0.0, "maximum": 4.0, "quantiles": {0.5: 2.1}},
         n=(1, 2.5, None),

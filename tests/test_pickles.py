@@ -85,6 +85,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "response.Replace": lambda: prb.response.Replace(1.0),
     "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),
     "response.Retry": lambda: prb.response.Retry(2),
+    "response.Smooth": lambda: prb.response.Smooth(0.0),
     "response.StoreError": lambda: prb.response.StoreError("y: store"),
     "scalar": lambda: prb.scalar(abs),
     "surrogate.CrossValidation": lambda: surrogate().error,

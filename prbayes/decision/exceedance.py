@@ -50,6 +50,7 @@ from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import Responses
 from prbayes.results.predict import call_settings
 
@@ -200,6 +201,7 @@ def exceedance(
     settings = _Settings(prob, requirement, steps, n_points)
     places, estimates, n_searched = question.over_intervals(settings)
     findings, n_nested = question.compared(estimates, settings)
+    findings += findings_of(response)
     intervals = np.array([estimate.interval(prob) for estimate in estimates])
     bounds = [choose(estimates, key=lambda estimate: estimate.mean) for choose in (min, max)]
     # A probability is rough if two standard errors are about a factor of two, or would decide the
@@ -444,7 +446,7 @@ def _rare_probability(
         raise TypeError(
             f"prb.exceedance: {responses.name}: got a model variable as an input, expected "
             ".dist() objects and constants; take the .dist() objects of the model, or "
-            "prb.decision.Interval"
+            "prb.decision.Interval, or compute shares from prb.predict"
         )
     evaluator = populations.evaluator
     values = variables_at(evaluator.hyperparameters, populations.thetas)

@@ -10,6 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
+from prbayes._finding import as_json, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
 from prbayes._validate import Floats, Function, StrPath, positive_integer, share
 from prbayes.decision.populations import (
@@ -23,6 +24,7 @@ from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import refuse_uncallable
 from prbayes.results.predict import call_settings
 
@@ -87,7 +89,7 @@ def p_box(
         include: of smaller tails ask `exceedance`. Where no point is below y, or none above, the
         bands have the bound of the effective number of points. It prints as quantiles; a notebook
         shows a table. Attributes: ``prob``, ``response`` (its name), ``responses`` (number
-        computed) and ``identity``.
+        computed), ``findings`` (as JSON) and ``identity``.
 
     Raises
     ------
@@ -156,6 +158,7 @@ def p_box(
             "prob": prob,
             "response": response_name(response),
             "responses": n_searched + sum(sample.responses.count for sample in samples),
+            "findings": as_json(findings_of(response)),
             **populations.provenance(),
         },
     )
@@ -180,7 +183,8 @@ class ProbabilityBox(Table):
             rows.append(row)
         prob = percentage(self.attrs["prob"])
         heading = f"Distribution of {self.attrs['response']}, with {prob} bands"
-        return View(heading, ["", "new specimen", "pointwise", "simultaneous"], rows)
+        columns = ["", "new specimen", "pointwise", "simultaneous"]
+        return View(heading, columns, rows, sentences_of(self.attrs))
 
 
 def _place(function: Floats, y: Floats, probability: float) -> float:

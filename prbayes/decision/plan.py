@@ -38,6 +38,7 @@ from prbayes.model.parameters import split_elements, table_elements, variables_a
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.numerics.modes import rows_by_mode
 from prbayes.optimize.optimum import Optimum
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import refuse_uncallable
 from prbayes.results.predict import call_settings
 
@@ -205,6 +206,7 @@ def plan(
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
         for name, condition in candidates.items()
     }
+    findings = _with_findings_of(candidates, findings)
     sd, specimens = [], []
     for name, condition in candidates.items():
         information = [
@@ -234,6 +236,15 @@ def plan(
             **populations.provenance(),
         },
     )
+
+
+def _with_findings_of(candidates: Mapping[str, Condition], findings: Findings) -> Findings:
+    """Return findings and those of the candidates' responses, each once."""
+    of_candidates = [findings_of(condition.response) for condition in candidates.values()]
+    distinct = dict.fromkeys(findings)
+    for of_response in of_candidates:
+        distinct.update(dict.fromkeys(of_response))
+    return tuple(distinct)
 
 
 def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:

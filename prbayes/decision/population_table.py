@@ -20,6 +20,7 @@ from prbayes.decision.populations import NestedPopulations, Populations, quantil
 from prbayes.model.locking import locked
 from prbayes.model.parameters import element_name, variable_of
 from prbayes.optimize.optimum import Optimum
+from prbayes.response.inputs import Groups
 from prbayes.response.outputs import with_unit
 from prbayes.results.predict import call_settings, width_of_epsilon
 
@@ -143,7 +144,7 @@ def population(
     if nested is not None:
         elements += _under_nested_family(reader, nested, inputs)
     names = list(dict.fromkeys(name for x in elements for name in x.numbers))
-    groups = {x.groups.dim: list(x.groups.labels) for x in elements if x.groups is not None}
+    groups = {_dimension(x.groups): list(x.groups.labels) for x in elements if x.groups is not None}
     if len(groups) > 1:
         raise ValueError(
             f"{_CALLER}: inputs: got populations of the groups {list(groups)}, expected those of "
@@ -180,6 +181,12 @@ def population(
             **populations.provenance(),
         },
     )
+
+
+def _dimension(groups: Groups) -> str:
+    """Return the dimension of groups, which differs from the table's other coordinates."""
+    is_taken = groups.dim in ("name", "quantity", "unit")
+    return f"{groups.dim}_group" if is_taken else groups.dim
 
 
 def _numbers(

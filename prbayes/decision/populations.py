@@ -46,6 +46,7 @@ from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, refuse_several_populations
 from prbayes.response.outputs import Outputs, is_missing
@@ -359,10 +360,11 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
 def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findings, float]:
     """Return findings, and the error of the quantity at the centre.
 
-    Findings report a tail of few points, and populations beyond the runs. Raises ValueError if
-    no response is in the tail, or specimens failed.
+    Findings report a tail of few points, populations beyond the runs, and a model discrepancy
+    beyond the data. Raises ValueError if no response is in the tail, or specimens failed.
     """
     caller, center = sample.populations.caller, sample.populations.center[None]
+    findings = findings_of(quantity.response)
     if quantity.needs_finite and np.isposinf(sample.values[-1]):
         raise ValueError(
             f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
@@ -373,7 +375,8 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     at, side = np.nextafter(value, -np.inf), "beyond it"
     is_beyond = quantity.of_specimen(sample.values, at)
     if not np.isin(is_beyond, (0.0, 1.0)).all():
-        return _beyond_runs(sample, quantity), _jackknife_error(sample, quantity)
+        findings += _beyond_runs(sample, quantity)
+        return findings, _jackknife_error(sample, quantity)
     share = float(sample.mean_weights() @ is_beyond)
     is_upper = share <= 0.5
     if not is_upper:  # because the rarer side decides how well the quantity is known
@@ -386,13 +389,12 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
             f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "
             f"points, expected some; {advice}"
         )
-    findings: Findings = ()
     if error > 0.3 * share:
         text = (
             f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
             f"of {error:.2g}, which limits the accuracy of the quantity; {advice}."
         )
-        findings = report(Finding("rough-probability", text))
+        findings += report(Finding("rough-probability", text))
     if not isinstance(quantity, Quantile):
         return findings, error
     findings += _beyond_runs(sample, quantity)

@@ -2,7 +2,7 @@
 
 from prbayes.response.budget import BudgetError, Cost
 from prbayes.response.condition import condition
-from prbayes.response.discrepancy import Additive, Multiplicative
+from prbayes.response.discrepancy import Additive, Multiplicative, Smooth
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.inputs import group
 from prbayes.response.store import Store, StoreError
@@ -16,6 +16,7 @@ __all__ = [
     "Replace",
     "ResponseError",
     "Retry",
+    "Smooth",
     "Store",
     "StoreError",
     "condition",

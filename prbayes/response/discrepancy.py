@@ -4,21 +4,189 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from prbayes._finding import Finding, Findings
-from prbayes._validate import Floats, Function, called, real_array, unmasked
+from prbayes._validate import (
+    Floats,
+    Function,
+    called,
+    number,
+    positive_number,
+    real_array,
+    unmasked,
+)
 from prbayes.response.call import scalar, unwrapped
 from prbayes.response.outputs import relabelled
+
+
+@dataclass(frozen=True)
+class Smooth:
+    r"""The free shape of a discrepancy that is zero under a known condition: a Gaussian process.
+
+    .. math:: d(c) = \frac{c - c_0}{R} g(c), \qquad
+              \operatorname{cov}(g(c), g(c')) = \sigma^2 / \bigl(1 + (c - c')^2 / (2 l^2)\bigr),
+
+    with the zero :math:`c_0` and the largest distance R of the data's conditions from it. The
+    standard deviation :math:`\sigma` is that of the discrepancy at this distance, and grows in
+    proportion to the distance.
+
+    Parameters
+    ----------
+    zero_at : float
+        Condition :math:`c_0` under which the response is known to be right, such as no load.
+    length : float, optional
+        Length scale l, in units of the condition; by default R / 2. The covariance is a mixture of
+        squared exponentials, 90 % of whose length scales are from .58 l to 4.4 l [1]_.
+    reach : float
+        How far beyond the data and the zero the shape is defined, in units of R. It ends at a zero
+        that is the lowest or highest condition. Predictions further away are refused.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is no finite number, or ``length`` or ``reach`` is not positive.
+
+    Notes
+    -----
+    Pass it as ``shape`` of `Additive` or `Multiplicative`, which have a coefficient for each
+    element of an orthogonal expansion. Independent normal coefficients with the standard deviation
+    :math:`\sigma` make the discrepancy this process; their number is in ``event``. The first ones
+    determine the discrepancy under the conditions of the data, the others what is left elsewhere,
+    to 5 % of the variance.
+
+    References
+    ----------
+    .. [1] Rasmussen, C. E. and C. K. I. Williams (2006), Gaussian processes for machine learning,
+       MIT Press, eq. 4.19 with alpha = 1.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> stiffening = prb.response.Additive([0.5, 1.0, 2.0], prb.response.Smooth(zero_at=0.0))
+    >>> stiffening.event
+    (5,)
+    >>> stiffening.value(np.ones(5), 0.0)
+    array(0.)
+    """
+
+    zero_at: float
+    _: KW_ONLY
+    length: float | None = None
+    reach: float = 0.5
+
+    def __post_init__(self) -> None:
+        number(self.zero_at, "prb.response.Smooth: zero_at")
+        positive_number(self.reach, "prb.response.Smooth: reach")
+        if self.length is not None:
+            positive_number(self.length, "prb.response.Smooth: length")
+
+    def expansion(self, seen: Floats) -> Expansion:
+        """Return the orthogonal expansion of the process for conditions with data, (n,)."""
+        zero = float(self.zero_at)
+        conditions = np.unique(seen)
+        first = float(conditions[0])
+        last = float(conditions[-1])
+        farthest = max(abs(first - zero), abs(last - zero))
+        margin = self.reach * farthest
+        # A zero that is not between conditions is an end of the range.
+        low = zero if zero <= first else first - margin
+        high = zero if zero >= last else last + margin
+        length = farthest / 2 if self.length is None else float(self.length)
+        # The grid has at least ten points in a default length scale.
+        grid = np.linspace(low, high, 101)
+        # More conditions than the grid has determine no further terms.
+        size = min(len(conditions), len(grid))
+        chosen = np.linspace(0, len(conditions) - 1, size)
+        conditions = conditions[chosen.round().astype(np.intp)]
+        nodes = np.concatenate([conditions, grid])
+        covariance = rational_quadratic(conditions, conditions, length)
+        of_data = whitening(covariance, 1e-6)
+        at_grid = rational_quadratic(grid, conditions, length) @ of_data
+        # The other terms are those of the process less its regression on the first ones.
+        explained = at_grid @ at_grid.T
+        rest = rational_quadratic(grid, grid, length) - explained
+        of_rest = whitening(rest, 0.05)
+        regression = of_data @ at_grid.T @ of_rest
+        upper = np.concatenate([of_data, -regression], axis=1)
+        zeros = np.zeros_like(at_grid)
+        lower = np.concatenate([zeros, of_rest], axis=1)
+        weights = np.concatenate([upper, lower])
+        return Expansion(zero, farthest, length, low, high, nodes, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Terms of the orthogonal expansion of a `Smooth` shape, a function of the condition."""
+
+    zero: float
+    farthest: float  # largest distance of a condition with data from the zero
+    length: float  # length scale
+    low: float  # ends of the range in which the shape is defined
+    high: float
+    nodes: Floats  # (n,): conditions at which covariances are computed
+    weights: Floats  # (n, m): terms as combinations of the covariances with the nodes
+
+    def __call__(self, condition: Floats) -> Floats:
+        """Return the m terms at conditions, (...) -> (..., m)."""
+        at = np.asarray(condition, dtype=np.float64)
+        margin = 1e-9 * (self.high - self.low)
+        lowest = self.low - margin
+        highest = self.high + margin
+        is_below = at < lowest
+        is_above = at > highest
+        if (is_below | is_above).any():
+            raise ValueError(
+                f"prb.response.Smooth: condition: got {at.min():g} to {at.max():g}, expected "
+                f"conditions from {self.low:g} to {self.high:g}, where the shape is defined; pass "
+                "a larger reach="
+            )
+        covariance = rational_quadratic(at.ravel(), self.nodes, self.length)
+        terms = covariance @ self.weights
+        terms = terms.reshape(*at.shape, -1)
+        distance = (at - self.zero) / self.farthest
+        return np.asarray(distance[..., None] * terms)
+
+
+def rational_quadratic(first: Floats, second: Floats, length: float) -> Floats:
+    """Return the rational quadratic covariance of conditions, (n,) and (k,) -> (n, k)."""
+    difference = first[:, None] - second
+    distance = difference / length
+    ratio = 0.5 * distance**2
+    return np.asarray(1 / (1 + ratio))
+
+
+def whitening(covariance: Floats, dropped: float) -> Floats:
+    """Return weights, (n, k), of the main components with unit variance.
+
+    The others have at most the variance ``dropped`` in each element.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    values = np.maximum(values[::-1], 1e-300)
+    vectors = vectors[:, ::-1]
+    explained = np.cumsum(values * vectors**2, axis=1)
+    variance = covariance.diagonal()[:, None]
+    lost = (variance - explained).max(axis=0)
+    count = 1 + int((lost > dropped).sum())
+    # The sign is fixed, so that coefficients keep their meaning on other machines.
+    largest = np.abs(vectors).argmax(axis=0)
+    columns = np.arange(len(values))
+    signs = np.sign(vectors[largest, columns])
+    scales = np.sqrt(values)
+    weights = vectors * signs / scales
+    return np.asarray(weights[:, :count])
 
 
 class ModelDiscrepancy(ABC):
     """The error of a response over a condition such as time, temperature or load."""
 
-    def __init__(self, seen: ArrayLike, shape: Callable[[Floats], Any] | None = None) -> None:
+    def __init__(
+        self, seen: ArrayLike, shape: Callable[[Floats], Any] | Smooth | None = None
+    ) -> None:
         label = f"prb.response.{type(self).__name__}"
         conditions = real_array(seen, f"{label}: seen")
         if conditions.ndim != 1 or not np.isfinite(conditions).all() or np.ptp(conditions) == 0:
@@ -26,13 +194,15 @@ class ModelDiscrepancy(ABC):
                 f"{label}: seen: got {seen!r:.60}, expected at least two different finite "
                 "conditions, such as [20.0, 1000.0]"
             )
-        if shape is not None and not callable(shape):
+        if shape is not None and not callable(shape) and not isinstance(shape, Smooth):
             raise TypeError(
                 f"{label}: shape: got {called(shape)}, expected a function of the condition, such "
-                "as np.log"
+                "as np.log, or prb.response.Smooth(zero_at=0.0)"
             )
         self.low = float(conditions.min())
         self.high = float(conditions.max())
+        if isinstance(shape, Smooth):
+            shape = shape.expansion(conditions)
         self.shape = self._line if shape is None else shape
         values = self._basis(np.array([self.low, self.high]))
         if values.shape[:1] != (2,) or values.ndim > 2 or not np.isfinite(values).all():
@@ -125,6 +295,7 @@ class ModelDiscrepancy(ABC):
                 f"{label}: condition: got {condition!r:.60}, expected a number, or one for each "
                 "output, NaN for those without discrepancy"
             )
+        self._basis(np.where(np.isnan(at), self.low, at))  # raises where it is not defined
         if isinstance(response, scalar):
             return scalar(Corrected(response.function, self, at))
         return Corrected(response, self, at)
@@ -139,9 +310,10 @@ class Additive(ModelDiscrepancy):
     ----------
     seen : array_like, shape (n,)
         Conditions under which there are data, in any unit; its ends count.
-    shape : callable, optional
+    shape : callable or Smooth, optional
         :math:`\phi`: ``shape(condition)`` of shape (...) for one coefficient, or (..., m) for m;
-        by default a straight line from 0 at the lower end of ``seen`` to 1 at the upper one.
+        by default a straight line from 0 at the lower end of ``seen`` to 1 at the upper one. With
+        `Smooth` it is free, apart from a known zero.
 
     Raises
     ------
@@ -153,7 +325,7 @@ class Additive(ModelDiscrepancy):
     The response is right where the shape is zero. A constant shape is a shift of the response.
     `minimize` warns if the data cannot separate the coefficients' hyperparameters from those of the
     other inputs. Unlike the Gaussian process of [1]_ the discrepancy has a parametric form, between
-    the conditions of the data and beyond.
+    the conditions of the data and beyond, unless the shape is `Smooth`.
 
     References
     ----------
@@ -190,7 +362,7 @@ class Multiplicative(ModelDiscrepancy):
     ----------
     seen : array_like, shape (n,)
         As for `Additive`.
-    shape : callable, optional
+    shape : callable or Smooth, optional
         As for `Additive`.
 
     Raises

@@ -532,14 +532,16 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "
             "inputs of one population; prb.predict has a population for each of "
-            f"{groups.names}, whose responses can be compared"
+            f"{groups.names}, and prb.exceedance(..., n_points=1000) takes the .dist() of one of "
+            "them or of a new group, such as pm.Normal.dist(mu[0], sigma)"
         )
     covariates = [str(v.name) for v in parents if is_condition(v)]
     if covariates:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.condition({covariates[0]!r}), "
             "expected inputs of one population; prb.predict(..., at={"
-            f"{covariates[0]!r}: value}}) has the responses of a population"
+            f"{covariates[0]!r}: value}}) has the responses of a population, and "
+            "prb.exceedance(..., n_points=1000) takes a .dist() with the value in its parameters"
         )
 
 

@@ -124,18 +124,52 @@ def test_a_vector_has_the_correlations_of_its_elements() -> None:
         )  # fmt: skip
 
 
-def test_groups_are_a_dimension() -> None:
-    data = xr.DataArray(DATA, {"supplier": ("specimen", ["Adler", "Busch"] * 10)}, "specimen")
-    with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
-        mu = pm.Normal("mu", 2, 2, dims="supplier")
-        x = pm.Normal.dist(mu[prb.response.group("supplier")], 0.3)
+@pytest.mark.parametrize(("dim", "of_table"), [("supplier", "supplier"), ("unit", "unit_group")])
+def test_groups_are_a_dimension(dim: str, of_table: str) -> None:
+    data = xr.DataArray(DATA, {dim: ("specimen", ["Adler", "Busch"] * 10)}, "specimen")
+    with pm.Model(coords={dim: ["Adler", "Busch"]}) as model:
+        mu = pm.Normal("mu", 2, 2, dims=dim)
+        x = pm.Normal.dist(mu[prb.response.group(dim)], 0.3)
         prb.Simulator("y", np.positive, x, observed=data, **FRESH)
     means = np.random.default_rng(5).normal([1.0, 3.0], 0.1, (100, 2))
     table = prb.population(draws(mu=means), model=model)
-    assert table.estimate.dims == ("name", "supplier", "quantity")
+    assert table.estimate.dims == ("name", of_table, "quantity")
+    assert table[of_table].values.tolist() == ["Adler", "Busch"]
+    assert table.unit.dims == ("name",)
     of_mean = table.estimate.sel(quantity="mean")[0]
     np.testing.assert_allclose(of_mean, means.mean(axis=0))
     assert "[Busch]: mean 2.99 (2." in repr(table)
+
+
+def test_a_new_group_has_the_scatter_of_both_levels() -> None:
+    data = xr.DataArray(DATA, {"batch": ("specimen", ["a", "b"] * 10)}, "specimen")
+    with pm.Model(coords={"batch": ["a", "b"]}) as model:
+        mean, between, within = (pm.HalfNormal(name, 1) for name in ("mean", "between", "within"))
+        mu = pm.Normal("mu", mean, between, dims="batch")
+        x = pm.Normal.dist(mu[prb.response.group("batch")], within)
+        prb.Simulator("y", np.positive, x, observed=data)
+    rng = np.random.default_rng(6)
+    levels = {"mean": (2, 0.1), "between": (0.4, 0.03), "within": (0.3, 0.03)}
+    drawn = {name: rng.normal(*moments, 100) for name, moments in levels.items()}
+    means = rng.normal([1.8, 2.2], 0.05, (100, 2))
+    posterior = draws(mu=means, **drawn)
+    of_both = pm.Normal.dist(mean, pm.math.sqrt(between**2 + within**2), name="new")
+    of_second = pm.Normal.dist(mu[1], within, name="second")
+    sd = np.hypot(drawn["between"], drawn["within"])
+    exact = {"new": (drawn["mean"], sd), "second": (means[:, 1], drawn["within"])}
+    for dist in (of_both, of_second):
+        center, spread = exact[str(dist.name)]
+        table = prb.population(posterior, dist, model=model)
+        (basis,) = table.estimate.sel(quantity="B-basis")
+        np.testing.assert_allclose(basis, np.quantile(center - 1.28155 * spread, 0.05), atol=1e-3)
+        found = prb.exceedance(posterior, np.positive, 3.0, dist, model=model, n_points=1000)
+        expected = stats.norm.sf(3.0, center, spread).mean()
+        assert abs(float(found.probability) - expected) < 4 * float(found.error)
+        assert float(found.error) < 0.2 * expected
+    with pytest.raises(
+        TypeError, match=r"prb.exceedance\(..., n_points=1000\) takes the .dist\(\)"
+    ):
+        prb.exceedance(posterior, np.positive, 3.0, x, model=model)
 
 
 def test_a_covariate_needs_its_value() -> None:

@@ -157,3 +157,177 @@ def test_outputs_that_are_not_those_of_the_conditions_are_refused(
 def test_a_response_that_is_the_same_for_all_specimens_has_its_discrepancy_too() -> None:
     corrected = prb.response.Additive([0.0, 2.0]).of(lambda: 5.0, 2.0)
     np.testing.assert_array_equal(corrected(np.array([1.0, 2.0])), [6.0, 7.0])
+
+
+LOADS = np.array([0.5, 1.0, 1.5, 2.0])
+
+
+def process(shape: prb.response.Smooth, first: Any, second: Any, farthest: float) -> Any:
+    """Covariance of a smooth discrepancy with coefficients of unit variance."""
+    a, b = np.asarray(first)[:, None] - shape.zero_at, np.asarray(second) - shape.zero_at
+    length = farthest / 2 if shape.length is None else shape.length
+    return a * b / farthest**2 / (1 + 0.5 * ((a - b) / length) ** 2)
+
+
+def terms_of(discrepancy: Any, conditions: Any) -> Any:
+    """Terms of the expansion at conditions, (n, m)."""
+    return np.asarray(discrepancy.shape(np.asarray(conditions)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "conditions"),
+    [
+        (prb.response.Smooth(0.0), LOADS),
+        (prb.response.Smooth(2.5), LOADS),
+        (prb.response.Smooth(1.1, length=3.0), LOADS),
+        (prb.response.Smooth(0.0), np.array([20.0, 1000.0])),
+        (prb.response.Smooth(-1.0, length=0.4, reach=0.3), np.linspace(0, 2, 40)),
+        (prb.response.Smooth(0.5), LOADS[[0, 0, 1, 3]]),
+        (prb.response.Smooth(0.0), np.linspace(0, 5, 4000)),
+        (prb.response.Smooth(1e6), LOADS),
+    ],
+)
+def test_a_smooth_shape_expands_its_process(shape: Any, conditions: Any) -> None:
+    discrepancy = prb.response.Additive(conditions, shape)
+    farthest = np.abs(conditions - shape.zero_at).max()
+    ends = discrepancy.shape.low, discrepancy.shape.high
+    places = np.linspace(*ends, 57)
+    whole = terms_of(discrepancy, places)
+    expected = process(shape, places, places, farthest)
+    # At most 5 % of the variance is left out at any condition, and none where there are data.
+    lost = expected.diagonal() - (whole**2).sum(axis=1)
+    far = np.abs(places - shape.zero_at) / farthest
+    assert (lost > -1e-9).all()
+    assert (lost <= 0.051 * far**2 + 1e-9).all()
+    at_data = terms_of(discrepancy, conditions)
+    cross = process(shape, places, conditions, farthest)
+    np.testing.assert_allclose(whole @ at_data.T, cross, atol=2e-3)
+    np.testing.assert_allclose(
+        at_data @ at_data.T, process(shape, conditions, conditions, farthest), atol=1e-5
+    )
+
+
+def test_a_smooth_shape_is_zero_at_its_zero_and_grows_in_proportion_to_the_distance() -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    m = discrepancy.event[0]
+    b = np.random.default_rng(0).normal(size=(400, m))
+    assert (discrepancy.value(b, np.zeros(400)) == 0).all()
+    variance = (terms_of(discrepancy, [0.5, 1.0, 2.0, 3.0]) ** 2).sum(axis=1)
+    np.testing.assert_allclose(variance, [1 / 16, 1 / 4, 1, 9 / 4], rtol=0.05)
+
+
+def test_the_last_coefficients_of_a_smooth_shape_leave_the_data_as_they_are() -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    whole = terms_of(discrepancy, LOADS)
+    assert np.abs(whole[:, 4:]).max() < 1e-8
+    assert (np.abs(whole[:, :4]).max(axis=0) > 0.01).all()
+    assert np.abs(terms_of(discrepancy, [3.0])[0, 4:]).max() > 0.1
+
+
+def test_a_smooth_shape_interpolates_like_the_process_given_its_data() -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    d = 0.25 * LOADS**2
+    at_data = terms_of(discrepancy, LOADS)
+    b = np.linalg.lstsq(at_data, d, rcond=None)[0]
+    shape = prb.response.Smooth(0.0)
+    gain = np.linalg.solve(process(shape, LOADS, LOADS, 2.0), process(shape, LOADS, [1.25], 2.0))
+    np.testing.assert_allclose(discrepancy.value(b, 1.25), (d @ gain)[0], rtol=1e-4)
+
+
+def test_a_smooth_shape_serves_curves_and_multiplicative_discrepancies() -> None:
+    x = np.random.default_rng(1).normal(size=6)
+    for kind in (prb.response.Additive, prb.response.Multiplicative):
+        discrepancy = kind(TIMES, prb.response.Smooth(zero_at=0.0))
+        b = np.random.default_rng(2).normal(size=discrepancy.event)
+        found = discrepancy.of(curve, TIMES)(x, b)  # common to all specimens
+        d = terms_of(discrepancy, TIMES) @ b
+        sums = x[:, None] * TIMES + d
+        products = x[:, None] * TIMES * np.exp(d)
+        expected = sums if kind is prb.response.Additive else products
+        np.testing.assert_allclose(found, expected)
+        again = pickle.loads(pickle.dumps(discrepancy))
+        np.testing.assert_array_equal(again.of(curve, TIMES)(x, b), found)
+
+
+def test_a_smooth_shape_is_the_same_whatever_the_order_of_the_conditions() -> None:
+    first = prb.response.Additive(LOADS, prb.response.Smooth(0.0))
+    second = prb.response.Additive(LOADS[[2, 0, 3, 1, 1]], prb.response.Smooth(0.0))
+    np.testing.assert_array_equal(terms_of(first, [0.7, 2.5]), terms_of(second, [0.7, 2.5]))
+
+
+@pytest.mark.parametrize("condition", [3.1, -0.1, [1.0, np.nan, 7.0]])
+def test_conditions_beyond_the_range_of_a_smooth_shape_are_refused(condition: Any) -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    with pytest.raises(ValueError, match="from 0 to 3, where the shape is defined; pass a larger"):
+        discrepancy.of(curve, condition)
+    with pytest.raises(ValueError, match="where the shape is defined"):
+        discrepancy.value(np.ones(discrepancy.event), condition)
+    far = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0, reach=4.0))
+    assert findings_of(far.of(line, 7.0))
+
+
+def test_the_free_shape_without_conditions_is_refused_as_a_function() -> None:
+    with pytest.raises(TypeError, match="expected a function of the condition"):
+        prb.response.Additive(LOADS, 3.0)  # type: ignore[arg-type]
+
+
+def draws_of(**values: Any) -> xr.DataTree:
+    """A posterior with the given draws, (draw, ...)."""
+    variables = {
+        name: (("chain", "draw", f"{name}_dim")[: x.ndim + 1], x[None])
+        for name, x in values.items()
+    }
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
+
+
+def test_decisions_say_that_they_extrapolate() -> None:
+    drift = prb.response.Additive([0.0, 2.0])
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        b = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        prb.Simulator(
+            "y", drift.of(lambda: 2.0, 2.0), b, observed=rng.normal(3, 0.3, 20),
+            metric=prb.AreaMetric(), propagation=prb.Reweighted(256),
+        )  # fmt: skip
+    result = draws_of(mu=rng.normal(1, 0.05, 50))
+    for condition in (2.0, 3.0):
+        response = drift.of(lambda: 2.0, condition)
+        quantity = prb.decision.Mean(response, b)
+        later = {"later": prb.decision.Condition(response, b)}
+        tables: list[Any] = [
+            prb.exceedance(result, response, 3.0, b, model=model),
+            prb.sensitivity(result, quantity, model=model, n_points=64),
+            prb.plan(result, later, model=model, quantity=quantity),
+            prb.plan(result, later, model=model),
+            prb.decision.p_box(result, response, b, model=model),
+        ]
+        for table in tables:
+            codes = [f.code for f in from_json(table.attrs["findings"])]
+            assert codes.count("extrapolated-discrepancy") == int(condition == 3.0)
+            assert ("extrapolates its model discrepancy" in str(table)) is (condition == 3.0)
+
+
+def test_a_discrepancy_that_all_specimens_share_is_that_of_each_population() -> None:
+    discrepancy = prb.response.Additive(LOADS, prb.response.Smooth(zero_at=0.0))
+    (m,) = discrepancy.event
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        b = pm.Normal("b", 0, 1, shape=m)
+        with pytest.raises(TypeError, match="goes into the response as a model variable"):
+            prb.Simulator("y", discrepancy.of(line, 1.0), x, b, observed=[1.0, 2.0, 3.0])
+        prb.Simulator("y", line, x, observed=[1.0, 2.0, 3.0], metric=prb.AreaMetric())
+    mu, coefficients = rng.normal(size=8), rng.normal(size=(8, m))
+    result = draws_of(mu=mu, b=coefficients)
+    for condition in (1.25, 3.0):
+        response = discrepancy.of(line, condition)
+        predicted = prb.predict(result, response, x, b, model=model, n_samples=512, random_seed=1)
+        expected = 2 * mu + coefficients @ terms_of(discrepancy, condition)
+        np.testing.assert_allclose(predicted.mean("sample")[0], expected, atol=0.01)
+        np.testing.assert_allclose(predicted.std("sample")[0], 0.6, rtol=0.02)
+        codes = {f.code for f in from_json(predicted.attrs["findings"])}
+        assert ("extrapolated-discrepancy" in codes) is (condition == 3.0)
+        with pytest.raises(TypeError, match=r"expected the \.dist\(\) objects .* prb.predict"):
+            prb.exceedance(result, response, 3.0, x, b, model=model)
+        with pytest.raises(TypeError, match="compute shares from"):
+            prb.exceedance(result, response, 3.0, x, b, model=model, n_points=100)
