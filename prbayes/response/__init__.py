@@ -1,6 +1,7 @@
 """The user's response: inputs, calls, failures and storage."""
 
 from prbayes.response.budget import BudgetError, Cost
+from prbayes.response.by_specimen import by_specimen
 from prbayes.response.condition import condition
 from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
@@ -18,6 +19,7 @@ __all__ = [
     "Retry",
     "Store",
     "StoreError",
+    "by_specimen",
     "condition",
     "group",
 ]

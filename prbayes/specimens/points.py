@@ -200,6 +200,7 @@ class SpecimenData:
     # Function of hyperparameters, (S, p), that returns them as draws; for a part of the specimens.
     draws: Callable[[Floats], Draws] | None = None
     seed: int = 0
+    allows_linear: bool = False  # whether proposals that are nearly linear may be so
 
     @property
     def free(self) -> Indices:
@@ -260,6 +261,7 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         data.box,
         data.order,
         columns,
+        data.allows_linear,
     )
 
 

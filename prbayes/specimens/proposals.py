@@ -73,6 +73,7 @@ class Residuals:
     order: Indices | None = None
     # (N, m): columns of the outputs that were measured of a specimen; None if all were.
     columns: Indices | None = None
+    allows_linear: bool = False  # whether maps that are nearly linear are replaced by linear ones
 
     @property
     def free(self) -> Indices:
@@ -84,6 +85,13 @@ class Residuals:
         z = self.known[specimen]
         z[:, self.free] = self.population.mean + a @ self.population.root.T
         return z
+
+    def is_possible(self, specimen: Indices, a: Floats) -> Bools:
+        """Return whether whitened inputs, (k, free), are in the range of possible ones."""
+        if self.box is None:
+            return np.ones(len(a), dtype=bool)
+        z = self.coordinates(specimen, a)
+        return np.asarray(((z >= self.box[0]) & (z <= self.box[1])).all(axis=1))
 
     def whitened(self, z: Floats) -> Floats:
         """Return whitened inputs, (..., free), of coordinates (..., d)."""
@@ -343,6 +351,7 @@ class Proposals:
     # (R, free): directions that the readings leave open, along which populations differ
     open_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
+    is_linear: Bools  # (R,): whether the map is linear, which needs no solution
 
     @classmethod
     @one_thread()
@@ -370,9 +379,39 @@ class Proposals:
         orientation = orientation * np.sign(np.linalg.det(rotation))
         back = rotation.swapaxes(1, 2)
         first = np.arange(d) < is_open.sum(axis=1, keepdims=True)
-        return cls(
-            residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
+        is_curved = np.zeros(count, dtype=bool)
+        exact = cls(
+            *(residuals, modes, back @ inputs, back @ readings, orientation, log_det),
+            *(first, share, is_curved),
         )
+        if not residuals.allows_linear:
+            return exact
+        is_linear = exact._is_nearly_linear()
+        return replace(exact, is_linear=is_linear, open_axes=first | is_linear[:, None])
+
+    def _is_nearly_linear(self, points: int = 8, largest: float = 0.5) -> Bools:
+        """Return whether maps differ little from linear ones in their bulk, (R,).
+
+        The largest difference is in standard deviations of a proposal. Points of linear maps have
+        weights that vary more, but need one output each.
+        """
+        count, d = self.modes.a.shape
+        mode = np.repeat(np.arange(count), points)
+        xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
+        a = self._linear_inputs(mode, xi)
+        difference = np.abs(self.mapped(mode, a)[0] - xi).max(axis=1).reshape(count, points)
+        return np.asarray((difference < largest).all(axis=1))
+
+    @cached_property
+    def _at_modes(self) -> tuple[Floats, Floats]:
+        """Values xi of the maps at their modes, (R, free), and Jacobians, (R, free, free)."""
+        modes = self.modes
+        return self._mapped_errors(np.arange(len(modes.a)), modes.a, modes.errors, modes.slopes)
+
+    def _linear_inputs(self, mode: Indices, xi: Floats) -> Floats:
+        """Return inputs a, (k, free), at which the linear maps of modes are xi."""
+        values, jacobian = self._at_modes
+        return self.modes.a[mode] + _solutions(jacobian[mode], xi - values[mode])
 
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
@@ -415,6 +454,19 @@ class Proposals:
         self, mode: Indices, a: Floats, e: Floats, slopes: Floats
     ) -> tuple[Floats, Floats]:
         """Return xi and its Jacobian at points with standardised errors e and slopes G."""
+        xi, jacobian = self._mapped_errors(mode, a, e, slopes)
+        rows = np.flatnonzero(self.is_linear[mode])
+        if rows.size:
+            values, of_modes = self._at_modes
+            at, away = mode[rows], a[rows] - self.modes.a[mode[rows]]
+            xi[rows] = values[at] + np.einsum("kij,kj->ki", of_modes[at], away)
+            jacobian[rows] = of_modes[at]
+        return xi, jacobian
+
+    def _mapped_errors(
+        self, mode: Indices, a: Floats, e: Floats, slopes: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return xi and its Jacobian in maps that are not replaced by linear ones."""
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
         return xi, inputs + readings @ slopes
@@ -427,11 +479,18 @@ class Proposals:
         converged: xi need not be that of the lattice, as the density is that at the inputs found.
         The determinant keeps its sign on the way: beyond a fold another proposal finds the points.
         """
-        a = self.modes.a[mode].copy()
-        value, jacobian = self.mapped(mode, a)
+        is_linear = self.is_linear[mode]
+        a, value = self.modes.a[mode].copy(), xi.copy()
+        jacobian = np.empty((len(a), a.shape[1], a.shape[1]))
+        rows, active = np.flatnonzero(is_linear), np.flatnonzero(~is_linear)
+        a[rows], jacobian[rows] = (
+            self._linear_inputs(mode[rows], xi[rows]),
+            self._at_modes[1][mode[rows]],
+        )
+        value[active], jacobian[active] = self.mapped(mode[active], a[active])
         fraction = np.ones(len(a))
         converged, last = np.zeros(len(a), dtype=bool), np.full(len(a), np.inf)
-        active = np.arange(len(a))
+        converged[rows] = self.residuals.is_possible(self.modes.specimen[mode[rows]], a[rows])
         for _ in range(25):
             step = _solutions(jacobian[active], xi[active] - value[active])
             length = np.sqrt((step**2).sum(axis=1))
