@@ -344,6 +344,14 @@ class SpecimenLikelihood:
         """The readings of S specimens in M outputs."""
         return self.stacked.readings
 
+    @cached_property
+    def columns(self) -> Indices | None:
+        """Outputs of each specimen's own functions, (S, c); None where all have the same."""
+        if all(m.functions is None for m in self.measurements):
+            return None
+        is_read = self.readings.is_measured | self.readings.is_censored
+        return np.argsort(~is_read, axis=1, kind="stable")[:, : is_read.sum(axis=1).max()]
+
     def variables(self, names: Collection[str] | None = None) -> tuple[TensorVariable, ...]:
         """Return the model variables of the log-density: roots of the inputs, then extras.
 

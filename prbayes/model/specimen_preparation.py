@@ -374,7 +374,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         labels=specimen_labels(likelihood),
         remedies=partial(remedies_of, likelihood),
         draws=partial(PopulationDraws, populations),
-        allows_linear=any(m.functions is not None for m in likelihood.measurements),
+        columns=likelihood.columns,
     )
 
 

@@ -66,7 +66,7 @@ class SpecimenPoints:
     """Points of N specimens."""
 
     z: Floats  # (N, K, d): coordinates of the points
-    outputs: Floats  # (N, K, m): the emulator's outputs at the points
+    outputs: Floats  # (N, K, m): the emulator's outputs at the points, or those that were read
     # (N, K): the log-likelihood of a specimen under a density p of z is ``logsumexp(log p(z) +
     # log_a, axis=1)``; -inf for points that fill up the array
     log_a: Floats
@@ -200,7 +200,15 @@ class SpecimenData:
     # Function of hyperparameters, (S, p), that returns them as draws; for a part of the specimens.
     draws: Callable[[Floats], Draws] | None = None
     seed: int = 0
-    allows_linear: bool = False  # whether proposals that are nearly linear may be so
+    # (N, c): outputs of each specimen's own function, the only ones that points have; None where
+    # all specimens have the same function.
+    columns: Indices | None = None
+
+    def log_density(self, readings: Readings, outputs: Floats, error: Floats) -> Floats:
+        """Return the log-density of readings at outputs of points, (N, K); error is (m,)."""
+        if self.columns is None:
+            return readings.log_density(outputs, error)
+        return readings.at_columns(self.columns).log_density(outputs, error[self.columns])
 
     @property
     def free(self) -> Indices:
@@ -261,7 +269,7 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         data.box,
         data.order,
         columns,
-        data.allows_linear,
+        data.columns is not None,
     )
 
 
@@ -358,10 +366,16 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     emulation = proposals.residuals.response
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
-    outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
-    if emulation.offsets is not None:
-        outputs = outputs + emulation.offsets[:, None]
-    log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
+    parts = []
+    for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
+        values = emulation.values(z[rows].reshape(-1, d)).reshape(len(rows), k, -1)
+        if emulation.offsets is not None:
+            values = values + emulation.offsets[rows, None]
+        if data.columns is not None:
+            values = np.take_along_axis(values, data.columns[rows, None], axis=2)
+        parts.append(values)
+    outputs = np.concatenate(parts)
+    log_a = data.log_density(data.readings, outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
     return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
@@ -495,7 +509,7 @@ def at_scale(
     if scale == 1.0:
         return points
     readings = scaled_errors(data.readings, scale)
-    log_a = readings.log_density(points.outputs, error) - points.log_proposal
+    log_a = data.log_density(readings, points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 

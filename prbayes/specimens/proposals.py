@@ -389,7 +389,7 @@ class Proposals:
         is_linear = exact._is_nearly_linear()
         return replace(exact, is_linear=is_linear, open_axes=first | is_linear[:, None])
 
-    def _is_nearly_linear(self, points: int = 8, largest: float = 0.5) -> Bools:
+    def _is_nearly_linear(self, points: int = 8, largest: float = 1.0) -> Bools:
         """Return whether maps differ little from linear ones in their bulk, (R,).
 
         The largest difference is in standard deviations of a proposal. Points of linear maps have
