@@ -368,6 +368,12 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
     name, model, data = arguments.name, arguments.model, arguments.data
     _refuse_by_specimen(arguments)
+    if arguments.at_conditions and metric.selected is not None:
+        raise ValueError(
+            f"{name}: metric: selected: got limits with readings of each specimen's own, expected "
+            "the same outputs of all specimens: the share that is never seen differs; leave "
+            "selected= out"
+        )
     if data.rows is not None:
         metric = metric.of_frequencies(data.rows, data.n_rows)
     values = _checked_specimens(arguments)

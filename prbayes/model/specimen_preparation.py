@@ -231,7 +231,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         points = first.points
 
         def posterior(share: ResponseShare | None) -> PopulationDraws:
-            if share is not None and likelihood.inputs.conditions:
+            has_own = likelihood.inputs.conditions or likelihood.columns is not None
+            if share is not None and has_own:
                 got, advice = (
                     "NaN from the response for a share of the population that is not negligible",
                     "return inf there if these specimens fail, or a number beside all readings",
@@ -240,7 +241,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                     got, advice = "selected=", "pass the condition as a constant, or no limits"
                 raise DesignError(
                     f"{likelihood.name}: got {got}, expected a response of all specimens with "
-                    f"prb.response.condition, since that share depends on the condition; {advice}"
+                    "conditions or functions of their own, on which that share depends; "
+                    f"{advice}"
                 )
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
@@ -266,6 +268,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if likelihood.has_table:
             raise
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
+        _refuse_missing_function(likelihood, outputs, error)
         # The first runs are checked alone as well, because later runs may be far from the priors.
         for of_runs in (outputs, *runs.outputs[:1]):
             refuse_unreached(likelihood.name, of_runs, likelihood.readings)
@@ -275,6 +278,24 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     finally:
         for response in responses:
             response.on_start = None
+
+
+def _refuse_missing_function(
+    likelihood: SpecimenLikelihood, outputs: Floats, error: DesignError
+) -> None:
+    """Raise for the function of a specimen that returned NaN where those of others did not."""
+    for m in likelihood.measurements:
+        if m.functions is None or not len(outputs):
+            continue
+        is_nan = np.isnan(outputs[:, output_columns(likelihood, m)])
+        count = (is_nan & ~is_nan.all(axis=1, keepdims=True)).sum(axis=0)
+        if count.any():
+            raise DesignError(
+                f"{m.name}: got NaN in {count.max()} of {len(outputs)} runs from the "
+                f"{m.functions.label_of_output(int(count.argmax()))}, expected numbers, since a "
+                "run without the output of one specimen is none for the others; return a number "
+                f"beside all readings there. Therefore: {error}"
+            )
 
 
 @dataclass(eq=False)

@@ -159,9 +159,9 @@ class ReadingDensity:
 def _sums_of_squares(
     readings: Readings, scale: Floats, outputs: Floats, variance: Floats, is_counted: Bools
 ) -> tuple[tuple[Floats, Floats, float], Floats] | None:
-    """Return squares, numbers and variance of `ReadingDensity.sums`, and sums of log scales, (S, 1).
+    """Return squares, numbers and variance of `ReadingDensity.sums`, and log scales, (S, 1).
 
-    They are those of the readings that count, (S, k). None if the readings are not plain, or the
+    These are sums over the readings that count, (S, k). None if the readings are not plain, or the
     ``variance`` of the emulator's error, (S, k), is not negligible.
     """
     unit = np.where(is_counted, scale, 1.0)

@@ -49,9 +49,15 @@ class BySpecimen:
 
     def _outputs(self, k: int, result: Any, inputs: Sequence[Any]) -> Any:
         """Return the outputs of a function that have readings, (..., m)."""
+        has_axis = result.ndim > max((np.ndim(x) for x in inputs), default=0)
         if self.columns is None:
-            has_axis = result.ndim > max((np.ndim(x) for x in inputs), default=0)
             return result if has_axis else result[..., None]
+        if self.readings is None and has_axis:
+            raise ValueError(
+                f"{self.label(k)} returned shape {result.shape} for inputs of shapes "
+                f"{[np.shape(x) for x in inputs]}, expected one number for each point, as observed "
+                "has one reading of a specimen"
+            )
         if self.readings is None:
             return result[..., None]
         used = self.columns[k]
@@ -70,6 +76,11 @@ class BySpecimen:
         rows = [str(row) for row, place in enumerate(self.places) if place == k]
         more = ", ..." if len(rows) > 3 else ""
         return f"function of specimen {', '.join(rows[:3])}{more}"
+
+    def label_of_output(self, output: int) -> str:
+        """Return which specimens have the function of an output, as a text."""
+        sizes = [columns.size for columns in self.columns or ()]
+        return self.label(int(np.searchsorted(np.cumsum(sizes), output, side="right")))
 
     @property
     def __signature__(self) -> inspect.Signature:

@@ -638,6 +638,7 @@ def _point_counts(share: Floats, table: Indices, count: int) -> Indices:
     return np.asarray(counts[table >= 0], dtype=np.intp)
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _log_mixture(
     proposals: Proposals,
     specimen: Indices,
@@ -646,8 +647,7 @@ def _log_mixture(
     drawn: tuple[Indices, Floats] | None,
 ) -> Floats:
     """Return `Proposals.log_mixture` of a block of points."""
-    with np.errstate(divide="ignore"):
-        logs = np.log(weights)
+    logs = np.log(weights)
     modes, residuals = proposals.modes, proposals.residuals
     values, jacobian = residuals.simulated(specimen, a)
     largest, terms = np.full(len(a), -np.inf), []
