@@ -268,7 +268,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if likelihood.has_table:
             raise
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
-        _refuse_missing_function(likelihood, outputs, error)
+        _refuse_missing_outputs(likelihood, outputs, error)
         # The first runs are checked alone as well, because later runs may be far from the priors.
         for of_runs in (outputs, *runs.outputs[:1]):
             refuse_unreached(likelihood.name, of_runs, likelihood.readings)
@@ -280,22 +280,17 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             response.on_start = None
 
 
-def _refuse_missing_function(
+def _refuse_missing_outputs(
     likelihood: SpecimenLikelihood, outputs: Floats, error: DesignError
 ) -> None:
-    """Raise for the function of a specimen that returned NaN where those of others did not."""
-    for m in likelihood.measurements:
-        if m.functions is None or not len(outputs):
-            continue
-        is_nan = np.isnan(outputs[:, output_columns(likelihood, m)])
-        count = (is_nan & ~is_nan.all(axis=1, keepdims=True)).sum(axis=0)
-        if count.any():
-            raise DesignError(
-                f"{m.name}: got NaN in {count.max()} of {len(outputs)} runs from the "
-                f"{m.functions.label_of_output(int(count.argmax()))}, expected numbers, since a "
-                "run without the output of one specimen is none for the others; return a number "
-                f"beside all readings there. Therefore: {error}"
-            )
+    """Raise if functions by specimen returned NaN, which an error that follows does not name."""
+    count = int(np.isnan(outputs).any(axis=1).sum())
+    if likelihood.columns is not None and count:
+        raise DesignError(
+            f"{likelihood.name}: got NaN in {count} of {len(outputs)} runs, expected numbers from "
+            "the functions of all specimens: where one of them returns NaN, a run counts for no "
+            f"specimen; return a number beside all readings there. Therefore: {error}"
+        ) from None
 
 
 @dataclass(eq=False)

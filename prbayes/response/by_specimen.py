@@ -77,11 +77,6 @@ class BySpecimen:
         more = ", ..." if len(rows) > 3 else ""
         return f"function of specimen {', '.join(rows[:3])}{more}"
 
-    def label_of_output(self, output: int) -> str:
-        """Return which specimens have the function of an output, as a text."""
-        sizes = [columns.size for columns in self.columns or ()]
-        return self.label(int(np.searchsorted(np.cumsum(sizes), output, side="right")))
-
     @property
     def __signature__(self) -> inspect.Signature:
         """The signature of the first function, without its record."""
@@ -150,7 +145,7 @@ def by_specimen(
                 f"{caller}: got {len(functions)} functions and records, expected one function of "
                 "inputs and record, or functions alone"
             )
-        own, objects = list(functions), list(functions)
+        objects = separate = list(functions)
     else:
         is_table = isinstance(records, Mapping | str | bytes) or hasattr(records, "columns")
         if is_table or not hasattr(records, "__len__"):
@@ -159,18 +154,18 @@ def by_specimen(
                 "each specimen, beside one function"
             )
         objects = list(cast(Sequence[Any], records))
-        own = [_with_record(functions, record) for record in objects]
-    for row, function in enumerate([functions] if records is not None else own):
+        separate = [_with_record(functions, record) for record in objects]
+    for row, function in enumerate([functions] if records is not None else separate):
         if not callable(function) or isinstance(function, type):
             raise TypeError(
                 f"{caller}: functions: got {called(function)} at {row}, expected a function of the "
                 "inputs for each specimen"
             )
-    if len(own) < 2:
-        raise ValueError(f"{caller}: got {len(own)} specimens, expected at least 2 of them")
+    if len(separate) < 2:
+        raise ValueError(f"{caller}: got {len(separate)} specimens, expected at least 2 of them")
     first: dict[int, int] = {}
     places = tuple(first.setdefault(id(x), len(first)) for x in objects)
-    different = [own[places.index(k)] for k in range(len(first))]
+    different = [separate[places.index(k)] for k in range(len(first))]
     return BySpecimen(tuple(different), places)
 
 
