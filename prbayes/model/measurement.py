@@ -24,7 +24,7 @@ from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.model.simulator_with_data import new_observed, number_specimens
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.response.by_specimen import BySpecimen, of_specimens
+from prbayes.response.by_specimen import of_specimens
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
@@ -67,11 +67,6 @@ class Measurement:
         return self.observed.shape[1:]
 
     @property
-    def functions(self) -> BySpecimen | None:
-        """Functions or records of each specimen's own, None without."""
-        return of_specimens(self.responses.function)
-
-    @property
     def rows(self) -> Floats:
         """Observed values, (N, m)."""
         return self.observed.reshape(len(self.observed), -1)
@@ -98,7 +93,7 @@ class Measurement:
             return self
         of_rows = (self.groups, self.weights, self.specimens, self.conditions)
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
-        is_aligned = is_aligned or self.functions is not None
+        is_aligned = is_aligned or of_specimens(self.responses.function) is not None
         aligned = "groups, conditions, records, functions, weights= or specimens="
         return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
 
@@ -344,14 +339,6 @@ class SpecimenLikelihood:
         """The readings of S specimens in M outputs."""
         return self.stacked.readings
 
-    @cached_property
-    def columns(self) -> Indices | None:
-        """Outputs of each specimen's own functions, (S, c); None where all have the same."""
-        if all(m.functions is None for m in self.measurements):
-            return None
-        is_read = self.readings.is_measured | self.readings.is_censored
-        return np.argsort(~is_read, axis=1, kind="stable")[:, : is_read.sum(axis=1).max()]
-
     def variables(self, names: Collection[str] | None = None) -> tuple[TensorVariable, ...]:
         """Return the model variables of the log-density: roots of the inputs, then extras.
 
@@ -453,8 +440,19 @@ class SpecimenLikelihood:
 def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:
     """Return whether all specimens have the same population, weight and outputs of a simulator."""
     first, *more = likelihood.measurements
-    of_rows = (first.groups, first.weights, first.specimens, first.conditions, first.functions)
+    functions = of_specimens(first.responses.function)
+    of_rows = (first.groups, first.weights, first.specimens, first.conditions, functions)
     return not more and not first.covariates and all(x is None for x in of_rows)
+
+
+def columns_by_specimen(likelihood: SpecimenLikelihood) -> Indices | None:
+    """Return outputs of each specimen's own functions, (S, c); None where all have the same."""
+    functions = [of_specimens(m.responses.function) for m in likelihood.measurements]
+    if not any(functions):
+        return None
+    is_read = likelihood.readings.is_measured | likelihood.readings.is_censored
+    count = int(is_read.sum(axis=1).max())
+    return np.argsort(~is_read, axis=1, kind="stable")[:, :count]
 
 
 def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:

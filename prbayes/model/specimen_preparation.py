@@ -32,6 +32,7 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    columns_by_specimen,
     is_exchangeable,
     output_columns,
     readings_at,
@@ -231,7 +232,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         points = first.points
 
         def posterior(share: ResponseShare | None) -> PopulationDraws:
-            has_own = likelihood.inputs.conditions or likelihood.columns is not None
+            has_own = likelihood.inputs.conditions or data.columns is not None
             if share is not None and has_own:
                 got, advice = (
                     "NaN from the response for a share of the population that is not negligible",
@@ -285,7 +286,7 @@ def _refuse_missing_outputs(
 ) -> None:
     """Raise if functions by specimen returned NaN, which an error that follows does not name."""
     count = int(np.isnan(outputs).any(axis=1).sum())
-    if likelihood.columns is not None and count:
+    if columns_by_specimen(likelihood) is not None and count:
         raise DesignError(
             f"{likelihood.name}: got NaN in {count} of {len(outputs)} runs, expected numbers from "
             "the functions of all specimens: where one of them returns NaN, a run counts for no "
@@ -390,7 +391,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         labels=specimen_labels(likelihood),
         remedies=partial(remedies_of, likelihood),
         draws=partial(PopulationDraws, populations),
-        columns=likelihood.columns,
+        columns=columns_by_specimen(likelihood),
     )
 
 

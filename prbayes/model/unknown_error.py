@@ -17,7 +17,7 @@ import numpy as np
 
 from prbayes._validate import Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
-from prbayes.model.measurement import SpecimenLikelihood, output_columns
+from prbayes.model.measurement import SpecimenLikelihood, columns_by_specimen, output_columns
 from prbayes.specimens.points import SpecimenPoints
 
 
@@ -54,8 +54,9 @@ class ReadingDensity:
         shape = readings.values.shape
         numbers = np.broadcast_to(np.arange(shape[1]), shape)
         variances = np.broadcast_to(emulator_error**2, shape)
-        if likelihood.columns is not None:
-            numbers = likelihood.columns
+        columns_read = columns_by_specimen(likelihood)
+        if columns_read is not None:
+            numbers = columns_read
             readings = readings.at_columns(numbers)
             *scales, variances = (
                 np.take_along_axis(x, numbers, axis=1) for x in (*scales, variances)
@@ -86,7 +87,7 @@ class ReadingDensity:
             scales = [np.take_along_axis(x, places, 1) for x in scales]
             variance = np.take_along_axis(variances, places, 1)[:, None]
             numbers = np.take_along_axis(numbers, places, 1)
-        is_ordered = places is None and likelihood.columns is None
+        is_ordered = places is None and columns_read is None
         unit, relative, parameter, bias = (x[:, None] for x in scales)
         return cls(
             readings,

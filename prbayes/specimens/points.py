@@ -204,24 +204,10 @@ class SpecimenData:
     # all specimens have the same function.
     columns: Indices | None = None
 
-    def log_density(self, readings: Readings, outputs: Floats, error: Floats) -> Floats:
-        """Return the log-density of readings at outputs of points, (N, K); error is (m,)."""
-        if self.columns is None:
-            return readings.log_density(outputs, error)
-        return readings.at_columns(self.columns).log_density(outputs, error[self.columns])
-
     @property
     def free(self) -> Indices:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
-
-    @property
-    def box(self) -> Floats | None:
-        """Range of inputs, (2, d): that of the prior's data sets, and a quarter beyond it."""
-        if self.bounds is None:
-            return None
-        margin = 0.25 * (self.bounds[1] - self.bounds[0])
-        return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
 
     def scale(self, sd: Floats) -> Floats:
         """Return units of all coordinates, (d,), from those of the unknown coordinates, (free,)."""
@@ -251,6 +237,11 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
     if emulation.offsets is not None:
         target = target - emulation.offsets
     of_emulator = np.broadcast_to(emulation.error, target.shape)
+    box = None
+    if data.bounds is not None:
+        # The range of the prior's data sets, and a quarter beyond it.
+        margin = 0.25 * (data.bounds[1] - data.bounds[0])
+        box = np.stack([data.bounds[0] - margin, data.bounds[1] + margin])
     columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
     if 2 * count <= is_read.shape[1]:
         columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
@@ -266,7 +257,7 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         relative,
         population,
         data.known,
-        data.box,
+        box,
         data.order,
         columns,
         data.columns is not None,
@@ -361,6 +352,15 @@ def _as_starts(modes: Modes, starts: Floats) -> Floats:
     return result
 
 
+def reading_log_density(
+    data: SpecimenData, readings: Readings, outputs: Floats, error: Floats
+) -> Floats:
+    """Return the log-density of readings at outputs of points, (N, K); ``error`` is (m,)."""
+    if data.columns is None:
+        return readings.log_density(outputs, error)
+    return readings.at_columns(data.columns).log_density(outputs, error[data.columns])
+
+
 def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
     """Return points of all specimens, ``count`` of each."""
     emulation = proposals.residuals.response
@@ -375,7 +375,7 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
             values = np.take_along_axis(values, data.columns[rows, None], axis=2)
         parts.append(values)
     outputs = np.concatenate(parts)
-    log_a = data.log_density(data.readings, outputs, emulation.error) - log_proposal
+    log_a = reading_log_density(data, data.readings, outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
     return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
@@ -509,7 +509,7 @@ def at_scale(
     if scale == 1.0:
         return points
     readings = scaled_errors(data.readings, scale)
-    log_a = data.log_density(readings, points.outputs, error) - points.log_proposal
+    log_a = reading_log_density(data, readings, points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 

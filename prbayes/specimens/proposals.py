@@ -334,6 +334,21 @@ def _lowest(specimen: Indices, values: Floats, n: int) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
+class LinearMaps:
+    """Linear approximations of maps at their modes, which need no output for a point."""
+
+    is_used: Bools  # (R,): whether the map of a mode is replaced
+    values: Floats  # (R, free): xi at the mode
+    jacobian: Floats  # (R, free, free)
+
+    def __call__(self, mode: Indices, away: Floats) -> tuple[Floats, Floats]:
+        """Return xi, (k, free), and its Jacobian at distances from the modes, (k, free)."""
+        jacobian = self.jacobian[mode]
+        xi = self.values[mode] + np.einsum("kij,kj->ki", jacobian, away)
+        return xi, jacobian
+
+
+@dataclass(frozen=True, eq=False)
 class Proposals:
     """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
 
@@ -351,7 +366,7 @@ class Proposals:
     # (R, free): directions that the readings leave open, along which populations differ
     open_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
-    is_linear: Bools  # (R,): whether the map is linear, which needs no solution
+    linear: LinearMaps | None = None  # maps that replace some of the others
 
     @classmethod
     @one_thread()
@@ -379,39 +394,10 @@ class Proposals:
         orientation = orientation * np.sign(np.linalg.det(rotation))
         back = rotation.swapaxes(1, 2)
         first = np.arange(d) < is_open.sum(axis=1, keepdims=True)
-        is_curved = np.zeros(count, dtype=bool)
-        exact = cls(
-            *(residuals, modes, back @ inputs, back @ readings, orientation, log_det),
-            *(first, share, is_curved),
+        proposals = cls(
+            residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
         )
-        if not residuals.allows_linear:
-            return exact
-        is_linear = exact._is_nearly_linear()
-        return replace(exact, is_linear=is_linear, open_axes=first | is_linear[:, None])
-
-    def _is_nearly_linear(self, points: int = 8, largest: float = 1.0) -> Bools:
-        """Return whether maps differ little from linear ones in their bulk, (R,).
-
-        The largest difference is in standard deviations of a proposal. Points of linear maps have
-        weights that vary more, but need one output each.
-        """
-        count, d = self.modes.a.shape
-        mode = np.repeat(np.arange(count), points)
-        xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
-        a = self._linear_inputs(mode, xi)
-        difference = np.abs(self.mapped(mode, a)[0] - xi).max(axis=1).reshape(count, points)
-        return np.asarray((difference < largest).all(axis=1))
-
-    @cached_property
-    def _at_modes(self) -> tuple[Floats, Floats]:
-        """Values xi of the maps at their modes, (R, free), and Jacobians, (R, free, free)."""
-        modes = self.modes
-        return self._mapped_errors(np.arange(len(modes.a)), modes.a, modes.errors, modes.slopes)
-
-    def _linear_inputs(self, mode: Indices, xi: Floats) -> Floats:
-        """Return inputs a, (k, free), at which the linear maps of modes are xi."""
-        values, jacobian = self._at_modes
-        return self.modes.a[mode] + _solutions(jacobian[mode], xi - values[mode])
+        return with_linear_maps(proposals) if residuals.allows_linear else proposals
 
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
@@ -445,31 +431,31 @@ class Proposals:
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
-        modes = self.modes
-        return self.mapped_errors(
-            mode, a, *self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
-        )
+        modes, residuals = self.modes, self.residuals
+        if self.linear is None:
+            errors = residuals.errors(modes.specimen[mode], a, modes.scale[mode])
+            return self.mapped_errors(mode, a, *errors)
+        e = np.zeros((len(a), residuals.target.shape[1]))
+        slopes = np.zeros((*e.shape, a.shape[1]))
+        rows = np.flatnonzero(~self.linear.is_used[mode])
+        at = mode[rows]
+        e[rows], slopes[rows] = residuals.errors(modes.specimen[at], a[rows], modes.scale[at])
+        return self.mapped_errors(mode, a, e, slopes)
 
     def mapped_errors(
         self, mode: Indices, a: Floats, e: Floats, slopes: Floats
     ) -> tuple[Floats, Floats]:
         """Return xi and its Jacobian at points with standardised errors e and slopes G."""
-        xi, jacobian = self._mapped_errors(mode, a, e, slopes)
-        rows = np.flatnonzero(self.is_linear[mode])
-        if rows.size:
-            values, of_modes = self._at_modes
-            at, away = mode[rows], a[rows] - self.modes.a[mode[rows]]
-            xi[rows] = values[at] + np.einsum("kij,kj->ki", of_modes[at], away)
-            jacobian[rows] = of_modes[at]
-        return xi, jacobian
-
-    def _mapped_errors(
-        self, mode: Indices, a: Floats, e: Floats, slopes: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return xi and its Jacobian in maps that are not replaced by linear ones."""
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
-        return xi, inputs + readings @ slopes
+        jacobian = inputs + readings @ slopes
+        if self.linear is not None:
+            rows = np.flatnonzero(self.linear.is_used[mode])
+            at = mode[rows]
+            xi[rows], jacobian[rows] = self.linear(at, a[rows] - self.modes.a[at])
+            is_possible = self.residuals.is_possible(self.modes.specimen[at], a[rows])
+            xi[rows[~is_possible]] = np.nan
+        return xi, jacobian
 
     @np.errstate(all="ignore")
     def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, Bools]:
@@ -479,18 +465,11 @@ class Proposals:
         converged: xi need not be that of the lattice, as the density is that at the inputs found.
         The determinant keeps its sign on the way: beyond a fold another proposal finds the points.
         """
-        is_linear = self.is_linear[mode]
-        a, value = self.modes.a[mode].copy(), xi.copy()
-        jacobian = np.empty((len(a), a.shape[1], a.shape[1]))
-        rows, active = np.flatnonzero(is_linear), np.flatnonzero(~is_linear)
-        a[rows], jacobian[rows] = (
-            self._linear_inputs(mode[rows], xi[rows]),
-            self._at_modes[1][mode[rows]],
-        )
-        value[active], jacobian[active] = self.mapped(mode[active], a[active])
+        a = self.modes.a[mode].copy()
+        value, jacobian = self.mapped(mode, a)
         fraction = np.ones(len(a))
         converged, last = np.zeros(len(a), dtype=bool), np.full(len(a), np.inf)
-        converged[rows] = self.residuals.is_possible(self.modes.specimen[mode[rows]], a[rows])
+        active = np.arange(len(a))
         for _ in range(25):
             step = _solutions(jacobian[active], xi[active] - value[active])
             length = np.sqrt((step**2).sum(axis=1))
@@ -614,6 +593,26 @@ class Proposals:
         result = np.zeros((len(modes.a), table.shape[1]), dtype=bool)
         result[table[n, slot]] = is_same[n, slot]
         return result
+
+
+def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0) -> Proposals:
+    """Return proposals in which linear maps replace those that are nearly linear in their bulk.
+
+    The largest difference is in standard deviations of a proposal. Weights of points vary more, but
+    a point needs one output instead of a solution.
+    """
+    modes = proposals.modes
+    count, d = modes.a.shape
+    every = np.arange(count)
+    values, jacobian = proposals.mapped_errors(every, modes.a, modes.errors, modes.slopes)
+    mode = np.repeat(every, points)
+    xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
+    a = modes.a[mode] + _solutions(jacobian[mode], xi - values[mode])
+    difference = np.abs(proposals.mapped(mode, a)[0] - xi).max(axis=1)
+    is_used = (difference < largest).reshape(count, points).all(axis=1)
+    open_axes = proposals.open_axes | is_used[:, None]
+    linear = LinearMaps(is_used, values, jacobian)
+    return replace(proposals, linear=linear, open_axes=open_axes)
 
 
 def mixing_weights(modes: Modes, mass: Floats) -> Floats:

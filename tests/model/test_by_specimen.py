@@ -140,7 +140,7 @@ def test_records_with_readings_in_different_numbers_have_their_exact_likelihood(
     np.testing.assert_allclose(got, exact, atol=0.06)
     np.testing.assert_allclose((got - got[0]).sum(axis=1), (exact - exact[0]).sum(axis=1), atol=0.1)
     assert likelihood.cache["preparation"].points.outputs.shape[2] == 3
-    assert likelihood.cache["preparation"].proposals.is_linear.all()
+    assert likelihood.cache["preparation"].proposals.linear.is_used.all()
 
 
 def test_optimum_prediction_and_individuals() -> None:
