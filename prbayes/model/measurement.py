@@ -450,9 +450,11 @@ def columns_by_specimen(likelihood: SpecimenLikelihood) -> Indices | None:
     functions = [of_specimens(m.responses.function) for m in likelihood.measurements]
     if not any(functions):
         return None
-    is_read = likelihood.readings.is_measured | likelihood.readings.is_censored
+    readings = likelihood.readings
+    is_read = readings.is_measured | readings.is_censored
     count = int(is_read.sum(axis=1).max())
-    return np.argsort(~is_read, axis=1, kind="stable")[:, :count]
+    order = np.argsort(~is_read, axis=1, kind="stable")
+    return order[:, :count]
 
 
 def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:

@@ -236,7 +236,8 @@ def observed_by_specimen(
     functions = of_specimens(response)
     if functions is None:
         return observed, metric, response
-    places, shape = np.array(functions.places), np.shape(observed)
+    places = np.array(functions.places)
+    shape = np.shape(observed)
     if isinstance(metric, Metric) and not metric.by_specimen:
         raise TypeError(
             f"{name}: metric: got {called(metric)} with functions of each specimen's own, expected "
@@ -260,16 +261,22 @@ def observed_by_specimen(
             f"{name}: observed: got {shape[0]} rows, and functions or records of {places.size} "
             "specimens, expected one for each row"
         )
-    readings = real_array(observed, f"{name}: observed").astype(float).reshape(places.size, -1)
+    numbers = real_array(observed, f"{name}: observed")
+    readings = numbers.astype(float).reshape(places.size, -1)
     is_read = np.isfinite(readings)
-    used = [np.flatnonzero(is_read[places == k].any(axis=0)) for k in range(places.max() + 1)]
+    used = []
+    for k in range(len(functions.functions)):
+        is_used = is_read[places == k].any(axis=0)
+        used.append(np.flatnonzero(is_used))
     if any(columns.size == 0 for columns in used):
-        row = int(np.flatnonzero(~is_read.any(axis=1))[0])
+        is_empty = ~is_read.any(axis=1)
+        row = int(is_empty.argmax())
         raise ValueError(
             f"{name}: observed: got no reading in row {row}, expected one at least; leave the "
             "specimen out, here and among the functions or records"
         )
-    ends = np.cumsum([0, *(columns.size for columns in used)])
+    sizes = [columns.size for columns in used]
+    ends = np.cumsum([0, *sizes])
     first, labels = _labels_by_specimen(name, observed, places, used)
 
     def at_outputs(value: Any, missing: float | None = None) -> Any:
@@ -283,14 +290,14 @@ def observed_by_specimen(
             result[row, ends[k] : ends[k + 1]] = values[row, used[k]]
         return result
 
-    scattered = xr.DataArray(
-        at_outputs(readings.reshape(shape), np.nan),
-        dims=(first, f"{name}_reading"),
-        coords=labels,
-    )
+    scattered_readings = at_outputs(readings.reshape(shape), np.nan)
+    dims = (first, f"{name}_reading")
+    scattered = xr.DataArray(scattered_readings, dims=dims, coords=labels)
     if isinstance(metric, Metric):
         metric = mapped_metric(cast(LogLikelihood, metric), at_outputs)
-    return scattered, metric, with_columns(response, used, shape[1] if len(shape) == 2 else None)
+    count = shape[1] if len(shape) == 2 else None
+    changed = with_columns(response, used, count)
+    return scattered, metric, changed
 
 
 def _labels_by_specimen(
@@ -302,7 +309,8 @@ def _labels_by_specimen(
     coords = {k: v for k, v in getattr(observed, "coords", {}).items() if v.dims == (first,)}
     if index is not None and first not in coords:
         coords[first] = index
-    texts = [str(x) for x in (range(len(places)) if index is None else index)]
+    rows = range(len(places)) if index is None else index
+    texts = list(map(str, rows))
     labels = []
     for k, columns in enumerate(used):
         text = texts[int(np.argmax(places == k))]

@@ -69,7 +69,8 @@ class ReadingDensity:
             columns = output_columns(likelihood, m)
             if list(m.unknown) != ["error"] or m.extras["error"].type.ndim:
                 continue
-            is_counted = (numbers >= columns.start) & (numbers < columns.stop)
+            is_counted = numbers >= columns.start
+            is_counted &= numbers < columns.stop
             is_counted &= readings.is_measured | readings.is_censored
             plain = _sums_of_squares(readings, scales[0], outputs, variances, is_counted)
             if plain is not None:
@@ -88,6 +89,7 @@ class ReadingDensity:
             variance = np.take_along_axis(variances, places, 1)[:, None]
             numbers = np.take_along_axis(numbers, places, 1)
         is_ordered = places is None and columns_read is None
+        has_bias = any("bias" in m.extras for m in likelihood.measurements)
         unit, relative, parameter, bias = (x[:, None] for x in scales)
         return cls(
             readings,
@@ -95,7 +97,7 @@ class ReadingDensity:
             unit,
             relative * np.abs(outputs) if relative.any() else None,
             parameter,
-            bias if any("bias" in m.extras for m in likelihood.measurements) else None,
+            bias if has_bias else None,
             variance,
             None if is_ordered else numbers,
             sums,
@@ -166,7 +168,8 @@ def _sums_of_squares(
     ``variance`` of the emulator's error, (S, k), is not negligible.
     """
     unit = np.where(is_counted, scale, 1.0)
-    relative = variance / unit**2
+    squared = unit**2
+    relative = variance / squared
     is_special = (readings.step != 0) | (readings.family >= 0) | readings.is_censored
     # With this tolerance a log-density changes by less than 1e-4 at an eighth of the largest
     # plausible error.
@@ -177,7 +180,8 @@ def _sums_of_squares(
     inverse = np.where(is_counted, 1 / unit, 0.0)
     squares = np.zeros(outputs.shape[:2])
     for y, c, output in zip(measured.T, inverse.T, np.moveaxis(outputs, 2, 0), strict=True):
-        squares += ((y[:, None] - output) * c[:, None]) ** 2
+        residuals = y[:, None] - output
+        squares += (residuals * c[:, None]) ** 2
     count = is_counted.sum(axis=1, keepdims=True, dtype=float)
     sums = (squares, count, float(relative[is_counted].mean()))
     return sums, np.log(unit).sum(axis=1, keepdims=True)

@@ -358,7 +358,8 @@ def reading_log_density(
     """Return the log-density of readings at outputs of points, (N, K); ``error`` is (m,)."""
     if data.columns is None:
         return readings.log_density(outputs, error)
-    return readings.at_columns(data.columns).log_density(outputs, error[data.columns])
+    of_outputs = readings.at_columns(data.columns)
+    return of_outputs.log_density(outputs, error[data.columns])
 
 
 def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
@@ -368,7 +369,8 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     n, k, d = z.shape
     parts = []
     for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
-        values = emulation.values(z[rows].reshape(-1, d)).reshape(len(rows), k, -1)
+        values = emulation.values(z[rows].reshape(-1, d))
+        values = values.reshape(len(rows), k, -1)
         if emulation.offsets is not None:
             values = values + emulation.offsets[rows, None]
         if data.columns is not None:

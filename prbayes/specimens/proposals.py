@@ -453,7 +453,8 @@ class Proposals:
             rows = np.flatnonzero(self.linear.is_used[mode])
             at = mode[rows]
             xi[rows], jacobian[rows] = self.linear(at, a[rows] - self.modes.a[at])
-            is_possible = self.residuals.is_possible(self.modes.specimen[at], a[rows])
+            specimen = self.modes.specimen[at]
+            is_possible = self.residuals.is_possible(specimen, a[rows])
             xi[rows[~is_possible]] = np.nan
         return xi, jacobian
 
@@ -607,8 +608,9 @@ def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0
     values, jacobian = proposals.mapped_errors(every, modes.a, modes.errors, modes.slopes)
     mode = np.repeat(every, points)
     xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
-    a = modes.a[mode] + _solutions(jacobian[mode], xi - values[mode])
-    difference = np.abs(proposals.mapped(mode, a)[0] - xi).max(axis=1)
+    away = _solutions(jacobian[mode], xi - values[mode])
+    mapped, _ = proposals.mapped(mode, modes.a[mode] + away)
+    difference = np.abs(mapped - xi).max(axis=1)
     is_used = (difference < largest).reshape(count, points).all(axis=1)
     open_axes = proposals.open_axes | is_used[:, None]
     linear = LinearMaps(is_used, values, jacobian)
