@@ -156,6 +156,7 @@ def test_optimum_prediction_and_individuals() -> None:
     np.testing.assert_allclose(
         np.log(medians), optimum.point["mu"] * np.array([0.5, 1, 2]), atol=0.05
     )
+    assert prb.diagnose(optimum)  # from synthetic data of each specimen's function
     subjects = prb.individuals(optimum)
     np.testing.assert_allclose(subjects["posterior"]["x"].mean(("chain", "draw")), X, atol=1e-3)
     with pytest.raises(ValueError, match="as many as there are groups, conditions, records"):
