@@ -244,13 +244,7 @@ def observed_by_specimen(
             "prb.LogLikelihood(): a metric of distributions compares specimens with the same "
             "function; leave metric= out"
         )
-    vector = next((x for x in inputs if isinstance(x, ReadingsCondition)), None)
-    if vector is not None:
-        raise TypeError(
-            f"{name}: inputs: got the condition {vector.name} with several values of a specimen "
-            "beside functions of each specimen's own, expected one of both; put the values into "
-            "the records"
-        )
+    _refuse_times_beside_functions(name, inputs)
     if isinstance(observed, Variable | Mapping) or len(shape) not in (1, 2):
         raise TypeError(
             f"{name}: observed: got {called(observed)} with functions of each specimen's own, "
@@ -298,6 +292,17 @@ def observed_by_specimen(
     count = shape[1] if len(shape) == 2 else None
     changed = with_columns(response, used, count)
     return scattered, metric, changed
+
+
+def _refuse_times_beside_functions(name: str, inputs: Sequence[Any]) -> None:
+    """Raise if an input is a condition with several values of each specimen."""
+    vector = next((x for x in inputs if isinstance(x, ReadingsCondition)), None)
+    if vector is not None:
+        raise TypeError(
+            f"{name}: inputs: got the condition {vector.name} with several values of a specimen "
+            "beside functions of each specimen's own, expected one of both; put the values into "
+            "the records"
+        )
 
 
 def _labels_by_specimen(
