@@ -338,6 +338,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "Reweighted": Row(max_points=(3,), emulator=(3, "a"), timeout=WITHOUT_PROCESSES),
     "Resimulated": Row(n=(1,), points=("halton",), timeout=WITHOUT_PROCESSES),
     "Fresh": Row(timeout=WITHOUT_PROCESSES),
+    "response.by_specimen": Row(
+        {"functions": line, "records": [1.0, 2.0]},
+        functions=([line], [line, 1.0], [pm.Normal, line], line(1.0, 2.0), [line, line]),
+        records=(None, "ab", {"a": 1, "b": 2}, [1.0], 3),
+    ),
     "response.condition": Row(
         {"name": "load", "values": [1.0, 2.0]},
         name=("",),

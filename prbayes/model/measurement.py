@@ -24,6 +24,7 @@ from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.model.simulator_with_data import new_observed, number_specimens
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
+from prbayes.response.by_specimen import of_specimens
 from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
@@ -55,7 +56,8 @@ class Measurement:
     # Conditions on which the population of a specimen depends, as values (N,) by name.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
-    at_conditions: bool = False  # whether outputs are readings at values of a vector condition
+    # Whether outputs are readings at values of a vector condition, or of functions by specimen.
+    at_conditions: bool = False
     # Model variables of the measurement: `ROLES` of the readings, and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
@@ -91,7 +93,8 @@ class Measurement:
             return self
         of_rows = (self.groups, self.weights, self.specimens, self.conditions)
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
-        aligned = "groups, conditions, weights= or specimens="
+        is_aligned = is_aligned or of_specimens(self.responses.function) is not None
+        aligned = "groups, conditions, records, functions, weights= or specimens="
         return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
 
 
@@ -437,8 +440,21 @@ class SpecimenLikelihood:
 def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:
     """Return whether all specimens have the same population, weight and outputs of a simulator."""
     first, *more = likelihood.measurements
-    of_rows = (first.groups, first.weights, first.specimens, first.conditions)
+    functions = of_specimens(first.responses.function)
+    of_rows = (first.groups, first.weights, first.specimens, first.conditions, functions)
     return not more and not first.covariates and all(x is None for x in of_rows)
+
+
+def columns_by_specimen(likelihood: SpecimenLikelihood) -> Indices | None:
+    """Return outputs of each specimen's own functions, (S, c); None where all have the same."""
+    functions = [of_specimens(m.responses.function) for m in likelihood.measurements]
+    if not any(functions):
+        return None
+    readings = likelihood.readings
+    is_read = readings.is_measured | readings.is_censored
+    count = int(is_read.sum(axis=1).max())
+    order = np.argsort(~is_read, axis=1, kind="stable")
+    return order[:, :count]
 
 
 def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:

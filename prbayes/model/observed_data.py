@@ -19,6 +19,7 @@ from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
 from prbayes.model.random_variable import known_value
+from prbayes.response.by_specimen import of_specimens, with_columns
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
 from prbayes.response.inputs import Groups, group_indices
@@ -223,6 +224,103 @@ def observed_at_conditions(
     if isinstance(metric, Metric):
         metric = mapped_metric(cast(LogLikelihood, metric), at_columns)
     return scattered, metric
+
+
+def observed_by_specimen(
+    name: str, observed: Any, metric: Metric | None, response: Any, inputs: Sequence[Any]
+) -> tuple[Any, Metric | None, Any]:
+    """Return observed values, metric and response with an output for each reading of a function.
+
+    They are returned as they are if the response is not one by specimen.
+    """
+    functions = of_specimens(response)
+    if functions is None:
+        return observed, metric, response
+    places = np.array(functions.places)
+    shape = np.shape(observed)
+    if isinstance(metric, Metric) and not metric.by_specimen:
+        raise TypeError(
+            f"{name}: metric: got {called(metric)} with functions of each specimen's own, expected "
+            "prb.LogLikelihood(): a metric of distributions compares specimens with the same "
+            "function; leave metric= out"
+        )
+    _refuse_times_beside_functions(name, inputs)
+    if isinstance(observed, Variable | Mapping) or len(shape) not in (1, 2):
+        raise TypeError(
+            f"{name}: observed: got {called(observed)} with functions of each specimen's own, "
+            f"expected an array of shape ({places.size},) or ({places.size}, T), padded with NaN"
+        )
+    if shape[0] != places.size:
+        raise ValueError(
+            f"{name}: observed: got {shape[0]} rows, and functions or records of {places.size} "
+            "specimens, expected one for each row"
+        )
+    numbers = real_array(observed, f"{name}: observed")
+    readings = numbers.astype(float).reshape(places.size, -1)
+    is_read = np.isfinite(readings)
+    used = []
+    for k in range(len(functions.functions)):
+        is_used = is_read[places == k].any(axis=0)
+        used.append(np.flatnonzero(is_used))
+    if any(columns.size == 0 for columns in used):
+        is_empty = ~is_read.any(axis=1)
+        row = int(is_empty.argmax())
+        raise ValueError(
+            f"{name}: observed: got no reading in row {row}, expected one at least; leave the "
+            "specimen out, here and among the functions or records"
+        )
+    sizes = [columns.size for columns in used]
+    ends = np.cumsum([0, *sizes])
+    first, labels = _labels_by_specimen(name, observed, places, used)
+
+    def at_outputs(value: Any, missing: float | None = None) -> Any:
+        """Return values of the shape of the readings at the outputs of functions, (N, M)."""
+        if isinstance(value, Variable) or np.shape(value) != shape:
+            return value
+        values = np.asarray(value, dtype=float).reshape(readings.shape)
+        filling = float(np.median(values)) if missing is None else missing
+        result = np.full((len(values), ends[-1]), filling)
+        for row, k in enumerate(places):
+            result[row, ends[k] : ends[k + 1]] = values[row, used[k]]
+        return result
+
+    scattered_readings = at_outputs(readings.reshape(shape), np.nan)
+    dims = (first, f"{name}_reading")
+    scattered = xr.DataArray(scattered_readings, dims=dims, coords=labels)
+    if isinstance(metric, Metric):
+        metric = mapped_metric(cast(LogLikelihood, metric), at_outputs)
+    count = shape[1] if len(shape) == 2 else None
+    changed = with_columns(response, used, count)
+    return scattered, metric, changed
+
+
+def _refuse_times_beside_functions(name: str, inputs: Sequence[Any]) -> None:
+    """Raise if an input is a condition with several values of each specimen."""
+    vector = next((x for x in inputs if isinstance(x, ReadingsCondition)), None)
+    if vector is not None:
+        raise TypeError(
+            f"{name}: inputs: got the condition {vector.name} with several values of a specimen "
+            "beside functions of each specimen's own, expected one of both; put the values into "
+            "the records"
+        )
+
+
+def _labels_by_specimen(
+    name: str, observed: Any, places: Indices, used: Sequence[Indices]
+) -> tuple[str, dict[str, Any]]:
+    """Return the dimension of the specimens, and coordinates of specimens and readings."""
+    index = specimen_index(observed)
+    first = observed.dims[0] if hasattr(observed, "dims") else f"{name}_specimen"
+    coords = {k: v for k, v in getattr(observed, "coords", {}).items() if v.dims == (first,)}
+    if index is not None and first not in coords:
+        coords[first] = index
+    rows = range(len(places)) if index is None else index
+    texts = list(map(str, rows))
+    labels = []
+    for k, columns in enumerate(used):
+        text = texts[int(np.argmax(places == k))]
+        labels += [text] if np.ndim(observed) == 1 else [f"{text}[{j}]" for j in columns]
+    return first, {**coords, f"{name}_reading": labels}
 
 
 def _refuse_other_order(

@@ -46,7 +46,12 @@ from prbayes.model.measurement import (
     selection_of,
     specimen_labels,
 )
-from prbayes.model.observed_data import ObservedData, observed_at_conditions, read_data
+from prbayes.model.observed_data import (
+    ObservedData,
+    observed_at_conditions,
+    observed_by_specimen,
+    read_data,
+)
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
@@ -75,6 +80,7 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
+from prbayes.response.by_specimen import of_specimens
 from prbayes.response.condition import ReadingsCondition, refuse_vectors_of_specimens
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
@@ -224,10 +230,12 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         unused = [metric, epsilon, weights, specimens, dims, variables.groups]
         metric, observed = _read_summary(name, observed, unused, settings)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
+    observed, metric, response = observed_by_specimen(name, observed, metric, response, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
     of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)
+    of_readings = of_readings or of_specimens(response) is not None
     arguments = _Arguments(
         name, model, response, variables, data, settings, epsilon, progressbar, of_readings
     )
@@ -360,6 +368,12 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
     name, model, data = arguments.name, arguments.model, arguments.data
     _refuse_by_specimen(arguments)
+    if arguments.at_conditions and metric.selected is not None:
+        raise ValueError(
+            f"{name}: metric: selected: got limits with readings of each specimen's own, expected "
+            "the same outputs of all specimens: the share that is never seen differs; leave "
+            "selected= out"
+        )
     if data.rows is not None:
         metric = metric.of_frequencies(data.rows, data.n_rows)
     values = _checked_specimens(arguments)

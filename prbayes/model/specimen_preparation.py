@@ -32,6 +32,7 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    columns_by_specimen,
     is_exchangeable,
     output_columns,
     readings_at,
@@ -231,7 +232,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         points = first.points
 
         def posterior(share: ResponseShare | None) -> PopulationDraws:
-            if share is not None and likelihood.inputs.conditions:
+            has_own = likelihood.inputs.conditions or data.columns is not None
+            if share is not None and has_own:
                 got, advice = (
                     "NaN from the response for a share of the population that is not negligible",
                     "return inf there if these specimens fail, or a number beside all readings",
@@ -240,7 +242,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                     got, advice = "selected=", "pass the condition as a constant, or no limits"
                 raise DesignError(
                     f"{likelihood.name}: got {got}, expected a response of all specimens with "
-                    f"prb.response.condition, since that share depends on the condition; {advice}"
+                    "conditions or functions of their own, on which that share depends; "
+                    f"{advice}"
                 )
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
@@ -266,6 +269,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if likelihood.has_table:
             raise
         outputs = np.concatenate(runs.outputs) if runs.outputs else np.empty((0, 0))
+        _refuse_missing_outputs(likelihood, outputs, error)
         # The first runs are checked alone as well, because later runs may be far from the priors.
         for of_runs in (outputs, *runs.outputs[:1]):
             refuse_unreached(likelihood.name, of_runs, likelihood.readings)
@@ -275,6 +279,19 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     finally:
         for response in responses:
             response.on_start = None
+
+
+def _refuse_missing_outputs(
+    likelihood: SpecimenLikelihood, outputs: Floats, error: DesignError
+) -> None:
+    """Raise if functions by specimen returned NaN, which an error that follows does not name."""
+    count = int(np.isnan(outputs).any(axis=1).sum())
+    if columns_by_specimen(likelihood) is not None and count:
+        raise DesignError(
+            f"{likelihood.name}: got NaN in {count} of {len(outputs)} runs, expected numbers from "
+            "the functions of all specimens: where one of them returns NaN, a run counts for no "
+            f"specimen; return a number beside all readings there. Therefore: {error}"
+        ) from None
 
 
 @dataclass(eq=False)
@@ -374,6 +391,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         labels=specimen_labels(likelihood),
         remedies=partial(remedies_of, likelihood),
         draws=partial(PopulationDraws, populations),
+        columns=columns_by_specimen(likelihood),
     )
 
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import Floats, Indices
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
-from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.measurement import SpecimenLikelihood, columns_by_specimen, output_columns
 from prbayes.specimens.points import SpecimenPoints
 
 
@@ -50,24 +50,34 @@ class ReadingDensity:
     ) -> ReadingDensity:
         """Return the density at points; ``emulator_error``, (M,), is that of the outputs."""
         readings, stacked = likelihood.readings, likelihood.stacked
+        scales = [stacked.scale, stacked.relative, stacked.parameter, stacked.bias]
+        shape = readings.values.shape
+        numbers = np.broadcast_to(np.arange(shape[1]), shape)
+        variances = np.broadcast_to(emulator_error**2, shape)
+        columns_read = columns_by_specimen(likelihood)
+        if columns_read is not None:
+            numbers = columns_read
+            readings = readings.at_columns(numbers)
+            *scales, variances = (
+                np.take_along_axis(x, numbers, axis=1) for x in (*scales, variances)
+            )
         # Entries that only fill up the array of points get an arbitrary output.
         outputs = np.where(np.isfinite(points.outputs), points.outputs, 1e30)
         is_missing = ~(readings.is_measured | readings.is_censored)
         sums, constant = [], np.zeros((len(readings), 1))
-        first = 0
         for m in likelihood.measurements:
-            columns = np.arange(first, first + m.rows.shape[1])
-            first += len(columns)
+            columns = output_columns(likelihood, m)
             if list(m.unknown) != ["error"] or m.extras["error"].type.ndim:
                 continue
-            plain = _sums_of_squares(likelihood, columns, outputs, emulator_error)
+            is_counted = numbers >= columns.start
+            is_counted &= numbers < columns.stop
+            is_counted &= readings.is_measured | readings.is_censored
+            plain = _sums_of_squares(readings, scales[0], outputs, variances, is_counted)
             if plain is not None:
-                of_sums, log_scale = plain
-                sums.append(of_sums)
-                constant -= log_scale
-                is_missing[:, columns] = True
-        scales = [stacked.scale, stacked.relative, stacked.parameter, stacked.bias]
-        variance, places = emulator_error**2, None
+                sums.append((columns.start, *plain[0]))
+                constant -= plain[1]
+                is_missing |= is_counted
+        variance, places = variances[:, None], None
         size = (~is_missing).sum(axis=1).max()
         if size < outputs.shape[-1]:
             places = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
@@ -76,7 +86,10 @@ class ReadingDensity:
             readings = replace(readings, values=np.where(is_outside, np.nan, readings.values))
             outputs = np.take_along_axis(outputs, places[:, None], axis=2)
             scales = [np.take_along_axis(x, places, 1) for x in scales]
-            variance = variance[places][:, None]
+            variance = np.take_along_axis(variances, places, 1)[:, None]
+            numbers = np.take_along_axis(numbers, places, 1)
+        is_ordered = places is None and columns_read is None
+        has_bias = any("bias" in m.extras for m in likelihood.measurements)
         unit, relative, parameter, bias = (x[:, None] for x in scales)
         return cls(
             readings,
@@ -84,9 +97,9 @@ class ReadingDensity:
             unit,
             relative * np.abs(outputs) if relative.any() else None,
             parameter,
-            bias if any("bias" in m.extras for m in likelihood.measurements) else None,
+            bias if has_bias else None,
             variance,
-            places,
+            None if is_ordered else numbers,
             sums,
             constant,
         )
@@ -147,27 +160,28 @@ class ReadingDensity:
 
 
 def _sums_of_squares(
-    likelihood: SpecimenLikelihood, columns: Indices, outputs: Floats, emulator_error: Floats
-) -> tuple[tuple[int, Floats, Floats, float], Floats] | None:
-    """Return `ReadingDensity.sums` of a simulator, and logarithms of scales summed, (S, 1).
+    readings: Readings, scale: Floats, outputs: Floats, variance: Floats, is_counted: Bools
+) -> tuple[tuple[Floats, Floats, float], Floats] | None:
+    """Return squares, numbers and variance of `ReadingDensity.sums`, and log scales, (S, 1).
 
-    None if the readings are not plain, or the error of the emulator is not negligible.
+    These are sums over the readings that count, (S, k). None if the readings are not plain, or the
+    ``variance`` of the emulator's error, (S, k), is not negligible.
     """
-    readings = likelihood.readings.at_columns(np.tile(columns, (len(outputs), 1)))
-    is_measured = readings.is_measured
-    unit = np.where(is_measured, likelihood.stacked.scale[:, columns], 1.0)
-    relative = (emulator_error[columns] / unit) ** 2
+    unit = np.where(is_counted, scale, 1.0)
+    squared = unit**2
+    relative = variance / squared
     is_special = (readings.step != 0) | (readings.family >= 0) | readings.is_censored
     # With this tolerance a log-density changes by less than 1e-4 at an eighth of the largest
     # plausible error.
     is_special |= relative > 1e-6 * (readings.error / unit) ** 2
-    if is_special[is_measured].any():
+    if is_special[is_counted].any():
         return None
-    measured = np.where(is_measured, readings.values, 0.0)
-    inverse = np.where(is_measured, 1 / unit, 0.0)
+    measured = np.where(is_counted, readings.values, 0.0)
+    inverse = np.where(is_counted, 1 / unit, 0.0)
     squares = np.zeros(outputs.shape[:2])
-    for column, y, c in zip(columns, measured.T, inverse.T, strict=True):
-        squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
-    count = is_measured.sum(axis=1, keepdims=True, dtype=float)
-    sums = (int(columns[0]), squares, count, float(relative[is_measured].mean()))
+    for y, c, output in zip(measured.T, inverse.T, np.moveaxis(outputs, 2, 0), strict=True):
+        residuals = y[:, None] - output
+        squares += (residuals * c[:, None]) ** 2
+    count = is_counted.sum(axis=1, keepdims=True, dtype=float)
+    sums = (squares, count, float(relative[is_counted].mean()))
     return sums, np.log(unit).sum(axis=1, keepdims=True)

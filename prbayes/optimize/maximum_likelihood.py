@@ -653,6 +653,7 @@ def specimen_pool(
         data,
         readings=readings,
         known=np.tile(data.known, (copies, 1)),
+        columns=None if data.columns is None else np.tile(data.columns, (copies, 1)),
         options=replace(data.options, half_difference=tolerance),
         seed=1,
     )

@@ -1,6 +1,7 @@
 """The user's response: inputs, calls, failures and storage."""
 
 from prbayes.response.budget import BudgetError, Cost
+from prbayes.response.by_specimen import by_specimen
 from prbayes.response.condition import condition
 from prbayes.response.discrepancy import Additive, Multiplicative, Smooth
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
@@ -19,6 +20,7 @@ __all__ = [
     "Smooth",
     "Store",
     "StoreError",
+    "by_specimen",
     "condition",
     "group",
 ]

@@ -66,7 +66,7 @@ class SpecimenPoints:
     """Points of N specimens."""
 
     z: Floats  # (N, K, d): coordinates of the points
-    outputs: Floats  # (N, K, m): the emulator's outputs at the points
+    outputs: Floats  # (N, K, m): the emulator's outputs at the points, or those that were read
     # (N, K): the log-likelihood of a specimen under a density p of z is ``logsumexp(log p(z) +
     # log_a, axis=1)``; -inf for points that fill up the array
     log_a: Floats
@@ -200,19 +200,14 @@ class SpecimenData:
     # Function of hyperparameters, (S, p), that returns them as draws; for a part of the specimens.
     draws: Callable[[Floats], Draws] | None = None
     seed: int = 0
+    # (N, c): outputs of each specimen's own function, the only ones that points have; None where
+    # all specimens have the same function.
+    columns: Indices | None = None
 
     @property
     def free(self) -> Indices:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
-
-    @property
-    def box(self) -> Floats | None:
-        """Range of inputs, (2, d): that of the prior's data sets, and a quarter beyond it."""
-        if self.bounds is None:
-            return None
-        margin = 0.25 * (self.bounds[1] - self.bounds[0])
-        return np.stack([self.bounds[0] - margin, self.bounds[1] + margin])
 
     def scale(self, sd: Floats) -> Floats:
         """Return units of all coordinates, (d,), from those of the unknown coordinates, (free,)."""
@@ -242,6 +237,11 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
     if emulation.offsets is not None:
         target = target - emulation.offsets
     of_emulator = np.broadcast_to(emulation.error, target.shape)
+    box = None
+    if data.bounds is not None:
+        # The range of the prior's data sets, and a quarter beyond it.
+        margin = 0.25 * (data.bounds[1] - data.bounds[0])
+        box = np.stack([data.bounds[0] - margin, data.bounds[1] + margin])
     columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
     if 2 * count <= is_read.shape[1]:
         columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
@@ -257,9 +257,10 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         relative,
         population,
         data.known,
-        data.box,
+        box,
         data.order,
         columns,
+        data.columns is not None,
     )
 
 
@@ -351,15 +352,32 @@ def _as_starts(modes: Modes, starts: Floats) -> Floats:
     return result
 
 
+def reading_log_density(
+    data: SpecimenData, readings: Readings, outputs: Floats, error: Floats
+) -> Floats:
+    """Return the log-density of readings at outputs of points, (N, K); ``error`` is (m,)."""
+    if data.columns is None:
+        return readings.log_density(outputs, error)
+    of_outputs = readings.at_columns(data.columns)
+    return of_outputs.log_density(outputs, error[data.columns])
+
+
 def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
     """Return points of all specimens, ``count`` of each."""
     emulation = proposals.residuals.response
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
-    outputs = emulation.values(z.reshape(-1, d)).reshape(n, k, -1)
-    if emulation.offsets is not None:
-        outputs = outputs + emulation.offsets[:, None]
-    log_a = data.readings.log_density(outputs, emulation.error) - log_proposal
+    parts = []
+    for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
+        values = emulation.values(z[rows].reshape(-1, d))
+        values = values.reshape(len(rows), k, -1)
+        if emulation.offsets is not None:
+            values = values + emulation.offsets[rows, None]
+        if data.columns is not None:
+            values = np.take_along_axis(values, data.columns[rows, None], axis=2)
+        parts.append(values)
+    outputs = np.concatenate(parts)
+    log_a = reading_log_density(data, data.readings, outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)
     return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode)
@@ -493,7 +511,7 @@ def at_scale(
     if scale == 1.0:
         return points
     readings = scaled_errors(data.readings, scale)
-    log_a = readings.log_density(points.outputs, error) - points.log_proposal
+    log_a = reading_log_density(data, readings, points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 

@@ -73,6 +73,7 @@ class Residuals:
     order: Indices | None = None
     # (N, m): columns of the outputs that were measured of a specimen; None if all were.
     columns: Indices | None = None
+    allows_linear: bool = False  # whether maps that are nearly linear are replaced by linear ones
 
     @property
     def free(self) -> Indices:
@@ -84,6 +85,13 @@ class Residuals:
         z = self.known[specimen]
         z[:, self.free] = self.population.mean + a @ self.population.root.T
         return z
+
+    def is_possible(self, specimen: Indices, a: Floats) -> Bools:
+        """Return whether whitened inputs, (k, free), are in the range of possible ones."""
+        if self.box is None:
+            return np.ones(len(a), dtype=bool)
+        z = self.coordinates(specimen, a)
+        return np.asarray(((z >= self.box[0]) & (z <= self.box[1])).all(axis=1))
 
     def whitened(self, z: Floats) -> Floats:
         """Return whitened inputs, (..., free), of coordinates (..., d)."""
@@ -326,6 +334,21 @@ def _lowest(specimen: Indices, values: Floats, n: int) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
+class LinearMaps:
+    """Linear approximations of maps at their modes, which need no output for a point."""
+
+    is_used: Bools  # (R,): whether the map of a mode is replaced
+    values: Floats  # (R, free): xi at the mode
+    jacobian: Floats  # (R, free, free)
+
+    def __call__(self, mode: Indices, away: Floats) -> tuple[Floats, Floats]:
+        """Return xi, (k, free), and its Jacobian at distances from the modes, (k, free)."""
+        jacobian = self.jacobian[mode]
+        xi = self.values[mode] + np.einsum("kij,kj->ki", jacobian, away)
+        return xi, jacobian
+
+
+@dataclass(frozen=True, eq=False)
 class Proposals:
     """Proposals of specimens, one for each mode: maps xi of equation (2) and their inverses."""
 
@@ -343,6 +366,7 @@ class Proposals:
     # (R, free): directions that the readings leave open, along which populations differ
     open_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
+    linear: LinearMaps | None = None  # maps that replace some of the others
 
     @classmethod
     @one_thread()
@@ -370,9 +394,10 @@ class Proposals:
         orientation = orientation * np.sign(np.linalg.det(rotation))
         back = rotation.swapaxes(1, 2)
         first = np.arange(d) < is_open.sum(axis=1, keepdims=True)
-        return cls(
+        proposals = cls(
             residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
         )
+        return with_linear_maps(proposals) if residuals.allows_linear else proposals
 
     def is_open(self, scale: float = 1.0) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
@@ -406,10 +431,16 @@ class Proposals:
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
-        modes = self.modes
-        return self.mapped_errors(
-            mode, a, *self.residuals.errors(modes.specimen[mode], a, modes.scale[mode])
-        )
+        modes, residuals = self.modes, self.residuals
+        if self.linear is None:
+            errors = residuals.errors(modes.specimen[mode], a, modes.scale[mode])
+            return self.mapped_errors(mode, a, *errors)
+        e = np.zeros((len(a), residuals.target.shape[1]))
+        slopes = np.zeros((*e.shape, a.shape[1]))
+        rows = np.flatnonzero(~self.linear.is_used[mode])
+        at = mode[rows]
+        e[rows], slopes[rows] = residuals.errors(modes.specimen[at], a[rows], modes.scale[at])
+        return self.mapped_errors(mode, a, e, slopes)
 
     def mapped_errors(
         self, mode: Indices, a: Floats, e: Floats, slopes: Floats
@@ -417,7 +448,15 @@ class Proposals:
         """Return xi and its Jacobian at points with standardised errors e and slopes G."""
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
-        return xi, inputs + readings @ slopes
+        jacobian = inputs + readings @ slopes
+        if self.linear is not None:
+            rows = np.flatnonzero(self.linear.is_used[mode])
+            at = mode[rows]
+            xi[rows], jacobian[rows] = self.linear(at, a[rows] - self.modes.a[at])
+            specimen = self.modes.specimen[at]
+            is_possible = self.residuals.is_possible(specimen, a[rows])
+            xi[rows[~is_possible]] = np.nan
+        return xi, jacobian
 
     @np.errstate(all="ignore")
     def solved(self, mode: Indices, xi: Floats) -> tuple[Floats, Floats, Floats, Bools]:
@@ -557,6 +596,27 @@ class Proposals:
         return result
 
 
+def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0) -> Proposals:
+    """Return proposals in which linear maps replace those that are nearly linear in their bulk.
+
+    The largest difference is in standard deviations of a proposal. Weights of points vary more, but
+    a point needs one output instead of a solution.
+    """
+    modes = proposals.modes
+    count, d = modes.a.shape
+    every = np.arange(count)
+    values, jacobian = proposals.mapped_errors(every, modes.a, modes.errors, modes.slopes)
+    mode = np.repeat(every, points)
+    xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
+    away = _solutions(jacobian[mode], xi - values[mode])
+    mapped, _ = proposals.mapped(mode, modes.a[mode] + away)
+    difference = np.abs(mapped - xi).max(axis=1)
+    is_used = (difference < largest).reshape(count, points).all(axis=1)
+    open_axes = proposals.open_axes | is_used[:, None]
+    linear = LinearMaps(is_used, values, jacobian)
+    return replace(proposals, linear=linear, open_axes=open_axes)
+
+
 def mixing_weights(modes: Modes, mass: Floats) -> Floats:
     """Return mixing weights by the mass of each mode, (R,).
 
@@ -579,6 +639,7 @@ def _point_counts(share: Floats, table: Indices, count: int) -> Indices:
     return np.asarray(counts[table >= 0], dtype=np.intp)
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _log_mixture(
     proposals: Proposals,
     specimen: Indices,
@@ -587,8 +648,7 @@ def _log_mixture(
     drawn: tuple[Indices, Floats] | None,
 ) -> Floats:
     """Return `Proposals.log_mixture` of a block of points."""
-    with np.errstate(divide="ignore"):
-        logs = np.log(weights)
+    logs = np.log(weights)
     modes, residuals = proposals.modes, proposals.residuals
     values, jacobian = residuals.simulated(specimen, a)
     largest, terms = np.full(len(a), -np.inf), []
