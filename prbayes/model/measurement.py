@@ -445,7 +445,7 @@ def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:
     return not more and not first.covariates and all(x is None for x in of_rows)
 
 
-def columns_by_specimen(likelihood: SpecimenLikelihood) -> Indices | None:
+def own_columns(likelihood: SpecimenLikelihood) -> Indices | None:
     """Return outputs of each specimen's own functions, (S, c); None where all have the same."""
     functions = [of_specimens(m.responses.function) for m in likelihood.measurements]
     if not any(functions):

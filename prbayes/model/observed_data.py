@@ -181,11 +181,12 @@ def observed_at_conditions(
     """
     vectors = [x for x in inputs if isinstance(x, ReadingsCondition)]
     conditions = [*vectors, *(x for x in inputs if isinstance(x, Variable) and is_condition(x))]
-    if conditions and isinstance(metric, Metric) and not metric.by_specimen:
-        raise TypeError(
-            f"{name}: metric: got {called(metric)} with the condition {conditions[0].name} of each "
-            "specimen, expected prb.LogLikelihood(): a metric of distributions compares specimens "
-            "under the same conditions; leave metric= out, or write a simulator for each condition"
+    if conditions:
+        _refuse_distributions(
+            name,
+            metric,
+            f"the condition {conditions[0].name} of each specimen",
+            "under the same conditions; leave metric= out, or write a simulator for each condition",
         )
     _refuse_other_order(name, observed, metric, inputs)
     if not vectors:
@@ -238,12 +239,12 @@ def observed_by_specimen(
         return observed, metric, response
     places = np.array(functions.places)
     shape = np.shape(observed)
-    if isinstance(metric, Metric) and not metric.by_specimen:
-        raise TypeError(
-            f"{name}: metric: got {called(metric)} with functions of each specimen's own, expected "
-            "prb.LogLikelihood(): a metric of distributions compares specimens with the same "
-            "function; leave metric= out"
-        )
+    _refuse_distributions(
+        name,
+        metric,
+        "functions of each specimen's own",
+        "with the same function; leave metric= out",
+    )
     _refuse_times_beside_functions(name, inputs)
     if isinstance(observed, Variable | Mapping) or len(shape) not in (1, 2):
         raise TypeError(
@@ -321,6 +322,15 @@ def _labels_by_specimen(
         text = texts[int(np.argmax(places == k))]
         labels += [text] if np.ndim(observed) == 1 else [f"{text}[{j}]" for j in columns]
     return first, {**coords, f"{name}_reading": labels}
+
+
+def _refuse_distributions(name: str, metric: Any, differing: str, remedy: str) -> None:
+    """Raise if a metric would compare the distributions of specimens that differ."""
+    if isinstance(metric, Metric) and not metric.by_specimen:
+        raise TypeError(
+            f"{name}: metric: got {called(metric)} with {differing}, expected prb.LogLikelihood(): "
+            f"a metric of distributions compares specimens {remedy}"
+        )
 
 
 def _refuse_other_order(

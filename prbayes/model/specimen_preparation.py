@@ -32,9 +32,9 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
-    columns_by_specimen,
     is_exchangeable,
     output_columns,
+    own_columns,
     readings_at,
     rows_by_context,
     selection_of,
@@ -286,7 +286,7 @@ def _refuse_missing_outputs(
 ) -> None:
     """Raise if functions by specimen returned NaN, which an error that follows does not name."""
     count = int(np.isnan(outputs).any(axis=1).sum())
-    if columns_by_specimen(likelihood) is not None and count:
+    if own_columns(likelihood) is not None and count:
         raise DesignError(
             f"{likelihood.name}: got NaN in {count} of {len(outputs)} runs, expected numbers from "
             "the functions of all specimens: where one of them returns NaN, a run counts for no "
@@ -391,7 +391,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         labels=specimen_labels(likelihood),
         remedies=partial(remedies_of, likelihood),
         draws=partial(PopulationDraws, populations),
-        columns=columns_by_specimen(likelihood),
+        columns=own_columns(likelihood),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from prbayes._validate import Bools, Floats, Indices
 from prbayes.metrics.readings import Readings
-from prbayes.model.measurement import SpecimenLikelihood, columns_by_specimen, output_columns
+from prbayes.model.measurement import SpecimenLikelihood, output_columns, own_columns
 from prbayes.specimens.points import SpecimenPoints
 
 
@@ -54,7 +54,7 @@ class ReadingDensity:
         shape = readings.values.shape
         numbers = np.broadcast_to(np.arange(shape[1]), shape)
         variances = np.broadcast_to(emulator_error**2, shape)
-        columns_read = columns_by_specimen(likelihood)
+        columns_read = own_columns(likelihood)
         if columns_read is not None:
             numbers = columns_read
             readings = readings.at_columns(numbers)

@@ -86,7 +86,7 @@ def plot_individuals(
     """
     check_options(labels, pc_kwargs)
     share(prob, "prob")
-    groups = groups_of(individuals)
+    groups = specimen_groups(individuals)
     dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
     groups = {name: subset(group, coords, dims) for name, group in groups.items()}
     observed, replicates = groups["observed_data"], groups["posterior_predictive"]
@@ -114,7 +114,7 @@ def plot_individuals(
     return finish(figure)
 
 
-def groups_of(individuals: object) -> dict[str, xr.Dataset]:
+def specimen_groups(individuals: object) -> dict[str, xr.Dataset]:
     """Return the groups of the result of `individuals`, or raise if it is none."""
     trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
     groups = {name: tree.to_dataset() for name, tree in trees.items()}

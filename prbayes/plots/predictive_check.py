@@ -21,7 +21,7 @@ from prbayes.plots.canvas import (
     panels,
     refuse_labels,
 )
-from prbayes.plots.individuals import groups_of
+from prbayes.plots.individuals import specimen_groups
 from prbayes.plots.selection import FilterVars, VarNames, select_variables
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def plot_predictive_check(
     share(prob, "prob")
     positive_integer(bins, "bins")
     flag(corrected, "corrected")
-    groups = groups_of(individuals)
+    groups = specimen_groups(individuals)
     conditions = groups.get("constant_data", xr.Dataset())
     observed = groups["observed_data"]
     horizontal = {

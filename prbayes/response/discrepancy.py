@@ -105,12 +105,12 @@ class Smooth:
         conditions = conditions[chosen.round().astype(np.intp)]
         nodes = np.concatenate([conditions, grid])
         covariance = rational_quadratic(conditions, conditions, length)
-        of_data = whitening(covariance, 1e-6)
+        of_data = residual_whitening(covariance, 1e-6)
         at_grid = rational_quadratic(grid, conditions, length) @ of_data
         # The other terms are those of the process less its regression on the first ones.
         explained = at_grid @ at_grid.T
         rest = rational_quadratic(grid, grid, length) - explained
-        of_rest = whitening(rest, 0.05)
+        of_rest = residual_whitening(rest, 0.05)
         regression = of_data @ at_grid.T @ of_rest
         upper = np.concatenate([of_data, -regression], axis=1)
         zeros = np.zeros_like(at_grid)
@@ -160,7 +160,7 @@ def rational_quadratic(first: Floats, second: Floats, length: float) -> Floats:
     return np.asarray(1 / (1 + ratio))
 
 
-def whitening(covariance: Floats, dropped: float) -> Floats:
+def residual_whitening(covariance: Floats, dropped: float) -> Floats:
     """Return weights, (n, k), of the main components with unit variance.
 
     The others have at most the variance ``dropped`` in each element.

@@ -604,9 +604,9 @@ def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0
     """
     modes = proposals.modes
     count, d = modes.a.shape
-    every = np.arange(count)
-    values, jacobian = proposals.mapped_errors(every, modes.a, modes.errors, modes.slopes)
-    mode = np.repeat(every, points)
+    rows = np.arange(count)
+    values, jacobian = proposals.mapped_errors(rows, modes.a, modes.errors, modes.slopes)
+    mode = np.repeat(rows, points)
     xi = np.tile(ndtri(sobol(points, d, 2)), (count, 1))
     away = _solutions(jacobian[mode], xi - values[mode])
     mapped, _ = proposals.mapped(mode, modes.a[mode] + away)
