@@ -356,6 +356,11 @@ class SpecimenLikelihood:
         return self.has_table or self.measurements[0].propagation.calls_response
 
     @property
+    def is_random(self) -> bool:
+        """Whether the response is random, so that its distribution is emulated."""
+        return self.measurements[0].responses.repeats > 1
+
+    @property
     def has_table(self) -> bool:
         """Whether the response is a table of runs."""
         return isinstance(self.measurements[0].responses.function, Runs)

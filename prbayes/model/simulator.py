@@ -73,6 +73,7 @@ from prbayes.model.specimen_likelihood import (
     measurements_of,
     specimen_likelihoods,
 )
+from prbayes.model.stochastic_likelihood import refuse_random
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.condition import ReadingsCondition, refuse_vectors_of_specimens
@@ -88,6 +89,7 @@ from prbayes.response.inputs import (
 from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.pymc_dims import values_of
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
+from prbayes.response.stochastic import with_noise
 
 # Options of a propagation that concern the calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
@@ -225,6 +227,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         metric, observed = _read_summary(name, observed, unused, settings)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
+    inputs = with_noise(response, inputs, data.outputs.event)
+    variables = _read_inputs(name, response, inputs, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
     of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)
@@ -388,6 +392,8 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
         arguments.at_conditions,
         _measurement_variables(name, model, metric, partners),
     )
+    if measurement.responses.repeats > 1:
+        refuse_random(measurement, partners)
     likelihood = _joint_likelihood(measurement, partners, model)
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
     names = tuple(m.name for m in likelihood.measurements)

@@ -43,6 +43,7 @@ from prbayes.model.parameters import Hyperparameters, log_posterior, variables_a
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.remedies import remedies_of
 from prbayes.model.run_coverage import coverage_findings
+from prbayes.model.stochastic_likelihood import points_of_random_response
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -81,7 +82,8 @@ class Preparation:
 
     emulation: Emulation
     points: SpecimenPoints
-    proposals: Proposals  # proposals from which the points were drawn
+    # Proposals from which the points were drawn; None where specimens share their points.
+    proposals: Proposals | None
     # (S, p): posterior draws at which the estimates from both halves of the points agree.
     thetas: Floats
     findings: Findings  # findings about the data and the runs, before the fit
@@ -299,7 +301,8 @@ class CheckedRuns:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             names = dict(enumerate(_coordinate_names(likelihood)))
             of_population = {k: names[k] for k in likelihood.coordinates.inputs_of_population}
-            refuse_unused_inputs(likelihood.name, z, values, of_population)
+            if not likelihood.is_random:
+                refuse_unused_inputs(likelihood.name, z, values, of_population)
             if not any(
                 m.metric.error is not None or m.gross_errors is not False for m in measurements
             ):
@@ -380,6 +383,10 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
 def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Fit the emulator and place the points; return both with their findings."""
     likelihood = runs.likelihood
+    if likelihood.is_random:
+        shared = points_of_random_response(runs, data, likelihood, emulation)
+        findings = (*shared.findings, *_data_findings(likelihood, shared.emulation.y, several_roots=False))
+        return Preparation(shared.emulation, shared.points, None, shared.draws.thetas, findings)
     if likelihood.has_table:
         emulation, points, proposals, draws = points_of_tables(data, likelihood)
     elif likelihood.calls_response:

@@ -5,6 +5,7 @@ from prbayes.response.condition import condition
 from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.inputs import group
+from prbayes.response.stochastic import Stochastic
 from prbayes.response.store import Store, StoreError
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Replace",
     "ResponseError",
     "Retry",
+    "Stochastic",
     "Store",
     "StoreError",
     "condition",

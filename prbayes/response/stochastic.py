@@ -1,0 +1,141 @@
+"""Random responses: a function that may return another value at each call."""
+
+from __future__ import annotations
+
+import inspect
+import zlib
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pymc as pm
+
+from prbayes._validate import Function, Shape, called, positive_integer
+from prbayes.response.call import scalar, unwrapped
+from prbayes.response.response import refuse_misfit
+
+
+class Stochastic:
+    r"""A random response, whose distribution given the inputs is emulated from repeated runs.
+
+    The function may return another value at each call with the same inputs, such as an agent-based
+    model, a turbulent flow or a Monte Carlo code. With the log-likelihood by specimen,
+
+    .. math:: \log L(\theta) = \sum_i \log \int p(y_i \mid x)\, p(x \mid \theta)\, dx,
+
+    the density :math:`p(y \mid x)` is that of an emulator of the mean, of the spread, and of the
+    density of the residuals, which may be skewed, and correlated between outputs. The error of the
+    emulator by finitely many runs widens the posterior.
+
+    Parameters
+    ----------
+    function : callable
+        As for `Simulator`. Write ``prb.scalar(prb.response.Stochastic(f))`` for a function of one
+        specimen.
+    repeats : int
+        Number of runs with the same inputs, at least 2. Two runs at many inputs serve better than
+        many at few.
+    seed : int, optional
+        The function then takes ``rng``, a `numpy.random.Generator`, as a keyword argument; runs
+        are the same on each computer. By default the function has its own source of randomness.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
+    Notes
+    -----
+    The distribution of the residuals has to be the same at all inputs, up to mean and spread, and
+    between outputs up to their correlation; `prbayes.diagnose` tests it. A simulator gets one more
+    input for the noise, standard normal, which predictions draw as well.
+
+    References
+    ----------
+    .. [1] Rubin, D. B. (1981), The Bayesian bootstrap, Ann. Stat. 9, 130-134,
+       doi:10.1214/aos/1176345338.
+    .. [2] Baker, E. et al. (2022), Analyzing stochastic computer models: a review with
+       opportunities, Stat. Sci. 37, 64-89, doi:10.1214/21-STS822.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> queue = prb.response.Stochastic(lambda x, rng: x + rng.gumbel(size=x.shape), seed=1)
+    >>> data = np.random.default_rng(0).normal(3.0, 1.5, 30)
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 3, 2), pm.HalfNormal("s", 2))
+    ...     y = prb.Simulator("y", queue, x, observed=data)
+    >>> queue
+    prb.response.Stochastic(<lambda>, repeats=2, seed=1)
+    """
+
+    def __init__(self, function: Function, repeats: int = 2, seed: int | None = None) -> None:
+        label = "prb.response.Stochastic"
+        if isinstance(function, scalar):
+            raise TypeError(
+                f"{label}: function: got a prb.scalar, expected the function of one specimen in "
+                "it; write prb.scalar(prb.response.Stochastic(f)), with f = response.function"
+            )
+        if not callable(function) or isinstance(function, type):
+            raise TypeError(
+                f"{label}: function: got {called(function)}, expected a function of the inputs"
+            )
+        if isinstance(function, Stochastic):
+            raise TypeError(f"{label}: function: got a Stochastic, expected a plain function")
+        self.function = function
+        self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
+        self.seed = None if seed is None else positive_integer(seed, f"{label}: seed", minimum=0)
+        self._noise: dict[Shape, Any] = {}  # input for the noise by shape of the outputs
+
+    @property
+    def __name__(self) -> str:
+        return str(getattr(self.function, "__name__", type(self.function).__name__))
+
+    def __repr__(self) -> str:
+        seed = "" if self.seed is None else f", seed={self.seed}"
+        return f"prb.response.Stochastic({self.__name__}, repeats={self.repeats}{seed})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out variables of PyMC, which do not change the response."""
+        return {**vars(self), "_noise": {}}
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs, with that of the noise."""
+        try:
+            parameters = list(inspect.signature(self.function).parameters.values())
+        except (TypeError, ValueError):
+            return ()
+        names = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        return (*(name for name in names if name != "rng"), "noise")
+
+    def with_noise(self, inputs: Sequence[Any], event: Shape) -> list[Any]:
+        """Return the inputs and, unless they have it, a standard normal one of the event shape."""
+        noise = self._noise.get(event)
+        if noise is None:
+            noise = self._noise[event] = pm.Normal.dist(shape=event)
+            noise.name = "noise"
+        return [*(x for x in inputs if x is not noise), noise]
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Return the response; the last input is the noise, which numbers runs."""
+        *arguments, noise = inputs
+        if self.seed is None:
+            return self.function(*arguments)
+        numbers = [np.ascontiguousarray(x, dtype=np.float64) for x in (*arguments, noise)]
+        digest = zlib.crc32(b"".join(x.tobytes() for x in numbers))
+        return self.function(*arguments, rng=np.random.default_rng([self.seed, digest]))
+
+    def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any) -> None:
+        """Raise if the function does not take the inputs."""
+        function = self.function
+        if self.seed is not None:
+            function = partial(function, rng=None)
+        refuse_misfit(name, function, sizes[:-1], outputs)
+
+
+def with_noise(function: Function, inputs: Sequence[Any], event: Shape) -> list[Any]:
+    """Return the inputs of a function, with that for the noise of a random one."""
+    inner = unwrapped(function)
+    return inner.with_noise(inputs, event) if isinstance(inner, Stochastic) else list(inputs)
