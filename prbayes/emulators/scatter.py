@@ -9,7 +9,7 @@ remain.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
 from math import comb
@@ -186,7 +186,7 @@ def fit_scatter(
     unit = np.clip(region.unit(x), -1.0, 1.0)
     basis, of_spread = (legendre_products(unit, degree) for degree in degrees)
     fits = [_fit_output(basis, of_spread, of_output, weights) for of_output in y.T]
-    mean_terms, spread_terms, residuals = (np.stack(part, axis=-1) for part in zip(*fits))
+    mean_terms, spread_terms, residuals = (np.stack(part, axis=-1) for part in zip(*fits, strict=True))
     log_sd = of_spread @ spread_terms
     share = weights / weights.sum()
     residuals = residuals - share @ residuals

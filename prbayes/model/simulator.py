@@ -88,8 +88,8 @@ from prbayes.response.inputs import (
 )
 from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.pymc_dims import values_of
-from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
-from prbayes.response.stochastic import with_noise
+from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable, repeats_of
+from prbayes.response.stochastic import noise_of
 
 # Options of a propagation that concern the calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
@@ -227,8 +227,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         metric, observed = _read_summary(name, observed, unused, settings)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
-    inputs = with_noise(response, inputs, data.outputs.event)
-    variables = _read_inputs(name, response, inputs, model)
+    if repeats_of(response) > 1:
+        inputs = [*inputs, noise_of(data.outputs.event)]
+        variables = _read_inputs(name, response, inputs, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
     of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)

@@ -286,7 +286,8 @@ def log_likelihood_graph(
     result = logsumexp_finite(terms)
     if prepared(likelihood).points.tilts is not None:
         of_points = pt.exp(terms - pt.switch(pt.isinf(result), 0.0, result)[:, None])
-        factors = pt.matmul(of_points[:, None], emulator_factors(likelihood))[:, 0]
+        # A product of matrices for each specimen would take a minute to compile.
+        factors = (of_points[:, :, None] * emulator_factors(likelihood)).sum(axis=1)
         return mean_over_emulators(result, factors, measurements[0].weights, pt)
     if share is not None:
         result = result - _log_share(likelihood, params, share)

@@ -43,7 +43,7 @@ from prbayes.model.parameters import Hyperparameters, log_posterior, variables_a
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.remedies import remedies_of
 from prbayes.model.run_coverage import coverage_findings
-from prbayes.model.stochastic_likelihood import points_of_random_response
+from prbayes.model.stochastic_likelihood import points_of_random_response, random_cost
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -108,7 +108,7 @@ def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> Specim
     The log-likelihood of a population needs fewer points than the inputs of a specimen.
     """
     preparation = prepared(likelihood)
-    if preparation.points.log_a.shape[1] >= count:
+    if preparation.proposals is None or preparation.points.log_a.shape[1] >= count:
         return likelihood
     data = specimen_data(likelihood)
     points = draw_points(data, preparation.proposals, count, data.seed + 1)
@@ -132,6 +132,7 @@ def with_specimens(
         result = likelihood.observing({measurement.name: values})
         results.append(_of_same_populations(result, likelihood))
     joint, added = results
+    assert preparation.proposals is not None  # `update` refuses random responses
     data, reference = specimen_data(added), preparation.proposals.residuals.population
     proposals = fit_proposals(data, preparation.emulation, reference)
     count = data.options.points * proposals.modes.table.shape[1]
@@ -201,6 +202,8 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     if likelihood.has_table:
         n = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
         return RunCost(n, 0, n, "none: the table has all runs")
+    if likelihood.is_random:
+        return random_cost(likelihood, first_run_count(likelihood))
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.sampled + 2)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
@@ -385,7 +388,8 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
     likelihood = runs.likelihood
     if likelihood.is_random:
         shared = points_of_random_response(runs, data, likelihood, emulation)
-        findings = (*shared.findings, *_data_findings(likelihood, shared.emulation.y, several_roots=False))
+        of_data = _data_findings(likelihood, shared.emulation.y, several_roots=False)
+        findings = (*shared.findings, *of_data)
         return Preparation(shared.emulation, shared.points, None, shared.draws.thetas, findings)
     if likelihood.has_table:
         emulation, points, proposals, draws = points_of_tables(data, likelihood)

@@ -8,9 +8,16 @@ import numpy as np
 
 from prbayes._validate import ArrayFunction
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
+from prbayes.response.budget import RunCost
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import SpecimenData
-from prbayes.specimens.shared_points import Noise, RandomResponse, SharedPoints, shared_points
+from prbayes.specimens.shared_points import (
+    Noise,
+    RandomResponse,
+    RandomRunOptions,
+    SharedPoints,
+    shared_points,
+)
 
 
 def points_of_random_response(
@@ -29,6 +36,19 @@ def points_of_random_response(
     noise = Noise(coordinates.center[-n_noise:], coordinates.half_width[-n_noise:])
     repeats = likelihood.measurements[0].responses.repeats
     return shared_points(RandomResponse(run, data, repeats, noise), earlier)
+
+
+def random_cost(likelihood: SpecimenLikelihood, stated: int | None) -> RunCost:
+    """Return the runs for the emulator of a random response; ``stated`` is the user's number."""
+    (measurement,) = likelihood.measurements
+    options, repeats = RandomRunOptions(), measurement.responses.repeats
+    n_inputs = likelihood.coordinates.size - measurement.rows.shape[1]
+    count = repeats * options.distinct_inputs(stated, n_inputs, repeats)
+    growth = (
+        f"in all, {repeats} with the same inputs; doubled, up to {max(options.most, count)}, until "
+        "the readings do not choose between the emulators that the runs allow"
+    )
+    return RunCost(count, 0, max(options.most, count), growth)
 
 
 def refuse_random(measurement: Measurement, partners: Sequence[SpecimenLikelihood]) -> None:

@@ -594,6 +594,8 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
     if obstacle is not None:
         return obstacle
     for likelihood in evaluator.likelihoods:
+        if likelihood.is_random:
+            return f"the response of {likelihood.name} is random"
         if likelihood.readings.is_censored.any():
             return f"readings of {likelihood.name} are censored, and new ones cannot be drawn"
         is_measured = likelihood.readings.is_measured
@@ -656,6 +658,7 @@ def specimen_pool(
         options=replace(data.options, half_difference=tolerance),
         seed=1,
     )
+    assert preparation.proposals is not None  # `simulation_obstacle` excludes random responses
     proposals = fit_proposals(
         data,
         replace(preparation.emulation, offsets=None),

@@ -87,6 +87,11 @@ def refuse_misfit(
         inner.refuse_misfit(name, sizes, outputs)
 
 
+def repeats_of(function: Function) -> int:
+    """Return how many runs with the same inputs a random response needs; 1 for another one."""
+    return int(getattr(unwrapped(function), "repeats", 1))
+
+
 def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
@@ -173,7 +178,7 @@ class Responses:
         self.outputs = outputs
         self.function = function
         # Number of runs with the same inputs that a random response needs; 1 for another one.
-        self.repeats: int = getattr(unwrapped(function), "repeats", 1)
+        self.repeats = repeats_of(function)
         self.inputs = inputs
         # A function of batches without other settings is called once for a whole batch.
         self.is_batched = (

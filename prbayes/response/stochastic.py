@@ -12,7 +12,7 @@ import numpy as np
 import pymc as pm
 
 from prbayes._validate import Function, Shape, called, positive_integer
-from prbayes.response.call import scalar, unwrapped
+from prbayes.response.call import scalar
 from prbayes.response.response import refuse_misfit
 
 
@@ -86,7 +86,6 @@ class Stochastic:
         self.function = function
         self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
         self.seed = None if seed is None else positive_integer(seed, f"{label}: seed", minimum=0)
-        self._noise: dict[Shape, Any] = {}  # input for the noise by shape of the outputs
 
     @property
     def __name__(self) -> str:
@@ -96,10 +95,6 @@ class Stochastic:
         seed = "" if self.seed is None else f", seed={self.seed}"
         return f"prb.response.Stochastic({self.__name__}, repeats={self.repeats}{seed})"
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out variables of PyMC, which do not change the response."""
-        return {**vars(self), "_noise": {}}
-
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs, with that of the noise."""
@@ -107,16 +102,9 @@ class Stochastic:
             parameters = list(inspect.signature(self.function).parameters.values())
         except (TypeError, ValueError):
             return ()
-        names = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        names = [p.name for p in parameters if p.kind in positional]
         return (*(name for name in names if name != "rng"), "noise")
-
-    def with_noise(self, inputs: Sequence[Any], event: Shape) -> list[Any]:
-        """Return the inputs and, unless they have it, a standard normal one of the event shape."""
-        noise = self._noise.get(event)
-        if noise is None:
-            noise = self._noise[event] = pm.Normal.dist(shape=event)
-            noise.name = "noise"
-        return [*(x for x in inputs if x is not noise), noise]
 
     def __call__(self, *inputs: Any) -> Any:
         """Return the response; the last input is the noise, which numbers runs."""
@@ -135,7 +123,8 @@ class Stochastic:
         refuse_misfit(name, function, sizes[:-1], outputs)
 
 
-def with_noise(function: Function, inputs: Sequence[Any], event: Shape) -> list[Any]:
-    """Return the inputs of a function, with that for the noise of a random one."""
-    inner = unwrapped(function)
-    return inner.with_noise(inputs, event) if isinstance(inner, Stochastic) else list(inputs)
+def noise_of(event: Shape) -> Any:
+    """Return the input for the noise of outputs of this shape: standard normal numbers."""
+    noise = pm.Normal.dist(shape=event)
+    noise.name = "noise"
+    return noise

@@ -149,6 +149,11 @@ def _updatable(model: pm.Model, caller: str) -> SpecimenLikelihood:
             f"{caller}: {likelihood.name}: got specimens with groups, labels, weights or "
             f"conditions, which new ones lack, expected none; {_AGAIN}"
         )
+    if likelihood.is_random:
+        raise TypeError(
+            f"{caller}: {likelihood.name}: got a random response, whose emulator is that of the "
+            f"first specimens, expected a deterministic one; {_AGAIN}"
+        )
     if prepared(likelihood).emulation.offsets is not None:
         raise DesignError(
             f"{likelihood.name}: got an emulator that runs at each specimen correct, expected one "

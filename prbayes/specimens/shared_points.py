@@ -44,6 +44,10 @@ class RandomRunOptions:
     reach: float = 3.5  # half the width of the region of runs, in standard deviations
     level: float = 1e-3  # size of the tests of the emulator
 
+    def distinct_inputs(self, stated: int | None, n_inputs: int, repeats: int) -> int:
+        """Return the number of distinct inputs of runs, without growth."""
+        return max((stated or max(self.runs, 64 * n_inputs)) // repeats, 32)
+
 
 @dataclass(frozen=True, eq=False)
 class RandomRuns:
@@ -295,8 +299,7 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
     """
     options, data = response.options, response.data
     n_inputs = len(response.free) + len(response.conditions)
-    count = data.options.n_first or max(options.runs, 64 * n_inputs)
-    count = max(count // response.repeats, 32)
+    count = options.distinct_inputs(data.options.n_first, n_inputs, response.repeats)
     if earlier is None:
         runs, batches = response.first_runs(count // 4), [count // 4, count - count // 2]
         region = response.region(data.inner, options.reach)
