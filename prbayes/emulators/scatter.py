@@ -186,7 +186,9 @@ def fit_scatter(
     unit = np.clip(region.unit(x), -1.0, 1.0)
     basis, of_spread = (legendre_products(unit, degree) for degree in degrees)
     fits = [_fit_output(basis, of_spread, of_output, weights) for of_output in y.T]
-    mean_terms, spread_terms, residuals = (np.stack(part, axis=-1) for part in zip(*fits, strict=True))
+    mean_terms, spread_terms, residuals = (
+        np.stack(part, axis=-1) for part in zip(*fits, strict=True)
+    )
     log_sd = of_spread @ spread_terms
     share = weights / weights.sum()
     residuals = residuals - share @ residuals
@@ -252,9 +254,7 @@ def emulator_draws(
     return [fit_scatter(region, x, y, places, degrees, row) for row in weights]
 
 
-def chosen_degrees(
-    region: Region, x: Floats, y: Floats, places: Indices
-) -> tuple[int, int]:
+def chosen_degrees(region: Region, x: Floats, y: Floats, places: Indices) -> tuple[int, int]:
     """Return degrees of mean and log-spread: those of the mean with the least left-out error.
 
     A fit without an input leaves out all of its repeats. At most a sixth of the distinct inputs are
@@ -286,5 +286,3 @@ def chosen_degrees(
             total += float(np.log(((left_out * of_spread) ** 2).mean()))
         errors.append(total)
     return int(np.argmin(errors)) + 1 if errors else 0, spread
-
-

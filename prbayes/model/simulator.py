@@ -627,6 +627,12 @@ def _add_by_metric(
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
+    if repeats_of(arguments.response) > 1:
+        raise TypeError(
+            f"{name}: metric: got {called(metric)} for a random response "
+            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass the function itself with "
+            "prb.AreaMetric() and propagation=prb.Fresh()"
+        )
     if inputs.covariates:
         text = (
             f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "

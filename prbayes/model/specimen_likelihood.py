@@ -53,7 +53,7 @@ from prbayes.model.unknown_error import ReadingDensity
 from prbayes.numerics.threads import one_thread
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
-from prbayes.specimens.response_share import ResponseShare
+from prbayes.specimens.shared_points import PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
 
@@ -146,6 +146,9 @@ def _over_emulators(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
                 logs[place, rows] = (np.log(total) + largest)[:, :, 0].T
             ratio = (weights @ factors[rows]) / np.where(total > 0, total, 1.0)
             changes[place, rows] = ratio.swapaxes(0, 1)
+    share = prepared(likelihood).share
+    if share is not None:
+        logs = logs - log_shares(likelihood, values, share)
     return np.asarray(mean_over_emulators(logs, changes, likelihood.measurements[0].weights, np))
 
 
@@ -284,13 +287,16 @@ def log_likelihood_graph(
     if not likelihood.error_is_known:
         terms = terms + _reading_density(likelihood)(unknown, pt)
     result = logsumexp_finite(terms)
+    if share is not None:
+        log_share = _log_share(likelihood, params, share)
     if prepared(likelihood).points.tilts is not None:
         of_points = pt.exp(terms - pt.switch(pt.isinf(result), 0.0, result)[:, None])
         # A product of matrices for each specimen would take a minute to compile.
         factors = (of_points[:, :, None] * emulator_factors(likelihood)).sum(axis=1)
+        result = result if share is None else result - log_share
         return mean_over_emulators(result, factors, measurements[0].weights, pt)
     if share is not None:
-        result = result - _log_share(likelihood, params, share)
+        result = result - log_share
     if stacked.repeats is not None:
         result = result + stacked.repeats.log_density(unknown[0], pt)
     gross_share = measurements[0].gross_errors
@@ -329,7 +335,7 @@ def _log_density(
 
 
 def _log_share(
-    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
+    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: PopulationShare
 ) -> Any:
     """Return the graph of the log share of each population with a response, by specimen, (S,)."""
     coordinates, contexts = (
@@ -345,6 +351,8 @@ def _log_share(
     log_b = share.log_b + coordinates.log_jacobian(share.z)
     log_p = _log_density(likelihood, params, points, pt.as_tensor(specimens))
     terms = log_p.reshape((size, len(share.z))) + pytensor.shared(log_b)
+    if not share.is_conditional:
+        return pt.maximum(logsumexp_finite(terms), 0.0)[context]
     inside = logsumexp_finite(terms[:, : share.with_response])
     outside = logsumexp_finite(terms[:, share.with_response :])
     is_unknown = pt.isinf(inside)

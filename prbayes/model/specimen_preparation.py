@@ -72,7 +72,8 @@ from prbayes.specimens.points import (
     specimen_points,
 )
 from prbayes.specimens.proposals import Proposals
-from prbayes.specimens.response_share import ResponseShare, response_share
+from prbayes.specimens.response_share import response_share
+from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
 
@@ -88,7 +89,7 @@ class Preparation:
     thetas: Floats
     findings: Findings  # findings about the data and the runs, before the fit
     # Share of a population with a response; None if it hardly changes the log-likelihood.
-    share: ResponseShare | None = None
+    share: PopulationShare | None = None
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
@@ -234,8 +235,10 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if any(finding.code == "readings-misfit" for finding in first.findings):
             refuse_unreached(likelihood.name, first.emulation.y, likelihood.readings)
         points = first.points
+        if likelihood.is_random:
+            return replace(first, findings=report(*runs.findings, *first.findings))
 
-        def posterior(share: ResponseShare | None) -> PopulationDraws:
+        def posterior(share: PopulationShare | None) -> PopulationDraws:
             if share is not None and likelihood.inputs.conditions:
                 got, advice = (
                     "NaN from the response for a share of the population that is not negligible",
@@ -390,7 +393,8 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         shared = points_of_random_response(runs, data, likelihood, emulation)
         of_data = _data_findings(likelihood, shared.emulation.y, several_roots=False)
         findings = (*shared.findings, *of_data)
-        return Preparation(shared.emulation, shared.points, None, shared.draws.thetas, findings)
+        thetas, mass = shared.draws.thetas, PointMass.of(shared.points)
+        return Preparation(shared.emulation, shared.points, None, thetas, findings, mass)
     if likelihood.has_table:
         emulation, points, proposals, draws = points_of_tables(data, likelihood)
     elif likelihood.calls_response:
@@ -566,7 +570,7 @@ def _data_findings(
 
 
 def log_shares(
-    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: ResponseShare
+    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: PopulationShare
 ) -> Floats:
     """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
     result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
@@ -639,7 +643,7 @@ class SpecimenPopulations:
         spread = log_sd.std(axis=0) if len(log_sd) else np.zeros(z.shape[-1])
         return np.argsort(-spread, kind="stable")
 
-    def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
+    def log_share(self, thetas: Floats, share: PopulationShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
         values = variables_at(self.hyperparameters, thetas)
         return log_shares(self.likelihood, values, share).sum(axis=1)
@@ -676,7 +680,7 @@ class SpecimenPopulations:
         z: Floats,
         log_a: Floats,
         smoothing: Floats | None = None,
-        share: ResponseShare | None = None,
+        share: PopulationShare | None = None,
         seed: int = 0,
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
@@ -762,7 +766,7 @@ class PopulationDraws:
         """Return log p(y_i | theta) at a quarter of the draws, (S, N)."""
         return self.populations.log_likelihoods(self.thetas[::4], z, log_a)
 
-    def log_share(self, share: ResponseShare) -> Floats:
+    def log_share(self, share: PopulationShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""
         return self.populations.log_share(self.thetas, share)
 

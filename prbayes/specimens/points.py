@@ -162,11 +162,15 @@ class Draws(Protocol):
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
         """Return log p(y_i | theta), (S, N)."""
 
+    def log_share(self, share: Any) -> Floats:
+        """Return the sum over specimens of the log of a share of their populations, (S,)."""
+
     def specimens(self) -> Floats:
         """Return coordinates of specimens, (n, d)."""
 
 
-type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
+# Function of points, numbers A, a smoothing and, optionally, a share of the populations
+type Posterior = Callable[..., Draws]
 
 
 def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:

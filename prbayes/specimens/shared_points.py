@@ -10,9 +10,9 @@ in common: the likelihood of the specimens is a mean over these draws.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.special import fdtrc, logsumexp, ndtr, ndtri
@@ -23,8 +23,12 @@ from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.scatter import Region, Scatter, chosen_degrees, emulator_draws, fit_scatter
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.propagation.population_density import PopulationDensity
+from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import DifferencedResponse, Emulation, half_difference
 from prbayes.specimens.points import Draws, SpecimenData, SpecimenPoints, normal_of
+from prbayes.specimens.response_share import ResponseShare
+from prbayes.specimens.weighted_points import WeightedPoints
 
 _PAGE = "random_responses.md#what-is-checked"
 
@@ -92,6 +96,37 @@ class Noise:
     def coordinates(self, noise: Floats) -> Floats:
         """Return the coordinates of noise, (..., m)."""
         return np.asarray((noise - self.center) / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class PointMass:
+    r"""Mass of populations at shared points, :math:`\sum_k p(x_k) / (K q(x_k))`.
+
+    It is the probability of the region of the points, unless the population is narrower than the
+    distances between points. One that contains a point then has a mass above one, by which its
+    likelihood is divided: otherwise the posterior would be drawn to the points.
+    """
+
+    z: Floats  # (K, d): coordinates of the points
+    log_b: Floats  # (K,): minus the log of K times the proposal density of z
+    is_conditional: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, points: SpecimenPoints) -> PointMass:
+        """Return the mass of points; all specimens have the same one."""
+        return cls(points.z[0], -points.log_proposal[0])
+
+    def of_populations(
+        self, density: PopulationDensity, parents: Sequence[Floats], coordinates: Coordinates
+    ) -> Floats:
+        """Return the log of a mass above one, and zero otherwise, (S,), at parents (S, *shape)."""
+        log_b = self.log_b + coordinates.log_jacobian(self.z)
+        x = [v[None] for v in coordinates.inputs(self.z)]
+        points = WeightedPoints.of(density, x, log_b[None])
+        return np.maximum(points.log_likelihoods(parents)[:, 0], 0.0)
+
+
+type PopulationShare = ResponseShare | PointMass
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,9 +269,11 @@ class RandomResponse:
         if len(scatters) > 1:
             tilts = np.clip(np.stack(logs[1:], axis=2) - logs[0][..., None], -100.0, 100.0)
         flat = x if len(x) == n else np.repeat(x, n, axis=0)
-        outputs = scatters[0].outputs(
-            flat.reshape(n * count, -1), noise.reshape(n * count, -1)
-        ).reshape(n, count, -1)
+        outputs = (
+            scatters[0]
+            .outputs(flat.reshape(n * count, -1), noise.reshape(n * count, -1))
+            .reshape(n, count, -1)
+        )
         single = np.ones(n, dtype=np.intp), np.zeros((n, count), dtype=np.intp)
         log_a = logs[0] - log_proposal
         return SpecimenPoints(z, outputs, log_a, log_proposal, *single, tilts=tilts)
@@ -250,13 +287,17 @@ class RandomResponse:
         return (np.concatenate([steps, steps + 1]) + 0.5) / count
 
 
-def halves_of(points: SpecimenPoints) -> list[SpecimenPoints]:
-    """Return both halves of the points, each with the numbers A of all points."""
-    half = points.log_a.shape[1] // 2
-    return [
-        replace(points, z=points.z[:, part], log_a=points.log_a[:, part] + np.log(2))
-        for part in (slice(half), slice(half, None))
-    ]
+def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
+    """Return half of the points, with the numbers A of all points."""
+    log_a, log_proposal = points.log_a[:, part] + np.log(2), points.log_proposal[:, part]
+    z = points.z[:, part]
+    return replace(points, z=z, log_a=log_a, log_proposal=log_proposal - np.log(2))
+
+
+def log_likelihoods_of(draws: Draws, points: SpecimenPoints) -> Floats:
+    """Return log-likelihoods of all specimens at a quarter of the draws, (S, 1)."""
+    logs = draws.log_likelihoods(points.z, points.log_a).sum(axis=1)
+    return np.asarray(logs - draws.log_share(PointMass.of(points))[::4])[:, None]
 
 
 def agreeing_shared_points(
@@ -267,8 +308,9 @@ def agreeing_shared_points(
     count = options.points
     while True:
         points = response.points(scatters[:1], region, response.cube(count))
-        first, second = (draws.log_likelihoods(p.z, p.log_a) for p in halves_of(points))
-        difference = half_difference(first, second)
+        parts = slice(count // 2), slice(count // 2, None)
+        halves = [log_likelihoods_of(draws, half_of(points, part)) for part in parts]
+        difference = half_difference(*halves)
         if difference[1] <= limit:
             points = response.points(scatters, region, response.cube(count))
             return replace(points, difference=difference[1])
@@ -315,7 +357,7 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         n_inside = len(np.unique(runs.inside(region).places))
         scatters = response.emulators(region, runs, options.draws)
         points = agreeing_shared_points(response, scatters, region, draws)
-        draws = data.posterior(points.z, points.log_a, None)
+        draws = data.posterior(points.z, points.log_a, None, PointMass.of(points))
         shares, shift = draw_shares(draws, points)
         effective = float(np.mean(1 / (shares**2).sum(axis=1)))
         n_places = int(runs.places.max()) + 1
@@ -345,7 +387,7 @@ def coarse_draws(response: RandomResponse, runs: RandomRuns, region: Region) -> 
     """Return posterior draws from the emulator of the first runs."""
     scatters = response.emulators(region, runs, 0)
     points = response.points(scatters, region, response.cube(response.options.points))
-    return response.data.posterior(points.z, points.log_a, None)
+    return response.data.posterior(points.z, points.log_a, None, PointMass.of(points))
 
 
 def draw_shares(draws: Draws, points: SpecimenPoints) -> tuple[Floats, float]:
@@ -372,9 +414,7 @@ def draw_shares(draws: Draws, points: SpecimenPoints) -> tuple[Floats, float]:
     return shares, float((means.std(axis=0) / sd).max())
 
 
-def scatter_findings(
-    response: RandomResponse, scatter: Scatter, runs: RandomRuns
-) -> list[Finding]:
+def scatter_findings(response: RandomResponse, scatter: Scatter, runs: RandomRuns) -> list[Finding]:
     """Report a mean that lacks detail, and residuals whose distribution differs by region."""
     data, level = response.data, response.options.level
     x = runs.z[:, : len(scatter.region.center)]
