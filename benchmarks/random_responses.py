@@ -30,11 +30,12 @@ _SHAPE, _N, _PROB = 4.0, 40, 0.89
 
 def gamma_noise(rng: np.random.Generator, shape: Any) -> Floats:
     """Return noise with mean zero, variance one and skewness one."""
-    return (rng.gamma(_SHAPE, size=shape) - _SHAPE) / np.sqrt(_SHAPE)
+    return np.asarray((rng.gamma(_SHAPE, size=shape) - _SHAPE) / np.sqrt(_SHAPE))
 
 
 def log_noise(e: Floats) -> Floats:
-    return stats.gamma.logpdf(e * np.sqrt(_SHAPE) + _SHAPE, _SHAPE) + 0.5 * np.log(_SHAPE)
+    logs = stats.gamma.logpdf(e * np.sqrt(_SHAPE) + _SHAPE, _SHAPE)
+    return np.asarray(logs + 0.5 * np.log(_SHAPE))
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def log_two(y: Floats, x: Floats) -> Floats:
     spreads = 0.25 * np.exp(0.2 * a), 0.3 * np.exp(-0.2 * b)
     g = (y[:, :1] - (a + 0.3 * b + 0.1 * a**2)) / spreads[0]
     h = ((y[:, 1:] - (b - 0.5 * a)) / spreads[1] - 0.6 * g) / 0.8
-    return log_noise(g) + log_noise(h) - np.log(0.8 * spreads[0] * spreads[1])
+    return np.asarray(log_noise(g) + log_noise(h) - np.log(0.8 * spreads[0] * spreads[1]))
 
 
 CASES = {"one": Case(one, log_one, (1.0,), 800), "two": Case(two, log_two, (1.0, 0.0), 70)}
@@ -94,7 +95,7 @@ def exact(case: Case, y: Floats) -> tuple[Floats, Floats]:
         with np.errstate(divide="ignore"):
             logs = np.log(density @ likelihoods).sum(axis=1)
         prior = stats.norm.logpdf(mean, case.means, 1.0) + stats.halfnorm.logpdf(sd) + log_sd
-        return logs + prior.sum(axis=1)
+        return np.asarray(logs + prior.sum(axis=1))
 
     center = np.r_[case.means, np.full(d, np.log(0.5))]
     covariance = np.diag(np.full(2 * d, 0.15**2))

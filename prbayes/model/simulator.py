@@ -228,7 +228,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
     if repeats_of(response) > 1:
-        inputs = [*inputs, noise_of(data.outputs.event)]
+        inputs = (*inputs, noise_of(data.outputs.event))
         variables = _read_inputs(name, response, inputs, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
@@ -630,8 +630,8 @@ def _add_by_metric(
     if repeats_of(arguments.response) > 1:
         raise TypeError(
             f"{name}: metric: got {called(metric)} for a random response "
-            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass the function itself with "
-            "prb.AreaMetric() and propagation=prb.Fresh()"
+            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass "
+            "the function itself with prb.AreaMetric() and propagation=prb.Fresh()"
         )
     if inputs.covariates:
         text = (

@@ -120,7 +120,9 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
 def emulator_factors(likelihood: SpecimenLikelihood) -> Any:
     """Return the shared variable of factors of exp(A) in draws of the emulator, (N, K, B)."""
     if "factors" not in likelihood.cache:
-        factors = np.exp(prepared(likelihood).points.tilts)
+        tilts = prepared(likelihood).points.tilts
+        assert tilts is not None
+        factors = np.exp(tilts)
         likelihood.cache["factors"] = pytensor.shared(factors, name=f"{likelihood.name}_factors")
     return likelihood.cache["factors"]
 
@@ -337,7 +339,7 @@ def _log_density(
 def _log_share(
     likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: PopulationShare
 ) -> Any:
-    """Return the graph of the log share of each population with a response, by specimen, (S,)."""
+    """Return the graph of the log share, or mass, of each specimen's population, (S,)."""
     coordinates, contexts = (
         likelihood.coordinates,
         [rows for _, rows in rows_by_context(likelihood)],
@@ -351,10 +353,10 @@ def _log_share(
     log_b = share.log_b + coordinates.log_jacobian(share.z)
     log_p = _log_density(likelihood, params, points, pt.as_tensor(specimens))
     terms = log_p.reshape((size, len(share.z))) + pytensor.shared(log_b)
-    if not share.is_conditional:
+    count = share.with_response
+    if count is None:  # a mass, of which only an excess above one counts
         return pt.maximum(logsumexp_finite(terms), 0.0)[context]
-    inside = logsumexp_finite(terms[:, : share.with_response])
-    outside = logsumexp_finite(terms[:, share.with_response :])
+    inside, outside = logsumexp_finite(terms[:, :count]), logsumexp_finite(terms[:, count:])
     is_unknown = pt.isinf(inside)
     log_ratio = outside - pt.switch(is_unknown, 0.0, inside)
     return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))[context]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -34,8 +34,7 @@ class Stochastic:
         As for `Simulator`. Write ``prb.scalar(prb.response.Stochastic(f))`` for a function of one
         specimen.
     repeats : int
-        Number of runs with the same inputs, at least 2. Two runs at many inputs serve better than
-        many at few.
+        Number of runs with the same inputs, at least 2.
     seed : int, optional
         The function then takes ``rng``, a `numpy.random.Generator`, as a keyword argument; runs
         are the same on each computer. By default the function has its own source of randomness.
@@ -83,6 +82,18 @@ class Stochastic:
             )
         if isinstance(function, Stochastic):
             raise TypeError(f"{label}: function: got a Stochastic, expected a plain function")
+        parameter = _parameters(function).get("rng")
+        if seed is None and parameter is not None and parameter.default is parameter.empty:
+            raise TypeError(
+                f"{label}: seed: got none for a function of rng, expected an integer, such as "
+                "seed=0, from which its random generator rng is made"
+            )
+        if seed is not None and parameter is None:
+            raise TypeError(
+                f"{label}: function: got seed={seed!r:.40} for a function without the argument "
+                "rng, expected one that takes a numpy.random.Generator by this name; add it, or "
+                "leave seed= out"
+            )
         self.function = function
         self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
         self.seed = None if seed is None else positive_integer(seed, f"{label}: seed", minimum=0)
@@ -98,13 +109,10 @@ class Stochastic:
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs, with that of the noise."""
-        try:
-            parameters = list(inspect.signature(self.function).parameters.values())
-        except (TypeError, ValueError):
-            return ()
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        names = [p.name for p in parameters if p.kind in positional]
-        return (*(name for name in names if name != "rng"), "noise")
+        parameters = _parameters(self.function)
+        names = [name for name, p in parameters.items() if p.kind in positional and name != "rng"]
+        return (*names, "noise")
 
     def __call__(self, *inputs: Any) -> Any:
         """Return the response; the last input is the noise, which numbers runs."""
@@ -121,6 +129,14 @@ class Stochastic:
         if self.seed is not None:
             function = partial(function, rng=None)
         refuse_misfit(name, function, sizes[:-1], outputs)
+
+
+def _parameters(function: Function) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a function, none if it does not declare them."""
+    try:
+        return inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return {}
 
 
 def noise_of(event: Shape) -> Any:

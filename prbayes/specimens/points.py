@@ -162,9 +162,6 @@ class Draws(Protocol):
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
         """Return log p(y_i | theta), (S, N)."""
 
-    def log_share(self, share: Any) -> Floats:
-        """Return the sum over specimens of the log of a share of their populations, (S,)."""
-
     def specimens(self) -> Floats:
         """Return coordinates of specimens, (n, d)."""
 

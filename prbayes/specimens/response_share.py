@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp, stdtrit
@@ -40,7 +40,6 @@ class ResponseShare:
     z: Floats  # (M, d): coordinates; the points with a response first
     log_b: Floats  # (M,): minus the log of the proposal density of z, up to a constant
     with_response: int  # number of points with a response
-    is_conditional: ClassVar[bool] = True  # whether specimens are those with a response
 
     def of_populations(
         self, density: PopulationDensity, parents: Sequence[Floats], coordinates: Coordinates

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 from scipy.special import fdtrc, logsumexp, ndtr, ndtri
@@ -109,7 +109,7 @@ class PointMass:
 
     z: Floats  # (K, d): coordinates of the points
     log_b: Floats  # (K,): minus the log of K times the proposal density of z
-    is_conditional: ClassVar[bool] = False
+    with_response: ClassVar[None] = None  # no points without a response are needed
 
     @classmethod
     def of(cls, points: SpecimenPoints) -> PointMass:
@@ -127,6 +127,13 @@ class PointMass:
 
 
 type PopulationShare = ResponseShare | PointMass
+
+
+class DrawsWithMass(Draws, Protocol):
+    """Draws of the hyperparameters, with the masses of their populations at points."""
+
+    def log_share(self, share: PopulationShare) -> Floats:
+        """Return the sum over the specimens of the log of the mass, (S,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,12 +172,12 @@ class RandomResponse:
     def free(self) -> Indices:
         """Columns of the unknown inputs."""
         free = self.data.free
-        return free[free < self.data.known.shape[1] - len(self.noise.scale)]
+        return np.asarray(free[free < self.data.known.shape[1] - len(self.noise.scale)])
 
     @property
     def conditions(self) -> Indices:
         """Columns of the known inputs."""
-        return np.flatnonzero(~np.isnan(self.data.known[0]))
+        return np.asarray(np.flatnonzero(~np.isnan(self.data.known[0])))
 
     def region(self, specimens: Floats, reach: float) -> Region:
         """Return the region of specimens (n, d), and of the conditions."""
@@ -214,7 +221,7 @@ class RandomResponse:
         places = np.repeat(np.arange(count), self.repeats)
         # The noise of a run is its number, so that a store keeps each of the repeated runs.
         number = first + np.arange(len(places))
-        noise = 4.0 * (2 * ((number * 0.6180339887498949) % 1.0) - 1)
+        noise = np.asarray(4.0 * (2 * ((number * 0.6180339887498949) % 1.0) - 1), dtype=np.float64)
         z = np.column_stack([x[places], self.noise.coordinates(noise[:, None])])
         y = self.run(z)
         is_finite = np.isfinite(y).all(axis=1)
@@ -294,14 +301,14 @@ def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
     return replace(points, z=z, log_a=log_a, log_proposal=log_proposal - np.log(2))
 
 
-def log_likelihoods_of(draws: Draws, points: SpecimenPoints) -> Floats:
+def log_likelihoods_of(draws: DrawsWithMass, points: SpecimenPoints) -> Floats:
     """Return log-likelihoods of all specimens at a quarter of the draws, (S, 1)."""
     logs = draws.log_likelihoods(points.z, points.log_a).sum(axis=1)
     return np.asarray(logs - draws.log_share(PointMass.of(points))[::4])[:, None]
 
 
 def agreeing_shared_points(
-    response: RandomResponse, scatters: list[Scatter], region: Region, draws: Draws
+    response: RandomResponse, scatters: list[Scatter], region: Region, draws: DrawsWithMass
 ) -> SpecimenPoints:
     """Return points whose halves agree at posterior draws; raise DesignError if none do."""
     options, limit = response.options, response.data.options.half_difference
@@ -330,7 +337,7 @@ class SharedPoints:
 
     emulation: Emulation
     points: SpecimenPoints
-    draws: Draws
+    draws: DrawsWithMass
     findings: Findings
 
 
@@ -346,7 +353,8 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         runs, batches = response.first_runs(count // 4), [count // 4, count - count // 2]
         region = response.region(data.inner, options.reach)
     else:
-        runs, region, batches = earlier.surface.runs, earlier.surface.scatter.region, []
+        surface = cast(ScatterSurface, earlier.surface)
+        runs, region, batches = surface.runs, surface.scatter.region, []
     draws = coarse_draws(response, runs, region)
     for size in batches:
         region = response.region(draws.specimens(), options.reach)
@@ -357,7 +365,7 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         n_inside = len(np.unique(runs.inside(region).places))
         scatters = response.emulators(region, runs, options.draws)
         points = agreeing_shared_points(response, scatters, region, draws)
-        draws = data.posterior(points.z, points.log_a, None, PointMass.of(points))
+        draws = posterior_of(response, points)
         shares, shift = draw_shares(draws, points)
         effective = float(np.mean(1 / (shares**2).sum(axis=1)))
         n_places = int(runs.places.max()) + 1
@@ -383,14 +391,21 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
     return SharedPoints(emulation, points, draws, tuple(findings))
 
 
-def coarse_draws(response: RandomResponse, runs: RandomRuns, region: Region) -> Draws:
+def coarse_draws(response: RandomResponse, runs: RandomRuns, region: Region) -> DrawsWithMass:
     """Return posterior draws from the emulator of the first runs."""
     scatters = response.emulators(region, runs, 0)
-    points = response.points(scatters, region, response.cube(response.options.points))
-    return response.data.posterior(points.z, points.log_a, None, PointMass.of(points))
+    return posterior_of(
+        response, response.points(scatters, region, response.cube(response.options.points))
+    )
 
 
-def draw_shares(draws: Draws, points: SpecimenPoints) -> tuple[Floats, float]:
+def posterior_of(response: RandomResponse, points: SpecimenPoints) -> DrawsWithMass:
+    """Return posterior draws of the hyperparameters given shared points."""
+    draws = response.data.posterior(points.z, points.log_a, None, PointMass.of(points))
+    return cast(DrawsWithMass, draws)
+
+
+def draw_shares(draws: DrawsWithMass, points: SpecimenPoints) -> tuple[Floats, float]:
     """Return weights of draws of the emulator at posterior draws, (S, B), and their largest shift.
 
     The shift is the standard deviation, over the emulator, of posterior means, in posterior
