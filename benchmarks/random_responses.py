@@ -119,7 +119,7 @@ def row(cell: str, number: int) -> dict[str, Any]:
     x = rng.normal(case.means, 0.5, (_N, d))
     y = case.response(*x.T, rng=rng)
     center, sd = exact(case, y)
-    response = prb.response.Stochastic(case.response, seed=number)
+    response = prb.response.Stochastic(case.response, random_seed=number)
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     clock = time.process_time()
     with pm.Model() as model:

@@ -219,10 +219,11 @@ def _fit_output(
     information += 1e-6 * np.trace(information) * np.eye(len(gamma))
     for _ in range(8):
         precision = np.sqrt(weights * np.exp(-log_variance))
-        left, values, right = np.linalg.svd(basis * precision[:, None], full_matrices=False)
+        weighted = basis * precision[:, None]
+        orthogonal, values, rotation = np.linalg.svd(weighted, full_matrices=False)
         inverse = np.where(values > 1e-9 * values[0], 1 / values, 0.0)
-        beta = right.T @ (inverse * (left.T @ (precision * y)))
-        leverage = np.minimum((left**2).sum(axis=1), 0.9)
+        beta = rotation.T @ (inverse * (orthogonal.T @ (precision * y)))
+        leverage = np.minimum((orthogonal**2).sum(axis=1), 0.9)
         square = (y - basis @ beta) ** 2 / (1 - leverage)
         for _ in range(3):
             ratio = np.minimum(square * np.exp(-log_variance), 1e6)
@@ -277,10 +278,10 @@ def chosen_degrees(region: Region, x: Floats, y: Floats, places: Indices) -> tup
         total = 0.0
         for of_output, of_spread in zip(means.T, sd.T, strict=True):
             precision = np.sqrt(counts) / of_spread
-            left = np.linalg.svd(basis * precision[:, None], full_matrices=False)[0]
+            orthogonal = np.linalg.svd(basis * precision[:, None], full_matrices=False)[0]
             scaled = precision * of_output
-            residuals = scaled - left @ (left.T @ scaled)
-            left_out = residuals / np.maximum(1 - (left**2).sum(axis=1), 0.1)
+            residuals = scaled - orthogonal @ (orthogonal.T @ scaled)
+            left_out = residuals / np.maximum(1 - (orthogonal**2).sum(axis=1), 0.1)
             # The sd of this degree would hide its misfit, so that left-out errors are in the units
             # of the output.
             total += float(np.log(((left_out * of_spread) ** 2).mean()))

@@ -356,11 +356,6 @@ class SpecimenLikelihood:
         return self.has_table or self.measurements[0].propagation.calls_response
 
     @property
-    def is_random(self) -> bool:
-        """Whether the response is random, so that its distribution is emulated."""
-        return self.measurements[0].responses.repeats > 1
-
-    @property
     def has_table(self) -> bool:
         """Whether the response is a table of runs."""
         return isinstance(self.measurements[0].responses.function, Runs)
@@ -437,6 +432,11 @@ class SpecimenLikelihood:
             model=self.model if is_same_model else weakref.ref(model),
             shared_emulation=prepared.emulation if prepared else self.shared_emulation,
         )
+
+
+def has_random_response(likelihood: SpecimenLikelihood) -> bool:
+    """Return whether the response is random, so that its distribution is emulated."""
+    return likelihood.measurements[0].responses.repeats > 1
 
 
 def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:

@@ -32,6 +32,7 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    has_random_response,
     is_exchangeable,
     output_columns,
     readings_at,
@@ -203,7 +204,7 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     if likelihood.has_table:
         n = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
         return RunCost(n, 0, n, "none: the table has all runs")
-    if likelihood.is_random:
+    if has_random_response(likelihood):
         return random_cost(likelihood, first_run_count(likelihood))
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.sampled + 2)
@@ -235,7 +236,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if any(finding.code == "readings-misfit" for finding in first.findings):
             refuse_unreached(likelihood.name, first.emulation.y, likelihood.readings)
         points = first.points
-        if likelihood.is_random:
+        if has_random_response(likelihood):
             return replace(first, findings=report(*runs.findings, *first.findings))
 
         def posterior(share: PopulationShare | None) -> PopulationDraws:
@@ -307,7 +308,7 @@ class CheckedRuns:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             names = dict(enumerate(_coordinate_names(likelihood)))
             of_population = {k: names[k] for k in likelihood.coordinates.inputs_of_population}
-            if not likelihood.is_random:
+            if not has_random_response(likelihood):
                 refuse_unused_inputs(likelihood.name, z, values, of_population)
             if not any(
                 m.metric.error is not None or m.gross_errors is not False for m in measurements
@@ -389,7 +390,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
 def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Fit the emulator and place the points; return both with their findings."""
     likelihood = runs.likelihood
-    if likelihood.is_random:
+    if has_random_response(likelihood):
         shared = points_of_random_response(runs, data, likelihood, emulation)
         of_data = _data_findings(likelihood, shared.emulation.y, several_roots=False)
         findings = (*shared.findings, *of_data)

@@ -35,9 +35,9 @@ class Stochastic:
         specimen.
     repeats : int
         Number of runs with the same inputs, at least 2.
-    seed : int, optional
-        The function then takes ``rng``, a `numpy.random.Generator`, as a keyword argument; runs
-        are the same on each computer. By default the function has its own source of randomness.
+    random_seed : int
+        Seed of the `numpy.random.Generator` that a function with the argument ``rng`` gets, so that
+        runs are the same on each computer. Another function has its own source of randomness.
 
     Raises
     ------
@@ -60,16 +60,16 @@ class Stochastic:
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
-    >>> queue = prb.response.Stochastic(lambda x, rng: x + rng.gumbel(size=x.shape), seed=1)
+    >>> queue = prb.response.Stochastic(lambda x, rng: x + rng.gumbel(size=x.shape))
     >>> data = np.random.default_rng(0).normal(3.0, 1.5, 30)
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 3, 2), pm.HalfNormal("s", 2))
     ...     y = prb.Simulator("y", queue, x, observed=data)
     >>> queue
-    prb.response.Stochastic(<lambda>, repeats=2, seed=1)
+    prb.response.Stochastic(<lambda>, repeats=2, random_seed=0)
     """
 
-    def __init__(self, function: Function, repeats: int = 2, seed: int | None = None) -> None:
+    def __init__(self, function: Function, repeats: int = 2, *, random_seed: int = 0) -> None:
         label = "prb.response.Stochastic"
         if isinstance(function, scalar):
             raise TypeError(
@@ -82,28 +82,17 @@ class Stochastic:
             )
         if isinstance(function, Stochastic):
             raise TypeError(f"{label}: function: got a Stochastic, expected a plain function")
-        parameter = _parameters(function).get("rng")
-        if seed is None and parameter is not None and parameter.default is parameter.empty:
-            raise TypeError(
-                f"{label}: seed: got none for a function of rng, expected an integer, such as "
-                "seed=0, from which its random generator rng is made"
-            )
-        if seed is not None and parameter is None:
-            raise TypeError(
-                f"{label}: function: got seed={seed!r:.40} for a function without the argument "
-                "rng, expected one that takes a numpy.random.Generator by this name; add it, or "
-                "leave seed= out"
-            )
         self.function = function
         self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
-        self.seed = None if seed is None else positive_integer(seed, f"{label}: seed", minimum=0)
+        self.random_seed = positive_integer(random_seed, f"{label}: random_seed", minimum=0)
+        self.takes_rng = "rng" in _parameters(function)
 
     @property
     def __name__(self) -> str:
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def __repr__(self) -> str:
-        seed = "" if self.seed is None else f", seed={self.seed}"
+        seed = f", random_seed={self.random_seed}" if self.takes_rng else ""
         return f"prb.response.Stochastic({self.__name__}, repeats={self.repeats}{seed})"
 
     @property
@@ -117,16 +106,16 @@ class Stochastic:
     def __call__(self, *inputs: Any) -> Any:
         """Return the response; the last input is the noise, which numbers runs."""
         *arguments, noise = inputs
-        if self.seed is None:
+        if not self.takes_rng:
             return self.function(*arguments)
         numbers = [np.ascontiguousarray(x, dtype=np.float64) for x in (*arguments, noise)]
         digest = zlib.crc32(b"".join(x.tobytes() for x in numbers))
-        return self.function(*arguments, rng=np.random.default_rng([self.seed, digest]))
+        return self.function(*arguments, rng=np.random.default_rng([self.random_seed, digest]))
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any) -> None:
         """Raise if the function does not take the inputs."""
         function = self.function
-        if self.seed is not None:
+        if self.takes_rng:
             function = partial(function, rng=None)
         refuse_misfit(name, function, sizes[:-1], outputs)
 

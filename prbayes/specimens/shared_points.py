@@ -187,9 +187,9 @@ class RandomResponse:
         center[self.free] = normal.mean
         root[np.ix_(self.free, self.free)] = reach * normal.root
         for column in self.conditions:
-            known = self.data.known[:, column]
-            center[column] = (known.min() + known.max()) / 2
-            root[column, column] = max(np.ptp(known) / 2, 1e-9)
+            values = self.data.known[:, column]
+            center[column] = (values.min() + values.max()) / 2
+            root[column, column] = max(np.ptp(values) / 2, 1e-9)
         return Region(center, root)
 
     def at(self, region: Region, u: Floats, spread: float = 1.7) -> tuple[Floats, Floats]:
@@ -243,7 +243,7 @@ class RandomResponse:
             raise DesignError(
                 f"{self.data.name}: got the same response in all repeated runs with the same "
                 "inputs, expected a random one; pass the function itself without "
-                "prb.response.Stochastic, or use the generator rng that it gets with seed="
+                "prb.response.Stochastic, or use the generator rng that it gets"
             )
         return runs
 
@@ -260,12 +260,12 @@ class RandomResponse:
 
         The coordinates of the noise are those that give the readings, and A has their density.
         """
-        readings, known = self.data.readings, self.data.known
+        readings, of_specimens = self.data.readings, self.data.known
         values = np.where(readings.is_measured, readings.values, np.nan)
-        n, count = len(known), len(u)
+        n, count = len(of_specimens), len(u)
         x, log_q = self.at(region, u)
         x = np.repeat(x[None], n if self.conditions.size else 1, axis=0)
-        x[:, :, self.conditions] = known[: len(x), None, self.conditions]
+        x[:, :, self.conditions] = of_specimens[: len(x), None, self.conditions]
         logs = [scatter.log_density(x, values, readings.error) for scatter in scatters]
         noise = scatters[0].noise(x, values)
         log_noise = -0.5 * noise**2 - 0.5 * np.log(2 * np.pi) + np.log(self.noise.scale)
@@ -379,7 +379,7 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
     error = data.options.floor * data.readings.spread()
     ends = np.stack([used.z.min(axis=0), used.z.max(axis=0)])
     emulation = Emulation(runs.z, runs.y, surface, error, shift, ends)
-    findings = [*scatter_findings(response, scatters[0], used), *_misfits(response, points)]
+    findings = [*scatter_findings(response, scatters[0], used), *_unreached(response, points)]
     if effective < options.least_draws:
         text = (
             f"{data.name}: got {len(runs.z)} runs of a random response, whose emulator is less "
@@ -475,7 +475,7 @@ def _p_of_halves(x: Floats, residuals: Floats) -> float:
     return float(ks_2samp(residuals[is_low], residuals[~is_low]).pvalue)
 
 
-def _misfits(response: RandomResponse, points: SpecimenPoints) -> list[Finding]:
+def _unreached(response: RandomResponse, points: SpecimenPoints) -> list[Finding]:
     """Report specimens whose readings are far from all responses of the emulator."""
     best = (points.log_a + points.log_proposal).argmax(axis=1)
     z = points.z[np.arange(len(best)), best]
@@ -490,4 +490,6 @@ def _misfits(response: RandomResponse, points: SpecimenPoints) -> list[Finding]:
         "explains by less than four standard deviations of the scatter, expected none; look at "
         "these readings, their units and the priors."
     )
-    return [Finding("readings-misfit", text, "likelihood_findings.md#readings-misfit")]
+    return [
+        Finding("readings-misfit", text, "likelihood_findings.md#readings-that-no-inputs-reproduce")
+    ]

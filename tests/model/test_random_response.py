@@ -37,7 +37,7 @@ def model_of(response: Any, observed: Any = DATA, **settings: Any) -> tuple[pm.M
 
 @pytest.fixture(scope="module")
 def calibrated() -> Any:
-    response = prb.response.Stochastic(noisy, seed=1)
+    response = prb.response.Stochastic(noisy, random_seed=1)
     model, x = model_of(response)
     result = prb.sample(500, model=model, random_seed=1, progressbar=False)
     return model, x, response, result
@@ -80,19 +80,22 @@ def test_predictions_have_the_scatter(calibrated: Any) -> None:
     individuals = prb.individuals(result, model=model)
     assert "noise" in str(individuals)
     with pytest.raises(TypeError, match="random response of a simulator of the model"):
-        prb.predict(result, prb.response.Stochastic(noisy, seed=1), x, **arguments)
+        prb.predict(result, prb.response.Stochastic(noisy, random_seed=1), x, **arguments)
 
 
-def test_narrow_population_has_no_likelihood_of_its_own(calibrated: Any) -> None:
+def test_population_at_a_point_has_the_density_there(calibrated: Any) -> None:
     model, *_ = calibrated
     (likelihood,) = set(specimen_likelihoods(model).values())
     points = prepared(likelihood).points
+    assert points.tilts is not None
     x = likelihood.coordinates.inputs(points.z)[0][0]
-    at_point = x[np.abs(x - 1.0).argmin()]
-    theta = np.array([[at_point, np.log(s)] for s in (1e-1, 1e-2, 1e-4, 1e-6)])
-    logs = Evaluator.of(model)(theta).log_other
-    # A population that is far narrower than the noise does not depend on its spread.
-    np.testing.assert_allclose(logs[1:], logs[1], atol=0.5)
+    place = int(np.abs(x - 1.0).argmin())
+    # Without the mass of the population its likelihood would grow like the density at the point.
+    logs = Evaluator.of(model)(np.array([[x[place], np.log(s)] for s in (1e-4, 1e-6)])).log_other
+    densities = points.log_a[:, place] + points.log_proposal[:, place]
+    by_draw = (densities[:, None] + points.tilts[:, place]).sum(axis=0)
+    expected = np.logaddexp.reduce(by_draw) - np.log(len(by_draw))
+    np.testing.assert_allclose(logs, expected, atol=1e-3)
 
 
 def test_likelihoods_of_specimens_have_the_sum_of_their_mean_over_emulators() -> None:
@@ -159,8 +162,8 @@ def test_unknown_error_is_refused() -> None:
     with pm.Model():
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
         metric = prb.LogLikelihood(error=pm.HalfNormal("e", 0.1))
+        response = prb.response.Stochastic(noisy)
         with pytest.raises(TypeError, match="an unknown error or bias"):
-            response = prb.response.Stochastic(noisy, seed=1)
             prb.Simulator("y", response, x, observed=DATA, metric=metric)
 
 
@@ -171,25 +174,23 @@ def test_what_needs_other_points_is_refused(calibrated: Any) -> None:
     with pytest.raises((TypeError, ValueError), match="random"):
         prb.calibrate_each({"A": DATA, "B": DATA}, model=model)
     with pytest.raises((TypeError, ValueError), match="random"):
-        prb.simulation_based_calibration(model, 10)
+        prb.simulation_based_calibration(10, model=model)
 
 
 def test_arguments() -> None:
     with pytest.raises(TypeError, match="the function of one specimen in it"):
         prb.response.Stochastic(prb.scalar(noisy))
     with pytest.raises(TypeError, match="plain function"):
-        prb.response.Stochastic(prb.response.Stochastic(noisy, seed=1))
+        prb.response.Stochastic(prb.response.Stochastic(noisy, random_seed=1))
     with pytest.raises(ValueError, match="repeats"):
-        prb.response.Stochastic(noisy, repeats=1, seed=1)
+        prb.response.Stochastic(noisy, repeats=1, random_seed=1)
     with pytest.raises(TypeError, match="function of the inputs"):
         prb.response.Stochastic(3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="missing a required argument"):
         model_of(prb.response.Stochastic(lambda a, b: a))
-    with pytest.raises(TypeError, match="without the argument rng"):
-        prb.response.Stochastic(lambda x: x, seed=1)
-    with pytest.raises(TypeError, match="got none for a function of rng"):
-        prb.response.Stochastic(noisy)
-    seeded = prb.response.Stochastic(noisy, seed=1)
+    with pytest.raises(ValueError, match="random_seed"):
+        prb.response.Stochastic(noisy, random_seed=-1)
+    seeded = prb.response.Stochastic(noisy, random_seed=1)
     x = np.ones(3)
     np.testing.assert_array_equal(seeded(x, x), seeded(x, x))
     assert (seeded(x, x) != seeded(x, 2 * x)).all()
