@@ -37,6 +37,11 @@ class Region:
         """Return the inputs at places of the cube, (..., d)."""
         return np.asarray(self.center + unit @ self.root.T)
 
+    def contains(self, other: Region, slack: float = 0.25) -> bool:
+        """Return whether the axes of another region end in this one, or a little beyond."""
+        ends = np.concatenate([np.eye(len(self.center)), -np.eye(len(self.center))])
+        return bool(np.abs(self.unit(other.at(ends))).max() <= 1 + slack)
+
 
 @dataclass(frozen=True, eq=False)
 class Scatter:

@@ -211,7 +211,8 @@ class RandomResponse:
     def runs_in(self, region: Region, count: int, seed: int, first: int) -> RandomRuns:
         """Compute runs at ``count`` inputs of a region; ``first`` is the number of earlier runs."""
         u = sobol(count, len(self.free) + len(self.conditions), seed)
-        x, _ = self.at(region, u[:, : len(self.free)])
+        # Runs are nearly uniform, because few at the ends would leave the spread open there.
+        x, _ = self.at(region, u[:, : len(self.free)], spread=8.0)
         for place, column in enumerate(self.conditions, start=len(self.free)):
             x[:, column] = np.quantile(self.data.known[:, column], u[:, place])
         low, high = self.data.prior.min(axis=0), self.data.prior.max(axis=0)
@@ -357,21 +358,25 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         runs, region, batches = surface.runs, surface.scatter.region, []
     draws = coarse_draws(response, runs, region)
     for size in batches:
-        region = response.region(draws.specimens(), options.reach)
+        # Populations of the first runs are uncertain, so that the region is a quarter wider.
+        region = response.region(draws.specimens(), 1.25 * options.reach)
         runs = runs.joined(response.runs_in(region, size, data.seed + len(runs.z), len(runs.z)))
         draws = coarse_draws(response, runs, region)
     while True:
-        region = response.region(draws.specimens(), options.reach)
-        n_inside = len(np.unique(runs.inside(region).places))
         scatters = response.emulators(region, runs, options.draws)
         points = agreeing_shared_points(response, scatters, region, draws)
         draws = posterior_of(response, points)
         shares, shift = draw_shares(draws, points)
         effective = float(np.mean(1 / (shares**2).sum(axis=1)))
-        n_places = int(runs.places.max()) + 1
-        is_enough = effective >= options.least_draws and n_inside >= count // 2
-        if is_enough or 2 * len(runs.z) > options.most:
+        latest = response.region(draws.specimens(), options.reach)
+        is_inside = region.contains(latest)
+        if is_inside and effective >= options.least_draws:
             break
+        n_places = int(runs.places.max()) + 1 if is_inside else count // 2
+        if len(runs.z) + response.repeats * n_places > options.most:
+            break
+        # Polynomials have no meaning where no runs are, so that the region changes with the runs.
+        region = region if is_inside else latest
         more = response.runs_in(region, n_places, data.seed + len(runs.z), len(runs.z))
         runs = runs.joined(more)
     used = runs.inside(region)
