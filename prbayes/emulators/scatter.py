@@ -104,13 +104,19 @@ class Scatter:
         root = np.linalg.cholesky(covariance)
         shrunk = np.sqrt(1 - self.bandwidth**2) * self.residuals
         centers = np.linalg.solve(root, factor @ shrunk.T)  # (n or 1, K, m, J)
-        away = np.linalg.solve(root, (values[:, None] - mean)[..., None])[..., 0]
+        away = np.linalg.solve(
+            root,
+            (values[:, None] - mean)[..., None],
+        )[..., 0]
         log_root = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
         constant = log_root + 0.5 * len(columns) * np.log(2 * np.pi)
         with np.errstate(divide="ignore"):
             offset = np.log(self.weights) - 0.5 * (centers**2).sum(axis=-2)
         logs = np.empty(away.shape[:2])
-        step = max(1, IN_CACHE // (away.shape[1] * len(self.weights)))
+        step = max(
+            1,
+            IN_CACHE // (away.shape[1] * len(self.weights)),
+        )
         for first in range(0, len(values), step):
             block = slice(first, first + step)
             at = slice(None) if len(centers) == 1 else block
@@ -135,7 +141,10 @@ class Scatter:
         grid, cumulative = self._quantiles
         probabilities = ndtr(noise)
         pairs = zip(probabilities.T, cumulative, strict=True)
-        drawn = np.stack([np.interp(p, of_output, grid) for p, of_output in pairs], axis=-1)
+        drawn = np.stack(
+            [np.interp(p, of_output, grid) for p, of_output in pairs],
+            axis=-1,
+        )
         return mean + sd * (drawn @ self.factor.T)
 
     def noise(self, x: Floats, values: Floats, most: float = 4.0) -> Floats:
@@ -147,8 +156,15 @@ class Scatter:
         grid, cumulative = self._quantiles
         away = np.nan_to_num((values[:, None] - mean) / sd)
         residuals = np.linalg.solve(self.factor, away[..., None])[..., 0]
-        pairs = zip(np.moveaxis(residuals, -1, 0), cumulative, strict=True)
-        levels = np.stack([np.interp(r, grid, of_output) for r, of_output in pairs], axis=-1)
+        pairs = zip(
+            np.moveaxis(residuals, -1, 0),
+            cumulative,
+            strict=True,
+        )
+        levels = np.stack(
+            [np.interp(r, grid, of_output) for r, of_output in pairs],
+            axis=-1,
+        )
         return np.asarray(np.clip(ndtri(inside(levels)), -most, most))
 
 
@@ -226,13 +242,20 @@ def _fit_output(
         precision = np.sqrt(weights * np.exp(-log_variance))
         weighted = basis * precision[:, None]
         orthogonal, values, rotation = np.linalg.svd(weighted, full_matrices=False)
-        inverse = np.where(values > 1e-9 * values[0], 1 / values, 0.0)
+        inverse = np.where(
+            values > 1e-9 * values[0],
+            1 / values,
+            0.0,
+        )
         beta = rotation.T @ (inverse * (orthogonal.T @ (precision * y)))
         leverage = np.minimum((orthogonal**2).sum(axis=1), 0.9)
         square = (y - basis @ beta) ** 2 / (1 - leverage)
         for _ in range(3):
             ratio = np.minimum(square * np.exp(-log_variance), 1e6)
-            step = np.linalg.solve(information, of_spread.T @ (weights * (ratio - 1)))
+            step = np.linalg.solve(
+                information,
+                of_spread.T @ (weights * (ratio - 1)),
+            )
             change = of_spread @ step
             gamma = gamma + step * min(1.0, 2.0 / max(np.abs(change).max(), 1e-300))
             floor = 2 * np.log(1e-8 * scale)
@@ -277,13 +300,22 @@ def chosen_degrees(region: Region, x: Floats, y: Floats, places: Indices) -> tup
     _, first = np.unique(places, return_index=True)
     errors = []
     for degree in range(1, most + 1):
-        fit = fit_scatter(region, x, y, places, (degree, spread))
+        fit = fit_scatter(
+            region,
+            x,
+            y,
+            places,
+            (degree, spread),
+        )
         _, sd = fit.moments(x[first])
         basis = legendre_products(unit[first], degree)
         total = 0.0
         for of_output, of_spread in zip(means.T, sd.T, strict=True):
             precision = np.sqrt(counts) / of_spread
-            orthogonal = np.linalg.svd(basis * precision[:, None], full_matrices=False)[0]
+            orthogonal = np.linalg.svd(
+                basis * precision[:, None],
+                full_matrices=False,
+            )[0]
             scaled = precision * of_output
             residuals = scaled - orthogonal @ (orthogonal.T @ scaled)
             left_out = residuals / np.maximum(1 - (orthogonal**2).sum(axis=1), 0.1)

@@ -50,7 +50,10 @@ class RandomRunOptions:
 
     def distinct_inputs(self, stated: int | None, n_inputs: int, repeats: int) -> int:
         """Return the number of distinct inputs of runs, without growth."""
-        return max((stated or max(self.runs, 64 * n_inputs)) // repeats, 32)
+        return max(
+            (stated or max(self.runs, 64 * n_inputs)) // repeats,
+            32,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +81,15 @@ class RandomRuns:
 
     def rows(self, is_used: Bools) -> RandomRuns:
         """Return a part of the runs."""
-        _, places = np.unique(self.places[is_used], return_inverse=True)
-        return RandomRuns(self.z[is_used], self.y[is_used], places)
+        _, places = np.unique(
+            self.places[is_used],
+            return_inverse=True,
+        )
+        return RandomRuns(
+            self.z[is_used],
+            self.y[is_used],
+            places,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +133,10 @@ class PointMass:
         log_b = self.log_b + coordinates.log_jacobian(self.z)
         x = [v[None] for v in coordinates.inputs(self.z)]
         points = WeightedPoints.of(density, x, log_b[None])
-        return np.maximum(points.log_likelihoods(parents)[:, 0], 0.0)
+        return np.maximum(
+            points.log_likelihoods(parents)[:, 0],
+            0.0,
+        )
 
 
 type PopulationShare = ResponseShare | PointMass
@@ -151,7 +164,10 @@ class ScatterSurface:
 
     def __call__(self, z: Floats, columns: Any = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
-        return DifferencedResponse(self.values, step=1e-4)(z, columns)
+        return DifferencedResponse(self.values, step=1e-4)(
+            z,
+            columns,
+        )
 
     def variance(self, z: Floats) -> Floats:
         """Return zeros: the error of the emulator is part of the likelihood."""
@@ -210,11 +226,22 @@ class RandomResponse:
 
     def runs_in(self, region: Region, count: int, seed: int, first: int) -> RandomRuns:
         """Compute runs at ``count`` inputs of a region; ``first`` is the number of earlier runs."""
-        u = sobol(count, len(self.free) + len(self.conditions), seed)
+        u = sobol(
+            count,
+            len(self.free) + len(self.conditions),
+            seed,
+        )
         # Runs are nearly uniform, because few at the ends would leave the spread open there.
-        x, _ = self.at(region, u[:, : len(self.free)], spread=8.0)
+        x, _ = self.at(
+            region,
+            u[:, : len(self.free)],
+            spread=8.0,
+        )
         for place, column in enumerate(self.conditions, start=len(self.free)):
-            x[:, column] = np.quantile(self.data.known[:, column], u[:, place])
+            x[:, column] = np.quantile(
+                self.data.known[:, column],
+                u[:, place],
+            )
         low, high = self.data.prior.min(axis=0), self.data.prior.max(axis=0)
         width = x.shape[1]
         inside = np.clip(x, low[:width], high[:width])
@@ -222,7 +249,10 @@ class RandomResponse:
         places = np.repeat(np.arange(count), self.repeats)
         # The noise of a run is its number, so that a store keeps each of the repeated runs.
         number = first + np.arange(len(places))
-        noise = np.asarray(4.0 * (2 * ((number * 0.6180339887498949) % 1.0) - 1), dtype=np.float64)
+        noise = np.asarray(
+            4.0 * (2 * ((number * 0.6180339887498949) % 1.0) - 1),
+            dtype=np.float64,
+        )
         z = np.column_stack([x[places], self.noise.coordinates(noise[:, None])])
         y = self.run(z)
         is_finite = np.isfinite(y).all(axis=1)
@@ -262,20 +292,35 @@ class RandomResponse:
         The coordinates of the noise are those that give the readings, and A has their density.
         """
         readings, of_specimens = self.data.readings, self.data.known
-        values = np.where(readings.is_measured, readings.values, np.nan)
+        values = np.where(
+            readings.is_measured,
+            readings.values,
+            np.nan,
+        )
         n, count = len(of_specimens), len(u)
         x, log_q = self.at(region, u)
-        x = np.repeat(x[None], n if self.conditions.size else 1, axis=0)
+        x = np.repeat(
+            x[None],
+            n if self.conditions.size else 1,
+            axis=0,
+        )
         x[:, :, self.conditions] = of_specimens[: len(x), None, self.conditions]
         logs = [scatter.log_density(x, values, readings.error) for scatter in scatters]
         noise = scatters[0].noise(x, values)
         log_noise = -0.5 * noise**2 - 0.5 * np.log(2 * np.pi) + np.log(self.noise.scale)
         log_proposal = log_q + np.log(count) + log_noise.sum(axis=-1)
         of_noise = self.noise.coordinates(noise)
-        z = np.concatenate([np.broadcast_to(x, (n, *x.shape[1:])), of_noise], axis=2)
+        z = np.concatenate(
+            [np.broadcast_to(x, (n, *x.shape[1:])), of_noise],
+            axis=2,
+        )
         tilts = np.empty((n, count, 0))
         if len(scatters) > 1:
-            tilts = np.clip(np.stack(logs[1:], axis=2) - logs[0][..., None], -100.0, 100.0)
+            tilts = np.clip(
+                np.stack(logs[1:], axis=2) - logs[0][..., None],
+                -100.0,
+                100.0,
+            )
         flat = x if len(x) == n else np.repeat(x, n, axis=0)
         outputs = (
             scatters[0]
@@ -284,12 +329,26 @@ class RandomResponse:
         )
         single = np.ones(n, dtype=np.intp), np.zeros((n, count), dtype=np.intp)
         log_a = logs[0] - log_proposal
-        return SpecimenPoints(z, outputs, log_a, log_proposal, *single, tilts=tilts)
+        return SpecimenPoints(
+            z,
+            outputs,
+            log_a,
+            log_proposal,
+            *single,
+            tilts=tilts,
+        )
 
     def cube(self, count: int) -> Floats:
         """Return places of points in two independent halves, (count, free)."""
         if len(self.free) > 1:
-            halves = [sobol(count // 2, len(self.free), self.data.seed + h) for h in (11, 12)]
+            halves = [
+                sobol(
+                    count // 2,
+                    len(self.free),
+                    self.data.seed + h,
+                )
+                for h in (11, 12)
+            ]
             return np.concatenate(halves)
         steps = np.arange(count // 2)[:, None] * 2
         return (np.concatenate([steps, steps + 1]) + 0.5) / count
@@ -299,7 +358,12 @@ def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
     """Return half of the points, with the numbers A of all points."""
     log_a, log_proposal = points.log_a[:, part] + np.log(2), points.log_proposal[:, part]
     z = points.z[:, part]
-    return replace(points, z=z, log_a=log_a, log_proposal=log_proposal - np.log(2))
+    return replace(
+        points,
+        z=z,
+        log_a=log_a,
+        log_proposal=log_proposal - np.log(2),
+    )
 
 
 def log_likelihoods_of(draws: DrawsWithMass, points: SpecimenPoints) -> Floats:
@@ -315,12 +379,20 @@ def agreeing_shared_points(
     options, limit = response.options, response.data.options.half_difference
     count = options.points
     while True:
-        points = response.points(scatters[:1], region, response.cube(count))
+        points = response.points(
+            scatters[:1],
+            region,
+            response.cube(count),
+        )
         parts = slice(count // 2), slice(count // 2, None)
         halves = [log_likelihoods_of(draws, half_of(points, part)) for part in parts]
         difference = half_difference(*halves)
         if difference[1] <= limit:
-            points = response.points(scatters, region, response.cube(count))
+            points = response.points(
+                scatters,
+                region,
+                response.cube(count),
+            )
             return replace(points, difference=difference[1])
         if 2 * count > options.most_points:
             raise DesignError(
@@ -342,26 +414,43 @@ class SharedPoints:
     findings: Findings
 
 
+def first_rounds(
+    response: RandomResponse, earlier: Emulation | None, count: int
+) -> tuple[RandomRuns, Region, DrawsWithMass]:
+    """Return runs at ``count`` inputs, their region, and posterior draws from their emulator.
+
+    Runs of an ``earlier`` emulator take their place.
+    """
+    options, data = response.options, response.data
+    if earlier is not None:
+        surface = cast(ScatterSurface, earlier.surface)
+        runs, region = surface.runs, surface.scatter.region
+        return runs, region, coarse_draws(response, runs, region)
+    runs = response.first_runs(count // 4)
+    region = response.region(data.inner, options.reach)
+    draws = coarse_draws(response, runs, region)
+    for size in (count // 4, count - count // 2):
+        # Populations of the first runs are uncertain, so that the region is a quarter wider.
+        reach = 1.25 * options.reach
+        region = response.region(draws.specimens(), reach)
+        n_runs = len(runs.z)
+        more = response.runs_in(region, size, data.seed + n_runs, n_runs)
+        runs = runs.joined(more)
+        draws = coarse_draws(response, runs, region)
+    return runs, region, draws
+
+
 def shared_points(response: RandomResponse, earlier: Emulation | None) -> SharedPoints:
     """Return emulator and points of a random response; ``earlier`` has runs for other specimens.
 
-    Runs are doubled until the readings do not choose between draws of the emulator.
+    Runs are added until they cover the populations of the posterior, and doubled until the readings
+    do not choose between draws of the emulator.
     """
     options, data = response.options, response.data
     n_inputs = len(response.free) + len(response.conditions)
-    count = options.distinct_inputs(data.options.n_first, n_inputs, response.repeats)
-    if earlier is None:
-        runs, batches = response.first_runs(count // 4), [count // 4, count - count // 2]
-        region = response.region(data.inner, options.reach)
-    else:
-        surface = cast(ScatterSurface, earlier.surface)
-        runs, region, batches = surface.runs, surface.scatter.region, []
-    draws = coarse_draws(response, runs, region)
-    for size in batches:
-        # Populations of the first runs are uncertain, so that the region is a quarter wider.
-        region = response.region(draws.specimens(), 1.25 * options.reach)
-        runs = runs.joined(response.runs_in(region, size, data.seed + len(runs.z), len(runs.z)))
-        draws = coarse_draws(response, runs, region)
+    stated = data.options.n_first
+    count = options.distinct_inputs(stated, n_inputs, response.repeats)
+    runs, region, draws = first_rounds(response, earlier, count)
     while True:
         scatters = response.emulators(region, runs, options.draws)
         points = agreeing_shared_points(response, scatters, region, draws)
@@ -372,41 +461,62 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         is_inside = region.contains(latest)
         if is_inside and effective >= options.least_draws:
             break
-        n_places = int(runs.places.max()) + 1 if is_inside else count // 2
-        if len(runs.z) + response.repeats * n_places > options.most:
+        n_runs = len(runs.z)
+        size = int(runs.places.max()) + 1 if is_inside else count // 2
+        if n_runs + response.repeats * size > options.most:
             break
         # Polynomials have no meaning where no runs are, so that the region changes with the runs.
         region = region if is_inside else latest
-        more = response.runs_in(region, n_places, data.seed + len(runs.z), len(runs.z))
+        more = response.runs_in(region, size, data.seed + n_runs, n_runs)
         runs = runs.joined(more)
     used = runs.inside(region)
+    findings = [
+        *scatter_findings(response, scatters[0], used),
+        *_unreached(response, points),
+        *_uncertain(response, len(runs.z), effective),
+    ]
     surface = ScatterSurface(scatters[0], response.noise, runs)
     error = data.options.floor * data.readings.spread()
     ends = np.stack([used.z.min(axis=0), used.z.max(axis=0)])
     emulation = Emulation(runs.z, runs.y, surface, error, shift, ends)
-    findings = [*scatter_findings(response, scatters[0], used), *_unreached(response, points)]
-    if effective < options.least_draws:
-        text = (
-            f"{data.name}: got {len(runs.z)} runs of a random response, whose emulator is less "
-            f"certain than the readings: {effective:.1f} of {options.draws} draws of it count, "
-            f"expected {options.least_draws:g}; intervals may be too narrow. Ask for more runs "
-            "with propagation=prb.Reweighted(n)."
-        )
-        findings.append(Finding("random-response", text, _PAGE))
     return SharedPoints(emulation, points, draws, tuple(findings))
+
+
+def _uncertain(response: RandomResponse, n_runs: int, effective: float) -> list[Finding]:
+    """Report an emulator that is less certain than the readings, by its effective draws."""
+    name, options = response.data.name, response.options
+    if effective >= options.least_draws:
+        return []
+    text = (
+        f"{name}: got {n_runs} runs of a random response, whose emulator is less certain than the "
+        f"readings: {effective:.1f} of {options.draws} draws of it count, expected "
+        f"{options.least_draws:g}; intervals may be too narrow. Ask for more runs with "
+        "propagation=prb.Reweighted(n)."
+    )
+    return [Finding("random-response", text, _PAGE)]
 
 
 def coarse_draws(response: RandomResponse, runs: RandomRuns, region: Region) -> DrawsWithMass:
     """Return posterior draws from the emulator of the first runs."""
     scatters = response.emulators(region, runs, 0)
     return posterior_of(
-        response, response.points(scatters, region, response.cube(response.options.points))
+        response,
+        response.points(
+            scatters,
+            region,
+            response.cube(response.options.points),
+        ),
     )
 
 
 def posterior_of(response: RandomResponse, points: SpecimenPoints) -> DrawsWithMass:
     """Return posterior draws of the hyperparameters given shared points."""
-    draws = response.data.posterior(points.z, points.log_a, None, PointMass.of(points))
+    draws = response.data.posterior(
+        points.z,
+        points.log_a,
+        None,
+        PointMass.of(points),
+    )
     return cast(DrawsWithMass, draws)
 
 
@@ -420,7 +530,10 @@ def draw_shares(draws: DrawsWithMass, points: SpecimenPoints) -> tuple[Floats, f
     first = draws.log_likelihoods(points.z, points.log_a).sum(axis=1)
     logs = np.stack(
         [
-            draws.log_likelihoods(points.z, points.log_a + tilt).sum(axis=1)
+            draws.log_likelihoods(
+                points.z,
+                points.log_a + tilt,
+            ).sum(axis=1)
             for tilt in np.moveaxis(points.tilts, 2, 0)
         ],
         axis=1,
@@ -449,7 +562,10 @@ def scatter_findings(response: RandomResponse, scatter: Scatter, runs: RandomRun
     df = len(counts) - len(scatter.mean_terms), len(residuals) - len(counts)
     findings = []
     for j, label in enumerate(data.output_names):
-        p_fit = fdtrc(*df, (between[j] / df[0]) / (within[j] / df[1]))
+        p_fit = fdtrc(
+            *df,
+            (between[j] / df[0]) / (within[j] / df[1]),
+        )
         if p_fit < level / len(data.output_names):
             text = (
                 f"{data.name}: the mean of {label} given the inputs has more detail than the "
@@ -496,5 +612,9 @@ def _unreached(response: RandomResponse, points: SpecimenPoints) -> list[Finding
         "these readings, their units and the priors."
     )
     return [
-        Finding("readings-misfit", text, "likelihood_findings.md#readings-that-no-inputs-reproduce")
+        Finding(
+            "readings-misfit",
+            text,
+            "likelihood_findings.md#readings-that-no-inputs-reproduce",
+        )
     ]
