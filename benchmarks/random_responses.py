@@ -2,7 +2,7 @@
 
 Noise is gamma distributed with a skewness of 1; its spread depends on the inputs. ``one`` has one
 input and output, ``two`` has two inputs and two outputs with correlated noise. Inputs are normal,
-and all their means and standard deviations are unknown. The response is computed 128 times. The
+and all their means and standard deviations are unknown. The first number of runs is 128. The
 reference knows the density of the noise. It integrates over a grid of the inputs, and over the
 hyperparameters by importance sampling from a t distribution.
 

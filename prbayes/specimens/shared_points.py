@@ -21,12 +21,18 @@ from scipy.stats import ks_2samp
 from prbayes._finding import Finding, Findings
 from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.scatter import Region, Scatter, chosen_degrees, emulator_draws, fit_scatter
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import inside, lattice, sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import DifferencedResponse, Emulation, half_difference
-from prbayes.specimens.points import Draws, SpecimenData, SpecimenPoints, normal_of
+from prbayes.specimens.points import (
+    Draws,
+    SpecimenData,
+    SpecimenPoints,
+    normal_of,
+    per_hyperparameter,
+)
 from prbayes.specimens.response_share import ResponseShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
@@ -208,7 +214,7 @@ class RandomResponse:
             root[column, column] = max(np.ptp(values) / 2, 1e-9)
         return Region(center, root)
 
-    def at(self, region: Region, u: Floats, spread: float = 1.7) -> tuple[Floats, Floats]:
+    def at(self, region: Region, u: Floats, spread: float = 1.4) -> tuple[Floats, Floats]:
         """Return inputs at points of the unit cube, (n, free), and the log of their density.
 
         Their density is normal, ``spread`` times as wide as that of the specimens, and ends at the
@@ -340,18 +346,15 @@ class RandomResponse:
 
     def cube(self, count: int) -> Floats:
         """Return places of points in two independent halves, (count, free)."""
-        if len(self.free) > 1:
-            halves = [
-                sobol(
-                    count // 2,
-                    len(self.free),
-                    self.data.seed + h,
-                )
-                for h in (11, 12)
-            ]
-            return np.concatenate(halves)
-        steps = np.arange(count // 2)[:, None] * 2
-        return (np.concatenate([steps, steps + 1]) + 0.5) / count
+        d, half = len(self.free), count // 2
+        if d == 1:
+            steps = np.arange(half)[:, None] * 2
+            return (np.concatenate([steps, steps + 1]) + 0.5) / count
+        # Lattices integrate narrow densities better than scrambled points.
+        rng = np.random.default_rng([self.data.seed, 11])
+        places = lattice(np.arange(half), np.full(half, half), d)
+        shifts = rng.random((2, 1, d))
+        return inside((places + shifts) % 1.0).reshape(count, d)
 
 
 def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
@@ -376,7 +379,9 @@ def agreeing_shared_points(
     response: RandomResponse, scatters: list[Scatter], region: Region, draws: DrawsWithMass
 ) -> SpecimenPoints:
     """Return points whose halves agree at posterior draws; raise DesignError if none do."""
-    options, limit = response.options, response.data.options.half_difference
+    options = response.options
+    # As for other points of inputs that the readings leave open.
+    limit = 2 * response.data.options.half_difference * per_hyperparameter(draws)
     count = options.points
     while True:
         points = response.points(
@@ -397,8 +402,8 @@ def agreeing_shared_points(
         if 2 * count > options.most_points:
             raise DesignError(
                 f"{response.data.name}: got two halves of {count} points whose log-likelihoods "
-                f"differ by {difference[1]:.2g} nats, expected at most {limit}: the population is "
-                "much narrower than the scatter of the response, or has many inputs; narrow the "
+                f"differ by {difference[1]:.2g} nats, expected at most {limit:.2g}: the population "
+                "is much narrower than the scatter of the response, or has many inputs; narrow the "
                 "priors, or model fewer inputs as random"
             )
         count *= 2

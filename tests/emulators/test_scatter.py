@@ -121,3 +121,16 @@ def test_beyond_the_region_are_the_moments_of_its_end(fitted: Scatter) -> None:
     np.testing.assert_array_equal(ends, beyond)
     assert np.isfinite(fitted.noise(np.zeros((1, 1, 1)), np.array([[1e9, np.nan]]))).all()
     assert ndtr(4.0) < 1
+
+
+def test_variance_of_few_runs_is_unbiased() -> None:
+    rng = np.random.default_rng(8)
+    x = np.repeat(np.linspace(-1, 1, 10), 2)[:, None]
+    places = np.repeat(np.arange(10), 2)
+    variances = []
+    for _ in range(300):
+        y = rng.standard_normal((20, 1))
+        fit = fit_scatter(UNIT, x, y, places, (4, 0))
+        variances.append(np.exp(2 * fit.spread_terms[0, 0]))
+    error = np.std(variances) / np.sqrt(300)
+    assert np.mean(variances) == pytest.approx(1.0, abs=4 * error)
