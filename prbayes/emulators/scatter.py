@@ -100,7 +100,9 @@ class Scatter:
     ) -> Floats:
         """Return `log_density` of specimens with the same error in the same measured outputs."""
         factor = sd[..., None] * self.factor[columns]
-        covariance = self.bandwidth**2 * factor @ factor.swapaxes(-1, -2) + np.diag(error**2)
+        transposed = factor.swapaxes(-1, -2)
+        of_kernel = self.bandwidth**2 * factor @ transposed
+        covariance = of_kernel + np.diag(error**2)
         root = np.linalg.cholesky(covariance)
         shrunk = np.sqrt(1 - self.bandwidth**2) * self.residuals
         centers = np.linalg.solve(root, factor @ shrunk.T)  # (n or 1, K, m, J)
@@ -108,7 +110,8 @@ class Scatter:
             root,
             (values[:, None] - mean)[..., None],
         )[..., 0]
-        log_root = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+        diagonal = np.diagonal(root, axis1=-2, axis2=-1)
+        log_root = np.log(diagonal).sum(axis=-1)
         constant = log_root + 0.5 * len(columns) * np.log(2 * np.pi)
         with np.errstate(divide="ignore"):
             offset = np.log(self.weights) - 0.5 * (centers**2).sum(axis=-2)

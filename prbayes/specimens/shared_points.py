@@ -349,12 +349,15 @@ class RandomResponse:
         d, half = len(self.free), count // 2
         if d == 1:
             steps = np.arange(half)[:, None] * 2
-            return (np.concatenate([steps, steps + 1]) + 0.5) / count
+            order = np.concatenate([steps, steps + 1])
+            return (order + 0.5) / count
         # Lattices integrate narrow densities better than scrambled points.
         rng = np.random.default_rng([self.data.seed, 11])
         places = lattice(np.arange(half), np.full(half, half), d)
         shifts = rng.random((2, 1, d))
-        return inside((places + shifts) % 1.0).reshape(count, d)
+        shifted = (places + shifts) % 1.0
+        halves = inside(shifted)
+        return halves.reshape(count, d)
 
 
 def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
@@ -381,7 +384,8 @@ def agreeing_shared_points(
     """Return points whose halves agree at posterior draws; raise DesignError if none do."""
     options = response.options
     # As for other points of inputs that the readings leave open.
-    limit = 2 * response.data.options.half_difference * per_hyperparameter(draws)
+    half_limit = response.data.options.half_difference
+    limit = 2 * half_limit * per_hyperparameter(draws)
     count = options.points
     while True:
         points = response.points(
@@ -391,7 +395,8 @@ def agreeing_shared_points(
         )
         parts = slice(count // 2), slice(count // 2, None)
         halves = [log_likelihoods_of(draws, half_of(points, part)) for part in parts]
-        difference = half_difference(*halves)
+        first, second = halves
+        difference = half_difference(first, second)
         if difference[1] <= limit:
             points = response.points(
                 scatters,
@@ -461,7 +466,8 @@ def shared_points(response: RandomResponse, earlier: Emulation | None) -> Shared
         points = agreeing_shared_points(response, scatters, region, draws)
         draws = posterior_of(response, points)
         shares, shift = draw_shares(draws, points)
-        effective = float(np.mean(1 / (shares**2).sum(axis=1)))
+        squares = (shares**2).sum(axis=1)
+        effective = float(np.mean(1 / squares))
         latest = response.region(draws.specimens(), options.reach)
         is_inside = region.contains(latest)
         if is_inside and effective >= options.least_draws:
