@@ -294,6 +294,19 @@ def selection() -> Iterator[Row]:
         yield [label, error, offset, widths, seconds, sets]
 
 
+def random_responses() -> Iterator[Row]:
+    """Yield offsets, widths and coverage of posteriors of random responses."""
+    names = {"one": "one input, one output", "two": "two inputs, two outputs"}
+    for cell, figures in summary("random_responses").items():
+        half = len(figures["coverage"]) // 2
+        for label, part in (("mean", slice(half)), ("sd", slice(half, None))):
+            numbers = [np.mean(figures[key][part]) for key in ("mean offset", "rms offset")]
+            numbers += [np.mean(figures[key][part]) for key in ("mean width", "coverage")]
+            texts = [f"{number:.2f}" for number in numbers]
+            seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+            yield [f"{names[cell]}: {label}", *texts, seconds, sets]
+
+
 def sizes() -> Iterator[Row]:
     """Yield the area test's size."""
     table = summary("validity")
@@ -656,6 +669,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "discrepancy": discrepancy,
     "kinds of readings": kinds_of_readings,
     "selection": selection,
+    "random_responses": random_responses,
     "gross errors": gross_errors,
     "readings, coverage": partial(coverage_of, "readings_coverage"),
     "covariates": partial(coverage_of, "covariates"),

@@ -78,6 +78,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "propagation.Propagation": lambda: prb.Fresh(16),
     "reports.Section": lambda: prb.reports.Section("A title"),
     "response.Abort": prb.response.Abort,
+    "response.Stochastic": lambda: prb.response.Stochastic(np.square),
     "response.Additive": lambda: prb.response.Additive([20.0, 1000.0]),
     "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
     "response.Cost": lambda: prb.cost(optimum().model),

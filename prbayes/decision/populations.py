@@ -117,7 +117,7 @@ class Populations:
     def responses(self, response: Function, inputs: Sequence[Any]) -> Responses:
         """Return a response with its inputs."""
         name = named_response(response, self.calling, "write the response with def")
-        sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model)
+        sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model, function=response)
         refuse_several_populations(f"{self.caller}: {name}", sorted_inputs.parents)
         simulators = self.evaluator.simulators
         outputs = known_outputs(simulators, response)

@@ -15,7 +15,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, NamedArrays
+from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, Function, NamedArrays, called
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
@@ -29,12 +29,11 @@ from prbayes.model.random_variable import (
     common_targets,
     log_kernel,
     nodes,
-    simulators,
 )
 from prbayes.model.simulator_with_data import SimulatorWithData
 from prbayes.model.specimen_likelihood import (
+    all_simulators,
     log_likelihoods,
-    measurements_of,
     require_simulator,
     specimen_likelihoods,
 )
@@ -45,6 +44,7 @@ from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, with_shared_arrays
 from prbayes.response.inputs import Inputs, is_known, read_inputs
+from prbayes.response.response import repeats_of
 
 # Number of points of a design from which on samplers start with an eighth of the points.
 _LARGE = SIZES.first
@@ -358,22 +358,38 @@ def _ordinary(model: pm.Model) -> list[Any]:
 
 
 def read_inputs_of_copy(
-    name: str, inputs: Sequence[Any], model: pm.Model, *, fixed: bool = False
+    name: str,
+    inputs: Sequence[Any],
+    model: pm.Model,
+    *,
+    fixed: bool = False,
+    function: Function | None = None,
 ) -> Inputs:
     """Sort the inputs of a response, as `read_inputs`.
 
     Inputs may be those of the model's simulators, also where `pymc.do`, `pymc.observe` or a clone
-    made the model: its simulators have the variables of the first one.
+    made the model: its simulators have the variables of the first one. A random ``function`` of
+    a simulator has the simulator's noise as a further input.
     """
-    parents = [v for inputs in _inputs_of_simulators(model) for v in inputs.parents]
+    records = [record.responses for record in all_simulators(model).values()]
+    parents = [v for record in records for v in record.inputs.parents]
     originals = [v for v in dict.fromkeys(parents) if not is_known(v)]
+    if function is not None and repeats_of(function) > 1:
+        noises = [r.inputs.aleatory[-1] for r in records if r.function is function]
+        if not noises:
+            raise TypeError(
+                f"{name}: got {called(function)}, expected the random response of a simulator of "
+                "the model, whose distribution is emulated; pass that very object"
+            )
+        inputs = [*(x for x in inputs if x is not noises[0]), noises[0]]
     return read_inputs(name, inputs, model, fixed=fixed, originals=originals)
 
 
 def refuse_replaced_expressions(model: pm.Model) -> None:
     """Refuse `pymc.do` of an expression between hyperparameters and inputs: it has no effect."""
     replaced = {str(v.name) for v in model.data_vars}
-    for inputs in _inputs_of_simulators(model):
+    for record in all_simulators(model).values():
+        inputs = record.responses.inputs
         parents = set(inputs.parents)
         ends = [*inputs.aleatory, *inputs.epistemic]
         for v in ancestors(ends, blockers=parents):
@@ -383,12 +399,6 @@ def refuse_replaced_expressions(model: pm.Model) -> None:
                     "expected pm.do of variables with a prior alone; fix those that it is "
                     "computed from, or write the model again with a number in its place"
                 )
-
-
-def _inputs_of_simulators(model: pm.Model) -> list[Inputs]:
-    """Return the inputs of all simulators of a model, whether or not their runs are computed."""
-    records = [*simulators(model).values(), *measurements_of(model).values()]
-    return [record.responses.inputs for record in records]
 
 
 # Compiled functions.

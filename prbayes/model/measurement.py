@@ -437,6 +437,11 @@ class SpecimenLikelihood:
         )
 
 
+def has_random_response(likelihood: SpecimenLikelihood) -> bool:
+    """Return whether the response is random, so that its distribution is emulated."""
+    return likelihood.measurements[0].responses.repeats > 1
+
+
 def is_exchangeable(likelihood: SpecimenLikelihood) -> bool:
     """Return whether all specimens have the same population, weight and outputs of a simulator."""
     first, *more = likelihood.measurements

@@ -78,6 +78,7 @@ from prbayes.model.specimen_likelihood import (
     measurements_of,
     specimen_likelihoods,
 )
+from prbayes.model.stochastic_likelihood import refuse_random
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.by_specimen import of_specimens
@@ -93,7 +94,8 @@ from prbayes.response.inputs import (
 )
 from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.pymc_dims import values_of
-from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
+from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable, repeats_of
+from prbayes.response.stochastic import noise_of
 
 # Options of a propagation that concern the calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
@@ -232,6 +234,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     observed, metric, response = observed_by_specimen(name, observed, metric, response, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
+    if repeats_of(response) > 1:
+        inputs = (*inputs, noise_of(data.outputs.event))
+        variables = _read_inputs(name, response, inputs, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
     of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)
@@ -402,6 +407,8 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
         arguments.at_conditions,
         _measurement_variables(name, model, metric, partners),
     )
+    if measurement.responses.repeats > 1:
+        refuse_random(measurement, partners)
     likelihood = _joint_likelihood(measurement, partners, model)
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
     names = tuple(m.name for m in likelihood.measurements)
@@ -634,6 +641,12 @@ def _add_by_metric(
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
+    if repeats_of(arguments.response) > 1:
+        raise TypeError(
+            f"{name}: metric: got {called(metric)} for a random response "
+            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass "
+            "the function itself with prb.AreaMetric() and propagation=prb.Fresh()"
+        )
     if inputs.covariates:
         text = (
             f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "

@@ -11,6 +11,7 @@ those of the first ones have none; their observed variables are parameters of th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import batched
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ from prbayes.model.unknown_error import ReadingDensity
 from prbayes.numerics.threads import one_thread
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import is_group, is_known
-from prbayes.specimens.response_share import ResponseShare
+from prbayes.specimens.shared_points import PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
 
@@ -95,6 +96,8 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     Values are those of the model's variables by name, (P, *shape).
     """
     share, repeats = prepared(likelihood).share, likelihood.stacked.repeats
+    if prepared(likelihood).points.tilts is not None:
+        return _over_emulators(likelihood, values)
     errors = _unknown_of(likelihood.measurements, values)
     parts = []
     for (group, rows), points in zip(likelihood.by_group, points_by_group(likelihood), strict=True):
@@ -112,6 +115,71 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     result = _with_gross_errors(likelihood, values, result, slice(None))
     weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights
+
+
+def emulator_factors(likelihood: SpecimenLikelihood) -> Any:
+    """Return the shared variable of factors of exp(A) in draws of the emulator, (N, K, B)."""
+    if "factors" not in likelihood.cache:
+        tilts = prepared(likelihood).points.tilts
+        assert tilts is not None
+        factors = np.exp(tilts)
+        likelihood.cache["factors"] = pytensor.shared(factors, name=f"{likelihood.name}_factors")
+    return likelihood.cache["factors"]
+
+
+@one_thread()
+def _over_emulators(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+    """Return log-likelihoods of specimens, (P, S), whose sum is that of their mean over draws."""
+    factors = emulator_factors(likelihood).get_value(borrow=True)
+    size = len(next(iter(values.values())))
+    logs = np.empty((size, len(factors)))
+    changes = np.empty((*logs.shape, factors.shape[2]))
+    for (group, rows), points in zip(likelihood.by_group, points_by_group(likelihood), strict=True):
+        densities = points.log_densities(likelihood.parents(values, group, rows))
+        # Blocks of populations, so that products with the factors are those of matrices.
+        for first, block in enumerate(batched(densities, 32)):
+            terms = np.stack(block, axis=1) + points.log_a[:, None]  # (n, p, K)
+            largest = np.maximum(terms.max(axis=2, keepdims=True), -1e300)
+            weights = np.exp(np.maximum(terms - largest, -700.0))
+            weights[terms == -np.inf] = 0.0
+            total = weights.sum(axis=2, keepdims=True)
+            place = slice(32 * first, 32 * first + len(block))
+            with np.errstate(divide="ignore"):
+                logs[place, rows] = (np.log(total) + largest)[:, :, 0].T
+            ratio = (weights @ factors[rows]) / np.where(total > 0, total, 1.0)
+            changes[place, rows] = ratio.swapaxes(0, 1)
+    share = prepared(likelihood).share
+    if share is not None:
+        logs = logs - log_shares(likelihood, values, share)
+    return np.asarray(mean_over_emulators(logs, changes, likelihood.measurements[0].weights, np))
+
+
+def mean_over_emulators(logs: Any, factors: Any, weights: Floats | None, xp: Any) -> Any:
+    r"""Return log-likelihoods of N specimens whose sum is that of their mean over emulators.
+
+    With the log-likelihood :math:`l_{ib}` of specimen i under draw b of the emulator, and the
+    shares :math:`w_b` of the draws in :math:`\sum_b \exp \sum_i l_{ib}`,
+
+    .. math:: \log \frac{1}{B} \sum_b \exp \sum_i l_{ib}
+        = \sum_i \sum_b w_b l_{ib} - \sum_b w_b \log(B w_b).
+
+    The last sum is divided equally among the specimens. ``logs``, (..., N), are those of the first
+    emulator, ``factors``, (..., N, B), the ratios of the likelihoods to those.
+    """
+    count = factors.shape[-1]
+    factor = np.ones(1) if weights is None else weights
+    is_possible = logs > -np.inf if xp is np else pt.gt(logs, -np.inf)
+    choose = np.where if xp is np else pt.switch
+    changes = xp.log(xp.maximum(factors, 1e-300))
+    finite = choose(is_possible, logs, 0.0)
+    totals = ((finite[..., None] + changes) * factor[:, None]).sum(axis=-2)
+    log_shares = totals - totals.max(axis=-1, keepdims=True)
+    log_shares = log_shares - xp.log(xp.exp(log_shares).sum(axis=-1, keepdims=True))
+    shares = xp.exp(log_shares)
+    divergence = (shares * (log_shares + xp.log(1.0 * count))).sum(axis=-1)
+    total_weight = logs.shape[-1] if weights is None else weights.sum()
+    change = (changes * shares[..., None, :]).sum(axis=-1)
+    return (logs + change - divergence[..., None] / total_weight) * factor
 
 
 def _with_gross_errors(
@@ -222,7 +290,15 @@ def log_likelihood_graph(
         terms = terms + _reading_density(likelihood)(unknown, pt)
     result = logsumexp_finite(terms)
     if share is not None:
-        result = result - _log_share(likelihood, params, share)
+        log_share = _log_share(likelihood, params, share)
+    if prepared(likelihood).points.tilts is not None:
+        of_points = pt.exp(terms - pt.switch(pt.isinf(result), 0.0, result)[:, None])
+        # A product of matrices for each specimen would take a minute to compile.
+        factors = (of_points[:, :, None] * emulator_factors(likelihood)).sum(axis=1)
+        result = result if share is None else result - log_share
+        return mean_over_emulators(result, factors, measurements[0].weights, pt)
+    if share is not None:
+        result = result - log_share
     if stacked.repeats is not None:
         result = result + stacked.repeats.log_density(unknown[0], pt)
     gross_share = measurements[0].gross_errors
@@ -261,9 +337,9 @@ def _log_density(
 
 
 def _log_share(
-    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
+    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: PopulationShare
 ) -> Any:
-    """Return the graph of the log share of each population with a response, by specimen, (S,)."""
+    """Return the graph of the log share, or mass, of each specimen's population, (S,)."""
     coordinates, contexts = (
         likelihood.coordinates,
         [rows for _, rows in rows_by_context(likelihood)],
@@ -277,8 +353,10 @@ def _log_share(
     log_b = share.log_b + coordinates.log_jacobian(share.z)
     log_p = _log_density(likelihood, params, points, pt.as_tensor(specimens))
     terms = log_p.reshape((size, len(share.z))) + pytensor.shared(log_b)
-    inside = logsumexp_finite(terms[:, : share.with_response])
-    outside = logsumexp_finite(terms[:, share.with_response :])
+    count = share.with_response
+    if count is None:  # a mass, of which only an excess above one counts
+        return pt.maximum(logsumexp_finite(terms), 0.0)[context]
+    inside, outside = logsumexp_finite(terms[:, :count]), logsumexp_finite(terms[:, count:])
     is_unknown = pt.isinf(inside)
     log_ratio = outside - pt.switch(is_unknown, 0.0, inside)
     return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))[context]

@@ -32,6 +32,7 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import (
     SpecimenLikelihood,
+    has_random_response,
     is_exchangeable,
     output_columns,
     own_columns,
@@ -44,6 +45,7 @@ from prbayes.model.parameters import Hyperparameters, log_posterior, variables_a
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.remedies import remedies_of
 from prbayes.model.run_coverage import coverage_findings
+from prbayes.model.stochastic_likelihood import points_of_random_response, random_cost
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
@@ -72,7 +74,8 @@ from prbayes.specimens.points import (
     specimen_points,
 )
 from prbayes.specimens.proposals import Proposals
-from prbayes.specimens.response_share import ResponseShare, response_share
+from prbayes.specimens.response_share import response_share
+from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
 
@@ -82,12 +85,13 @@ class Preparation:
 
     emulation: Emulation
     points: SpecimenPoints
-    proposals: Proposals  # proposals from which the points were drawn
+    # Proposals from which the points were drawn; None where specimens share their points.
+    proposals: Proposals | None
     # (S, p): posterior draws at which the estimates from both halves of the points agree.
     thetas: Floats
     findings: Findings  # findings about the data and the runs, before the fit
     # Share of a population with a response; None if it hardly changes the log-likelihood.
-    share: ResponseShare | None = None
+    share: PopulationShare | None = None
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
@@ -107,7 +111,7 @@ def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> Specim
     The log-likelihood of a population needs fewer points than the inputs of a specimen.
     """
     preparation = prepared(likelihood)
-    if preparation.points.log_a.shape[1] >= count:
+    if preparation.proposals is None or preparation.points.log_a.shape[1] >= count:
         return likelihood
     data = specimen_data(likelihood)
     points = draw_points(data, preparation.proposals, count, data.seed + 1)
@@ -131,6 +135,7 @@ def with_specimens(
         result = likelihood.observing({measurement.name: values})
         results.append(_of_same_populations(result, likelihood))
     joint, added = results
+    assert preparation.proposals is not None  # `update` refuses random responses
     data, reference = specimen_data(added), preparation.proposals.residuals.population
     proposals = fit_proposals(data, preparation.emulation, reference)
     count = data.options.points * proposals.modes.table.shape[1]
@@ -200,6 +205,8 @@ def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     if likelihood.has_table:
         n = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
         return RunCost(n, 0, n, "none: the table has all runs")
+    if has_random_response(likelihood):
+        return random_cost(likelihood, first_run_count(likelihood))
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.sampled + 2)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
@@ -230,8 +237,10 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if any(finding.code == "readings-misfit" for finding in first.findings):
             refuse_unreached(likelihood.name, first.emulation.y, likelihood.readings)
         points = first.points
+        if has_random_response(likelihood):
+            return replace(first, findings=report(*runs.findings, *first.findings))
 
-        def posterior(share: ResponseShare | None) -> PopulationDraws:
+        def posterior(share: PopulationShare | None) -> PopulationDraws:
             has_own = likelihood.inputs.conditions or data.columns is not None
             if share is not None and has_own:
                 got, advice = (
@@ -316,7 +325,8 @@ class CheckedRuns:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             names = dict(enumerate(_coordinate_names(likelihood)))
             of_population = {k: names[k] for k in likelihood.coordinates.inputs_of_population}
-            refuse_unused_inputs(likelihood.name, z, values, of_population)
+            if not has_random_response(likelihood):
+                refuse_unused_inputs(likelihood.name, z, values, of_population)
             if not any(
                 m.metric.error is not None or m.gross_errors is not False for m in measurements
             ):
@@ -398,6 +408,12 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
 def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None) -> Preparation:
     """Fit the emulator and place the points; return both with their findings."""
     likelihood = runs.likelihood
+    if has_random_response(likelihood):
+        shared = points_of_random_response(runs, data, likelihood, emulation)
+        of_data = _data_findings(likelihood, shared.emulation.y, several_roots=False)
+        findings = (*shared.findings, *of_data)
+        thetas, mass = shared.draws.thetas, PointMass.of(shared.points)
+        return Preparation(shared.emulation, shared.points, None, thetas, findings, mass)
     if likelihood.has_table:
         emulation, points, proposals, draws = points_of_tables(data, likelihood)
     elif likelihood.calls_response:
@@ -573,7 +589,7 @@ def _data_findings(
 
 
 def log_shares(
-    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: ResponseShare
+    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: PopulationShare
 ) -> Floats:
     """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
     result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
@@ -646,7 +662,7 @@ class SpecimenPopulations:
         spread = log_sd.std(axis=0) if len(log_sd) else np.zeros(z.shape[-1])
         return np.argsort(-spread, kind="stable")
 
-    def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
+    def log_share(self, thetas: Floats, share: PopulationShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
         values = variables_at(self.hyperparameters, thetas)
         return log_shares(self.likelihood, values, share).sum(axis=1)
@@ -683,7 +699,7 @@ class SpecimenPopulations:
         z: Floats,
         log_a: Floats,
         smoothing: Floats | None = None,
-        share: ResponseShare | None = None,
+        share: PopulationShare | None = None,
         seed: int = 0,
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
@@ -769,7 +785,7 @@ class PopulationDraws:
         """Return log p(y_i | theta) at a quarter of the draws, (S, N)."""
         return self.populations.log_likelihoods(self.thetas[::4], z, log_a)
 
-    def log_share(self, share: ResponseShare) -> Floats:
+    def log_share(self, share: PopulationShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""
         return self.populations.log_share(self.thetas, share)
 

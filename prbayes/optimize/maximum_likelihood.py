@@ -38,7 +38,7 @@ from prbayes.model.evaluator import (
     specimen_log_likelihoods,
 )
 from prbayes.model.fingerprint import identity_of
-from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
+from prbayes.model.measurement import SpecimenLikelihood, has_random_response, specimen_numbers
 from prbayes.model.parameters import Hyperparameters, unconstrained, variables_at
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
@@ -594,6 +594,8 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
     if obstacle is not None:
         return obstacle
     for likelihood in evaluator.likelihoods:
+        if has_random_response(likelihood):
+            return f"the response of {likelihood.name} is random"
         if likelihood.readings.is_censored.any():
             return f"readings of {likelihood.name} are censored, and new ones cannot be drawn"
         is_measured = likelihood.readings.is_measured
@@ -657,6 +659,7 @@ def specimen_pool(
         options=replace(data.options, half_difference=tolerance),
         seed=1,
     )
+    assert preparation.proposals is not None  # `simulation_obstacle` excludes random responses
     proposals = fit_proposals(
         data,
         replace(preparation.emulation, offsets=None),

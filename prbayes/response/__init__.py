@@ -6,6 +6,7 @@ from prbayes.response.condition import condition
 from prbayes.response.discrepancy import Additive, Multiplicative, Smooth
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.inputs import group
+from prbayes.response.stochastic import Stochastic
 from prbayes.response.store import Store, StoreError
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "ResponseError",
     "Retry",
     "Smooth",
+    "Stochastic",
     "Store",
     "StoreError",
     "by_specimen",

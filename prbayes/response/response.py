@@ -87,6 +87,11 @@ def refuse_misfit(
         inner.refuse_misfit(name, sizes, outputs)
 
 
+def repeats_of(function: Function) -> int:
+    """Return how many runs with the same inputs a random response needs; 1 for another one."""
+    return int(getattr(unwrapped(function), "repeats", 1))
+
+
 def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
@@ -172,6 +177,8 @@ class Responses:
         self.name = name
         self.outputs = outputs
         self.function = function
+        # Number of runs with the same inputs that a random response needs; 1 for another one.
+        self.repeats = repeats_of(function)
         self.inputs = inputs
         # A function of batches without other settings is called once for a whole batch.
         self.is_batched = (
@@ -331,7 +338,7 @@ class Responses:
         """
         store, runs = stored._settings.store, stored.runs
         self._is_checked |= stored._is_checked
-        if store is not None and store.version is not None:
+        if (store is not None and store.version is not None) or self.repeats > 1:
             return
         has_changed = runs.version not in (None, stored.watched.compared())
         if runs.is_repeated and not has_changed:
@@ -423,7 +430,7 @@ class Responses:
         also called for one in eight of many in random order, as a state may belong to places.
         """
         finite = finite_runs(values)
-        if finite.size < 2 or (self.scatter is None and not self.is_batched):
+        if finite.size < 2 or (self.scatter is None and not self.is_batched) or self.repeats > 1:
             return
         self.watched.called()
         inner = np.random.default_rng(len(finite)).permutation(finite[1:-1])
@@ -482,7 +489,8 @@ class Responses:
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
         is_unchanged = written_form(self.function) == self._written_form
-        if is_unchanged or self._written_form is None or self.scatter is None:
+        is_random = self.scatter is None or self.repeats > 1
+        if is_unchanged or self._written_form is None or is_random:
             return
         written = copy.copy(self)
         try:

@@ -207,7 +207,7 @@ def predict(
     if conditions is not None:  # A sample has a specimen for each condition.
         copies, n_samples = n_samples, len(conditions)
     points, coords = populations_of(result, model, n_draws, "prb.predict", copies)
-    inputs_read = read_inputs_of_copy(label, arguments, model)
+    inputs_read = read_inputs_of_copy(label, arguments, model, function=response)
     n_stored = sum(s.responses.count for s in sources)
     responses = Responses(
         label,

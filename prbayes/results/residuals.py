@@ -176,8 +176,11 @@ class _Linearisation:
         shapes = [x.shape[2:] for x in inputs]
 
         def flat(values: list[Floats]) -> Floats:
-            columns = [np.log(values[k]) if is_log[k] else values[k] for k in unknown]
-            return np.concatenate([x.reshape(*x.shape[:2], -1) for x in columns], axis=-1)
+            columns = []
+            for k in unknown:
+                column = np.log(values[k]) if is_log[k] else values[k]
+                columns.append(column.reshape(*column.shape[:2], -1))
+            return np.concatenate(columns, axis=-1)
 
         def responses(eta: Floats) -> Floats:
             values = [x[0] for x in inputs]

@@ -16,7 +16,7 @@ from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_unchanged_runs
 from prbayes.model.fingerprint import identity_from_attributes, identity_of, require_same
 from prbayes.model.locking import locked
-from prbayes.model.measurement import SpecimenLikelihood, is_exchangeable
+from prbayes.model.measurement import SpecimenLikelihood, has_random_response, is_exchangeable
 from prbayes.model.parameters import variables_at
 from prbayes.model.specimen_audit import audited_likelihood
 from prbayes.model.specimen_likelihood import (
@@ -148,6 +148,11 @@ def _updatable(model: pm.Model, caller: str) -> SpecimenLikelihood:
         raise TypeError(
             f"{caller}: {likelihood.name}: got specimens with groups, labels, weights or "
             f"conditions, which new ones lack, expected none; {_AGAIN}"
+        )
+    if has_random_response(likelihood):
+        raise TypeError(
+            f"{caller}: {likelihood.name}: got a random response, whose emulator is that of the "
+            f"first specimens, expected a deterministic one; {_AGAIN}"
         )
     if prepared(likelihood).emulation.offsets is not None:
         raise DesignError(

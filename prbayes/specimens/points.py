@@ -77,6 +77,9 @@ class SpecimenPoints:
     mode: Indices  # (N, K): mode whose proposal drew the point
     difference: float = np.nan  # the half difference of the log-likelihoods
     is_exact: bool = False  # whether readings determine the inputs, so that a mode has one point
+    # (N, K, B): changes of ``log_a`` in draws of the emulator of a random response. The likelihood
+    # of all specimens is the mean over these draws, which they have in common; None for no draws.
+    tilts: Floats | None = None
 
     def rows(self, index: Indices) -> SpecimenPoints:
         """Return the points of selected specimens."""
@@ -163,7 +166,8 @@ class Draws(Protocol):
         """Return coordinates of specimens, (n, d)."""
 
 
-type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
+# Function of points, numbers A, a smoothing and, optionally, a share of the populations
+type Posterior = Callable[..., Draws]
 
 
 def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:

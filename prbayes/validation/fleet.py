@@ -214,6 +214,7 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         "prb.response.condition": bool(simulator.inputs.covariates)
         or getattr(simulator, "conditions", None) is not None,
         "a prb.Summary": simulator.metric.exact_likelihood,
+        "a random response": simulator.responses.repeats > 1,
     }
     names = [name for name, is_there in numbers.items() if is_there]
     if names:

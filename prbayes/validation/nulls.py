@@ -501,7 +501,7 @@ class JointNull(Null):
             )
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
-        read = read_inputs_of_copy(condition.name, inputs, self.optimum.model)
+        read = read_inputs_of_copy(condition.name, inputs, self.optimum.model, function=response)
         responses = Responses(
             condition.name,
             response,
