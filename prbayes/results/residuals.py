@@ -149,7 +149,7 @@ class ResidualTable(Tree):
                 rows.append([f"{key} of {name}", f"{x.size}", *(f"{n:.3g}" for n in numbers)])
         header = ["", "readings", "mean", "sd", "largest"]
         sentences = ["A right model has CWRES with mean 0 and sd 1."]
-        return View("ResidualTable of the measured specimens", header, rows, sentences)
+        return View("Residuals of the measured specimens", header, rows, sentences)
 
 
 @dataclass(frozen=True)
