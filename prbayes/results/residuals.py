@@ -1,4 +1,4 @@
-"""ResidualTable of the readings of each specimen, with the names of population pharmacokinetics."""
+"""Residuals of the readings of each specimen, with the names of population pharmacokinetics."""
 
 from __future__ import annotations
 
