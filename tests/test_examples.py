@@ -34,6 +34,18 @@ def test_crack_growth_validity(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("name", ["prbayes", "sbi", "openturns"])
+def test_other_programs_have_the_same_answer(name: str) -> None:
+    pytest.importorskip(name)
+    script = EXAMPLES / "migration" / f"with_{name}.py"
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
+    mu, sigma = map(float, done.stdout.split()[-2:])
+    # A third of the posterior standard deviations, .028 and .022.
+    assert mu == pytest.approx(0.953, abs=0.009)
+    assert sigma == pytest.approx(0.125, abs=0.007)
+
+
+@pytest.mark.long
 def test_theophylline_has_the_published_estimates(capsys: pytest.CaptureFixture[str]) -> None:
     """Within a tenth of a standard error; the two kinds of subjects are those of the simulation."""
     module = runpy.run_path(str(EXAMPLES / "theophylline.py"))
