@@ -22,6 +22,6 @@ density = ot.PythonFunction(22, 1, log_density)
 sampler = ot.RandomWalkMetropolisHastings(
     density, ot.Interval([-10.0] * 22, [10.0] * 22), start, step
 )
-draws = np.array(sampler.getSample(40_000))[10_000:]  # a run of each spring in each step
+draws = np.array(sampler.getSample(40_000))[10_000:]  # 20 runs in each
 
 print("means of mu and sigma:", draws[:, 0].mean(), np.exp(draws[:, 1]).mean())

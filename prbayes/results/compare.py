@@ -22,6 +22,7 @@ from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.multivariate import Joint
+from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.locking import locked
@@ -338,7 +339,12 @@ def _scores(
             if simulator.metric.exact_likelihood:  # A data sheet has statistics, no specimens.
                 selection = [simulator.metric]
             for metric in selection:
-                target = metric.against(simulator.observed, simulator.weights)
+                try:
+                    target = metric.against(simulator.observed, simulator.weights)
+                except FewSpecimensError:
+                    if metrics is not None:
+                        raise
+                    continue  # Few specimens have the same outputs, such as readings at one time.
                 totals = simulator.discrepancies(evaluator.parents(thetas, k), target)
                 inner = getattr(metric, "metric", None)
                 name = type(metric).__name__

@@ -283,3 +283,21 @@ def test_a_metric_and_the_likelihood_of_the_same_data_are_compared() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             prb.compare({"metric": one, "other": fitted(**data)})
+
+
+def test_readings_at_times_of_their_own_are_scored_by_the_likelihood_alone() -> None:
+    rng = np.random.default_rng(3)
+    times = np.array([1.0, 2.0]) + np.linspace(0, 0.5, 8)[:, None]
+    y = rng.normal(1, 0.3, (8, 1)) * times + rng.normal(0, 0.1, (8, 2))
+    with pm.Model() as model:
+        rate = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        time = prb.response.condition("time", times)
+        metric = prb.LogLikelihood(error=0.1)
+        prb.Simulator("y", np.multiply.outer, rate, time, observed=y, metric=metric)
+    results = {"optimum": prb.minimize(model, starts=0, progressbar=False)}
+    table = prb.compare(results, model=model)
+    scores = [name for name, x in table.data_vars.items() if x.dims == ("result",)]
+    assert "LogLikelihood by specimen" in scores
+    assert not any("Joint" in str(name) for name in scores)
+    with pytest.raises(ValueError, match="expected at least 3"):
+        prb.compare(results, model=model, metrics=[prb.Joint(prb.AreaMetric())])
