@@ -562,13 +562,16 @@ def _data_findings(
         values = np.where(m.readings.family < 0, m.readings.values, np.nan)
         simulated = outputs[:, output_columns(likelihood, m)] if len(outputs) else outputs
         has_gross_errors = m.gross_errors is not False
+        remedy = "pass gross_errors=True beside the other arguments of prb.LogLikelihood"
+        if has_random_response(likelihood) or m.metric.selected is not None:
+            remedy = "keep them as part of the population"  # such a model has no gross errors
         findings += outlier_findings(
             m.name,
             values,
             simulated,
             m.outputs.names,
             gross_errors=has_gross_errors,
-            remedy="pass gross_errors=True beside the other arguments of prb.LogLikelihood",
+            remedy=remedy,
         )
         if len(finite):
             is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0

@@ -472,6 +472,8 @@ def test_the_advice_for_an_outlier_keeps_the_other_arguments(given: dict[str, fl
     advice = "or pass gross_errors=True beside the other arguments of prb.LogLikelihood."
     assert texts["outlying-data"].endswith(advice)
     assert "outlying-data" not in {f.code for f in fitted(gross_errors=True).findings}
+    selected = {f.code: f.text for f in fitted(selected=(0.0, None)).findings}
+    assert selected["outlying-data"].endswith("or keep them as part of the population.")
 
 
 def test_a_misfit_of_many_outputs_is_one_number() -> None:
