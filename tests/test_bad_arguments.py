@@ -110,6 +110,21 @@ by_specimen = Later(lambda: simulated(metric=prb.LogLikelihood(), propagation=pr
 at_optimum = Later(lambda: prb.minimize(by_specimen(), starts=0, **QUIET))
 specimens = Later(lambda: prb.individuals(at_optimum(), n_draws=20))
 residuals = Later(lambda: prb.residuals(at_optimum(), n_draws=20))
+
+
+def at_times() -> xr.DataTree:
+    """Return inputs and readings of three specimens at four times."""
+    draws, times = ("chain", "draw", "specimen"), {"time": np.arange(4.0)}
+    y = np.arange(24.0).reshape(1, 2, 3, 4)
+    return xr.DataTree.from_dict(
+        {
+            "posterior": xr.Dataset({"x": (draws, y[..., 0])}),
+            "posterior_predictive": xr.Dataset({"y": ((*draws, "time"), y)}, times),
+            "observed_data": xr.Dataset({"y": (("specimen", "time"), y[0, 0])}, times),
+        }
+    )
+
+
 surrogate = Later(lambda: prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET))
 
 
@@ -605,7 +620,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plots.plot_individuals": Row({"individuals": specimens}, individuals=(posterior, comparison)),
     "plots.plot_predictive_check": Row(
-        {"individuals": specimens},
+        {"individuals": Later(at_times)},
         individuals=(posterior, comparison, specimens),  # readings without a horizontal axis
         own="individuals",
     ),

@@ -86,9 +86,7 @@ def plot_individuals(
     """
     check_options(labels, pc_kwargs)
     share(prob, "prob")
-    groups = specimen_groups(individuals)
-    dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
-    groups = {name: subset(group, coords, dims) for name, group in groups.items()}
+    groups = specimen_groups(individuals, coords)
     observed, replicates = groups["observed_data"], groups["posterior_predictive"]
     conditions = groups.get("constant_data", xr.Dataset()).data_vars
     inputs = _elements(groups["posterior"])
@@ -114,8 +112,8 @@ def plot_individuals(
     return finish(figure)
 
 
-def specimen_groups(individuals: object) -> dict[str, xr.Dataset]:
-    """Return the groups of the result of `individuals`, or raise if it is none."""
+def specimen_groups(individuals: object, coords: Coords | None) -> dict[str, xr.Dataset]:
+    """Return the groups of the result of `individuals` at ``coords``, or raise if it is none."""
     trees = individuals.children if isinstance(individuals, xr.DataTree) else {}
     groups = {name: tree.to_dataset() for name, tree in trees.items()}
     draws = groups.get("posterior", xr.Dataset())
@@ -125,7 +123,8 @@ def specimen_groups(individuals: object) -> dict[str, xr.Dataset]:
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
-    return groups
+    dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
+    return {name: subset(group, coords, dims) for name, group in groups.items()}
 
 
 def _draw_inputs(axis: Axes, draws: Floats, prob: float) -> None:

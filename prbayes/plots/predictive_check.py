@@ -22,7 +22,7 @@ from prbayes.plots.canvas import (
     refuse_labels,
 )
 from prbayes.plots.individuals import specimen_groups
-from prbayes.plots.selection import FilterVars, VarNames, select_variables
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +35,7 @@ def plot_predictive_check(
     corrected: bool = False,
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
     labels: Labels | None = None,
     **pc_kwargs: Any,
@@ -66,6 +67,8 @@ def plot_predictive_check(
         as times, or a condition.
     filter_vars : {None, "like", "regex"}
         How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of specimens and outputs by dimension, such as the specimens of one dose.
     prob : float
         Probability of the bands.
     labels : mapping, optional
@@ -110,7 +113,7 @@ def plot_predictive_check(
     share(prob, "prob")
     positive_integer(bins, "bins")
     flag(corrected, "corrected")
-    groups = specimen_groups(individuals)
+    groups = specimen_groups(individuals, coords)
     conditions = groups.get("constant_data", xr.Dataset())
     observed = groups["observed_data"]
     horizontal = {

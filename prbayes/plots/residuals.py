@@ -18,13 +18,20 @@ from prbayes.plots.canvas import (
     panels,
     refuse_labels,
 )
+from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def plot_residuals(
-    residuals: xr.DataTree, *, labels: Labels | None = None, **pc_kwargs: Any
+    residuals: xr.DataTree,
+    *,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
+    labels: Labels | None = None,
+    **pc_kwargs: Any,
 ) -> Figure:
     """Draw readings against predictions, and weighted residuals against prediction and time.
 
@@ -36,6 +43,12 @@ def plot_residuals(
     ----------
     residuals : xarray.DataTree
         From `residuals`.
+    var_names : str or sequence of str, optional
+        Panels, in this order; all by default.
+    filter_vars : {None, "like", "regex"}
+        How ``var_names`` are read, as by ArviZ.
+    coords : mapping, optional
+        Labels of specimens and outputs by dimension, such as ``{"specimen": [0, 1, 2]}``.
     labels : mapping, optional
         Labels of simulators and dimensions by name, with units.
     **pc_kwargs
@@ -50,7 +63,7 @@ def plot_residuals(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, KeyError, ValueError
         If an argument is not as described.
 
     Examples
@@ -71,6 +84,8 @@ def plot_residuals(
             f"residuals: got {called(residuals)}, expected the DataTree that prb.residuals returns"
         )
     datasets = {name: tree.to_dataset() for name, tree in trees.items()}
+    dims = {dim for data in datasets.values() for dim in data.dims} - {"input"}
+    datasets = {name: subset(data, coords, dims) for name, data in datasets.items()}
     plan: dict[str, tuple[str, str | None]] = {}
     for name, data in datasets.items():
         plan[name] = name, None
@@ -79,7 +94,8 @@ def plot_residuals(
         if dim != "specimen" and data[dim].dtype.kind in "iuf":
             plan[f"{name}, CWRES against {dim}"] = name, dim
     refuse_labels(labels, [*datasets, *(x for _, x in plan.values() if x)])
-    figure, axes = panels(list(plan), size=(4.6, 3.9), pc_kwargs=pc_kwargs)
+    names = select_variables(list(plan), var_names, filter_vars)
+    figure, axes = panels(names, size=(4.6, 3.9), pc_kwargs=pc_kwargs)
     for title, axis in axes.items():
         name, horizontal = plan[title]
         data = datasets[name]

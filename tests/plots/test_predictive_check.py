@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import prbayes as prb
 from prbayes.plots import plot_predictive_check, plot_residuals
 
 TIMES = np.array([0.0, 1.0, 1.1, 5.0])
@@ -65,6 +64,8 @@ def test_a_condition_is_the_horizontal_axis_of_one_reading() -> None:
     figure = plot_predictive_check(data, labels={"dose": "dose in mg"})
     assert figure.axes[0].get_xlabel() == "dose in mg"
     assert read.xy(figure, "measured 0.05", "y")[0].tolist() == [1.0, 10.0]
+    one_dose = plot_predictive_check(tree(), coords={"specimen": np.arange(30, 60)})
+    assert read.artist(one_dose, "observed", "y").get_offsets().shape == (4 * 30, 2)
     alone = xr.DataTree.from_dict(
         {k: v for k, v in data.to_dict().items() if k != "/constant_data"}
     )
@@ -86,4 +87,7 @@ def test_residuals_have_a_panel_for_each_axis() -> None:
     assert figure.axes[2].get_xlabel() == "time in h"
     with pytest.raises(KeyError, match="no such"):
         plot_residuals(data, labels={"no such": "x"})
-    assert isinstance(prb.plots.plot_residuals(data), type(figure))
+    name = "y, CWRES against time"
+    some = plot_residuals(data, var_names=[name], coords={"time": [1.1, 5.0]})
+    places = read.artist(some, "residuals", name).get_offsets()[:, 0]
+    assert sorted(set(places.tolist())) == [1.1, 5.0]
