@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 from scipy.special import fdtrc, logsumexp, ndtr, ndtri
-from scipy.stats import ks_2samp
 
 from prbayes._finding import Finding, Findings
 from prbayes._validate import Bools, Floats, Indices
@@ -601,6 +600,8 @@ def scatter_findings(response: RandomResponse, scatter: Scatter, runs: RandomRun
 
 def _p_of_halves(x: Floats, residuals: Floats) -> float:
     """Return the p-value of equal distributions of residuals below and above the median of x."""
+    from scipy.stats import ks_2samp  # heavy, and only needed here
+
     is_low = x <= np.median(x)
     if is_low.all():
         return 1.0
