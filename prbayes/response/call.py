@@ -104,6 +104,14 @@ def unwrapped(function: Function) -> Function:
     return function.function if isinstance(function, scalar) else function
 
 
+def takes_single_points(function: Function) -> bool:
+    """Return whether a function is called for each point alone.
+
+    With a generator for each point its numbers would otherwise depend on the chunk of the point.
+    """
+    return isinstance(function, scalar) or getattr(function, "has_generator_for_each_point", False)
+
+
 @dataclass(frozen=True)
 class Points:
     """Points at which the response is evaluated."""
@@ -168,8 +176,8 @@ def compute(
 ) -> Chunk:
     """Return the responses at points. Unless failures are tolerated, the first one ends the work.
 
-    A `scalar` is called for each point. Another function is called for all points at once; if it
-    raises, the points are bisected. Bytes are a function that was `packed` in another process.
+    A function that takes single points is called for each of them, another one for all at once; if
+    it raises, the points are bisected. Bytes are a function that was `packed` in another process.
     """
     if isinstance(function, bytes):
         function = unpacked(function)
@@ -179,7 +187,8 @@ def compute(
     raised = {}
     is_scalar = isinstance(function, scalar)
     call = unwrapped(function)
-    waiting = [np.array([i]) for i in reversed(range(n))] if is_scalar else [np.arange(n)]
+    is_single = takes_single_points(function)
+    waiting = [np.array([i]) for i in reversed(range(n))] if is_single else [np.arange(n)]
     while waiting:
         rows = waiting.pop()
         arguments = points.at(int(rows[0]) if is_scalar else rows).arguments

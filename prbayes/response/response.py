@@ -38,6 +38,7 @@ from prbayes.response.call import (
     respond,
     scalar,
     shapes,
+    takes_single_points,
     tolerance_of,
     unpacked,
     unwrapped,
@@ -89,7 +90,7 @@ def refuse_misfit(
 
 def repeats_of(function: Function) -> int:
     """Return how many runs with the same inputs a random response needs; 1 for another one."""
-    return int(getattr(unwrapped(function), "repeats", 1))
+    return int(getattr(unwrapped(function), "random_repeats", 1))
 
 
 def check_call_settings(
@@ -185,7 +186,7 @@ class Responses:
             executor is None
             and store is None
             and policy == Abort()
-            and not isinstance(function, scalar)
+            and not takes_single_points(function)
         )
         # Tolerance, in standard deviations, for solvers that integrate a batch as one system.
         self._one_system = 0.01 if self.is_batched else 0.0

@@ -36,8 +36,10 @@ class Stochastic:
     repeats : int
         Number of runs with the same inputs, at least 2.
     random_seed : int
-        Seed of the `numpy.random.Generator` that a function with the argument ``rng`` gets, so that
-        runs are the same on each computer. Another function has its own source of randomness.
+        Seed of the `numpy.random.Generator` that a function with the argument ``rng`` gets. It is
+        called for one specimen at a time, with arrays of length 1, each with a generator of its
+        own, so that runs are the same on any number of workers. Another function has its own
+        source of randomness.
 
     Raises
     ------
@@ -85,14 +87,20 @@ class Stochastic:
         self.function = function
         self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
         self.random_seed = positive_integer(random_seed, f"{label}: random_seed", minimum=0)
-        self.takes_rng = "rng" in _parameters(function)
+        # The numbers of a point would depend on its chunk if a chunk had one generator.
+        self.has_generator_for_each_point = "rng" in _parameters(function)
+
+    @property
+    def random_repeats(self) -> int:
+        """Number of runs with the same inputs, by which simulators know a random response."""
+        return self.repeats
 
     @property
     def __name__(self) -> str:
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def __repr__(self) -> str:
-        seed = f", random_seed={self.random_seed}" if self.takes_rng else ""
+        seed = f", random_seed={self.random_seed}" if self.has_generator_for_each_point else ""
         return f"prb.response.Stochastic({self.__name__}, repeats={self.repeats}{seed})"
 
     @property
@@ -106,7 +114,7 @@ class Stochastic:
     def __call__(self, *inputs: Any) -> Any:
         """Return the response; the last input is the noise, which numbers runs."""
         *arguments, noise = inputs
-        if not self.takes_rng:
+        if not self.has_generator_for_each_point:
             return self.function(*arguments)
         numbers = [np.ascontiguousarray(x, dtype=np.float64) for x in (*arguments, noise)]
         digest = zlib.crc32(b"".join(x.tobytes() for x in numbers))
@@ -115,7 +123,7 @@ class Stochastic:
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any) -> None:
         """Raise if the function does not take the inputs."""
         function = self.function
-        if self.takes_rng:
+        if self.has_generator_for_each_point:
             function = partial(function, rng=None)
         refuse_misfit(name, function, sizes[:-1], outputs)
 

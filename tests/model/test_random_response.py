@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import mean_over_emulators, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
+from prbayes.response.call import Points, compute
 from prbayes.response.compile import PLAIN
 
 N = 24
@@ -74,7 +76,7 @@ def test_predictions_have_the_scatter(calibrated: Any) -> None:
     model, x, response, result = calibrated
     arguments: Any = {"model": model, "random_seed": 1, "progressbar": False}
     for stored in (True, False):
-        predicted = prb.predict(result, response, x, stored=stored, **arguments)
+        predicted = prb.predict(result, response, x, stored=stored, n_draws=100, **arguments)
         sd = np.hypot(2 * float(result["posterior"]["s"].mean()), 0.5)
         assert float(predicted.std()) == pytest.approx(sd, rel=0.15)
     individuals = prb.individuals(result, model=model)
@@ -112,6 +114,42 @@ def test_likelihoods_of_specimens_have_the_sum_of_their_mean_over_emulators() ->
         assert np.isfinite(np.delete(result[2], 1)).all()
         graph = mean_over_emulators(pt.as_tensor(logs), pt.as_tensor(factors), weights, pt)
         np.testing.assert_allclose(graph.eval(mode=PLAIN), result, rtol=1e-12)
+
+
+def test_runs_do_not_depend_on_their_chunk() -> None:
+    response = prb.response.Stochastic(noisy, random_seed=1)
+    x, noise = np.linspace(0, 1, 6), np.linspace(-1, 1, 6)
+
+    def runs(rows: Any) -> Any:
+        return compute(response, Points([x[rows], noise[rows]], [True, True]), False).values
+
+    parts = np.concatenate([runs(slice(0, 1)), runs(slice(1, 4)), runs(slice(4, 6))])
+    np.testing.assert_array_equal(runs(slice(None)), parts)
+    assert np.unique((parts - 2 * x).round(6)).size == 6  # each run has noise of its own
+
+
+def test_runs_are_the_same_with_any_number_of_workers() -> None:
+    logs = []
+    for workers in (0, 1, 3):
+        executor = ThreadPoolExecutor(workers) if workers else None
+        response = prb.response.Stochastic(noisy, random_seed=1)
+        model, _ = model_of(response, propagation=prb.Reweighted(64, executor=executor))
+        (likelihood,) = dict.fromkeys(specimen_likelihoods(model).values())
+        logs.append(prepared(likelihood).emulation.y)
+        if executor is not None:
+            executor.shutdown()
+    np.testing.assert_array_equal(logs[0], logs[1])
+    np.testing.assert_array_equal(logs[0], logs[2])
+
+
+def test_another_function_with_an_attribute_repeats_is_not_random() -> None:
+    def double(x: Any) -> Any:
+        return 2 * x
+
+    double.repeats = 3  # type: ignore[attr-defined]
+    model, _ = model_of(double)
+    (likelihood,) = dict.fromkeys(specimen_likelihoods(model).values())
+    assert len(likelihood.inputs.aleatory) == 1
 
 
 def test_store_keeps_each_of_the_repeated_runs(tmp_path: Path) -> None:
