@@ -34,6 +34,7 @@ from prbayes.decision.populations import (
     NestedPopulations,
     Populations,
     ResponseSample,
+    left_out_findings,
     output_column,
     probability_bounds,
     share_error,
@@ -48,7 +49,7 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.model.random_variable import response_name
 from prbayes.numerics.points import farthest_rows
-from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum
+from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import Responses
@@ -506,15 +507,11 @@ def _error_findings(
         )
         findings.append(Finding("rough-probability", text))
     lost = max(estimate.lost for estimate in estimates)
-    if lost >= SMALLEST_SHARE:
-        text = (
-            f"{name}: {lost:.1%} of specimens {NO_RESPONSE}: the probability is that of the "
-            "others, and the upper end of the interval counts all of them as beyond the limit. A "
-            "response that returns +inf counts as a specimen that failed."
-        )
-        page = "distributed.md#when-a-response-fails"
-        findings.append(Finding("specimens-left-out", text, page))
-    return report(*findings)
+    answer = (
+        "the probability is that of the others, and the upper end of the interval counts all of "
+        "them as beyond the limit"
+    )
+    return report(*findings) + left_out_findings(name, lost, answer)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
     ResponseSample,
+    left_out_findings,
     probability_bounds,
     share_error,
 )
@@ -87,7 +88,8 @@ def p_box(
         with intervals between ``mean`` and ``mean_upper``; and ``error``, the largest standard
         error of ``mean`` from the points, the emulator and the draws, which the bands do not
         include: of smaller tails ask `exceedance`. Where no point is below y, or none above, the
-        bands have the bound of the effective number of points. It prints as quantiles; a notebook
+        bands have the bound of the effective number of points; they are wider by the share of
+        specimens without response. It prints as quantiles; a notebook
         shows a table. Attributes: ``prob``, ``response`` (its name), ``responses`` (number
         computed), ``findings`` (as JSON) and ``identity``.
 
@@ -143,6 +145,10 @@ def p_box(
     # Distribution functions increase, so that a bound at y also holds beyond it.
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
+    name = response_name(response)
+    lost = max(sample.lost for sample in samples)
+    answer = "the mean is that of the others, and the bands contain them at either end"
+    findings = findings_of(response) + left_out_findings(name, lost, answer)
     data: dict[str, Any] = {
         "lower": (["band", "y"], lowest),
         "upper": (["band", "y"], highest),
@@ -156,9 +162,9 @@ def p_box(
         coords={"y": y, "band": ["pointwise", "simultaneous"]},
         attrs={
             "prob": prob,
-            "response": response_name(response),
+            "response": name,
             "responses": n_searched + sum(sample.responses.count for sample in samples),
-            "findings": as_json(findings_of(response)),
+            "findings": as_json(findings),
             **populations.provenance(),
         },
     )
@@ -218,6 +224,8 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     lowest, highest = envelope(functions, 1 - prob)
     lower = np.where(mean > 1 - 1e-12, least, [low, lowest])
     upper = np.where(mean == 0, most, [high, highest])
+    # Specimens without response may be above all values, or below them.
+    lower, upper = lower * (1 - sample.lost), upper * (1 - sample.lost) + sample.lost
     return lower, upper, mean, error
 
 

@@ -40,7 +40,7 @@ from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variables_at
 from prbayes.numerics.points import inside, sobol
-from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum, require_sampling
 from prbayes.posterior.nested import NestedFamily, nested_posterior
 from prbayes.propagation.base import N_BLOCKS, DesignError
 from prbayes.propagation.importance import new_specimens, through_inverses
@@ -357,14 +357,28 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
     return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
 
+def left_out_findings(name: str, lost: float, answer: str) -> Findings:
+    """Report a share of specimens without response, and what the ``answer`` says of them."""
+    if lost < SMALLEST_SHARE:
+        return ()
+    text = (
+        f"{name}: {lost:.1%} of specimens {NO_RESPONSE}: {answer}. A response that returns +inf "
+        "counts as a specimen that failed."
+    )
+    return report(Finding("specimens-left-out", text, "distributed.md#when-a-response-fails"))
+
+
 def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findings, float]:
     """Return findings, and the error of the quantity at the centre.
 
-    Findings report a tail of few points, populations beyond the runs, and a model discrepancy
-    beyond the data. Raises ValueError if no response is in the tail, or specimens failed.
+    Findings report a tail of few points, populations beyond the runs, specimens without response,
+    and a model discrepancy beyond the data. Raises ValueError if no response is in the tail, or
+    specimens failed.
     """
     caller, center = sample.populations.caller, sample.populations.center[None]
     findings = findings_of(quantity.response)
+    others = "the quantity is that of the others"
+    findings += left_out_findings(repr(quantity), sample.lost, others)
     if quantity.needs_finite and np.isposinf(sample.values[-1]):
         raise ValueError(
             f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "

@@ -31,7 +31,9 @@ class Region:
 
     def unit(self, x: Floats) -> Floats:
         """Return the place of inputs, (..., d), in the cube [-1, 1]^d."""
-        return np.asarray((x - self.center) @ np.linalg.inv(self.root).T)
+        inverse = np.linalg.inv(self.root)
+        centred = x - self.center
+        return np.asarray(centred @ inverse.T)
 
     def at(self, unit: Floats) -> Floats:
         """Return the inputs at places of the cube, (..., d)."""
@@ -39,8 +41,10 @@ class Region:
 
     def contains(self, other: Region, slack: float = 0.25) -> bool:
         """Return whether the axes of another region end in this one, or a little beyond."""
-        ends = np.concatenate([np.eye(len(self.center)), -np.eye(len(self.center))])
-        return bool(np.abs(self.unit(other.at(ends))).max() <= 1 + slack)
+        axes = np.eye(len(self.center))
+        ends = other.at(np.concatenate([axes, -axes]))
+        distance = np.abs(self.unit(ends))
+        return bool(distance.max() <= 1 + slack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +68,11 @@ class Scatter:
         """
         unit = np.clip(self.region.unit(x), -1.0, 1.0)
         flat = unit.reshape(-1, unit.shape[-1])
-        mean = legendre_products(flat, self.degrees[0]) @ self.mean_terms
-        log_sd = legendre_products(flat, self.degrees[1]) @ self.spread_terms
-        sd = np.exp(np.clip(log_sd, *self.log_spread))
+        of_mean, of_spread = self.degrees
+        mean = legendre_products(flat, of_mean) @ self.mean_terms
+        log_sd = legendre_products(flat, of_spread) @ self.spread_terms
+        limited = np.clip(log_sd, *self.log_spread)
+        sd = np.exp(limited)
         shape = (*unit.shape[:-1], mean.shape[1])
         return mean.reshape(shape), sd.reshape(shape)
 
@@ -84,13 +90,15 @@ class Scatter:
         kind = kind.ravel()
         for k in range(kind.max() + 1):
             rows = np.flatnonzero(kind == k)
-            columns = np.flatnonzero(~np.isnan(values[rows[0]]))
+            first = rows[0]
+            columns = np.flatnonzero(~np.isnan(values[first]))
+            measured = values[np.ix_(rows, columns)]
             at: Indices | slice = slice(None) if is_common else rows
             result[rows] = self._of_kind(
                 mean[at][..., columns],
                 sd[at][..., columns],
-                values[np.ix_(rows, columns)],
-                error[rows[0], columns],
+                measured,
+                error[first, columns],
                 columns,
             )
         return result
@@ -106,34 +114,36 @@ class Scatter:
         root = np.linalg.cholesky(covariance)
         shrunk = np.sqrt(1 - self.bandwidth**2) * self.residuals
         centers = np.linalg.solve(root, factor @ shrunk.T)  # (n or 1, K, m, J)
-        away = np.linalg.solve(
-            root,
-            (values[:, None] - mean)[..., None],
-        )[..., 0]
+        difference = values[:, None] - mean
+        away = np.linalg.solve(root, difference[..., None])
+        away = away[..., 0]
         diagonal = np.diagonal(root, axis1=-2, axis2=-1)
         log_root = np.log(diagonal).sum(axis=-1)
         constant = log_root + 0.5 * len(columns) * np.log(2 * np.pi)
+        squares = (centers**2).sum(axis=-2)
         with np.errstate(divide="ignore"):
-            offset = np.log(self.weights) - 0.5 * (centers**2).sum(axis=-2)
+            offset = np.log(self.weights) - 0.5 * squares
+        distance = (away**2).sum(axis=-1)
         logs = np.empty(away.shape[:2])
-        step = max(
-            1,
-            IN_CACHE // (away.shape[1] * len(self.weights)),
-        )
+        n_terms = away.shape[1] * len(self.weights)
+        step = max(1, IN_CACHE // n_terms)
         for first in range(0, len(values), step):
             block = slice(first, first + step)
             at = slice(None) if len(centers) == 1 else block
-            products = (away[block][:, :, None] @ centers[at])[:, :, 0]
-            logs[block] = log_sum_exp(products + offset[at]) - 0.5 * (away[block] ** 2).sum(axis=-1)
+            products = away[block][:, :, None] @ centers[at]
+            terms = products[:, :, 0] + offset[at]
+            logs[block] = log_sum_exp(terms) - 0.5 * distance[block]
         return np.asarray(logs - constant)
 
     @cached_property
     def _quantiles(self) -> tuple[Floats, Floats]:
         """A grid of residuals, (G,), and their distribution functions there, (m, G)."""
         grid = np.linspace(-12.0, 12.0, 2401)
-        shrunk = np.sqrt(1 - self.bandwidth**2) * self.residuals
-        steps = (grid - shrunk.T[..., None]) / self.bandwidth
-        return grid, self.weights @ ndtr(steps)
+        shrinkage = np.sqrt(1 - self.bandwidth**2)
+        middles = shrinkage * self.residuals.T
+        steps = (grid - middles[..., None]) / self.bandwidth
+        cumulative = self.weights @ ndtr(steps)
+        return grid, cumulative
 
     def outputs(self, x: Floats, noise: Floats) -> Floats:
         """Return outputs (n, m) at inputs (n, d), for standard normal noise (n, m).
@@ -144,11 +154,10 @@ class Scatter:
         grid, cumulative = self._quantiles
         probabilities = ndtr(noise)
         pairs = zip(probabilities.T, cumulative, strict=True)
-        drawn = np.stack(
-            [np.interp(p, of_output, grid) for p, of_output in pairs],
-            axis=-1,
-        )
-        return mean + sd * (drawn @ self.factor.T)
+        columns = [np.interp(p, of_output, grid) for p, of_output in pairs]
+        drawn = np.stack(columns, axis=-1)
+        correlated = drawn @ self.factor.T
+        return mean + sd * correlated
 
     def noise(self, x: Floats, values: Floats, most: float = 4.0) -> Floats:
         """Return the noise (N, K, m) that gives readings (N, m) at inputs (1 or N, K, d).
@@ -157,29 +166,28 @@ class Scatter:
         """
         mean, sd = self.moments(x)
         grid, cumulative = self._quantiles
-        away = np.nan_to_num((values[:, None] - mean) / sd)
-        residuals = np.linalg.solve(self.factor, away[..., None])[..., 0]
-        pairs = zip(
-            np.moveaxis(residuals, -1, 0),
-            cumulative,
-            strict=True,
-        )
-        levels = np.stack(
-            [np.interp(r, grid, of_output) for r, of_output in pairs],
-            axis=-1,
-        )
-        return np.asarray(np.clip(ndtri(inside(levels)), -most, most))
+        difference = values[:, None] - mean
+        away = np.nan_to_num(difference / sd)
+        residuals = np.linalg.solve(self.factor, away[..., None])
+        by_output = np.moveaxis(residuals[..., 0], -1, 0)
+        pairs = zip(by_output, cumulative, strict=True)
+        columns = [np.interp(r, grid, of_output) for r, of_output in pairs]
+        levels = inside(np.stack(columns, axis=-1))
+        return np.asarray(np.clip(ndtri(levels), -most, most))
 
 
 def legendre_products(unit: Floats, degree: int) -> Floats:
     """Return products of Legendre polynomials up to a total degree, (n, d) -> (n, P)."""
     n, d = unit.shape
-    powers = np.stack([np.polynomial.legendre.legvander(x, degree) for x in unit.T])
+    vandermonde = np.polynomial.legendre.legvander
+    powers = np.stack([vandermonde(x, degree) for x in unit.T])
+    inputs_in_order = np.arange(d)
     columns = [np.ones(n)]
     for total in range(1, degree + 1):
         for inputs in combinations_with_replacement(range(d), total):
             counts = np.bincount(inputs, minlength=d)
-            columns.append(powers[np.arange(d), :, counts].prod(axis=0))
+            factors = powers[inputs_in_order, :, counts]
+            columns.append(factors.prod(axis=0))
     return np.stack(columns, axis=1)
 
 
@@ -216,7 +224,8 @@ def fit_scatter(
     log_sd = of_spread @ spread_terms
     share = weights / weights.sum()
     residuals = residuals - share @ residuals
-    scale = positive_scale(np.sqrt(share @ residuals**2))
+    variance = share @ residuals**2
+    scale = positive_scale(np.sqrt(variance))
     residuals = residuals / scale
     correlation = (residuals.T * share) @ residuals
     factor = np.linalg.cholesky(correlation + 1e-9 * np.eye(m))
@@ -225,7 +234,9 @@ def fit_scatter(
     bandwidth = min(0.85 * count ** (-1 / (m + 4)), 0.95)
     # The spread has the scale of the residuals, whose variance is one.
     spread_terms[0] += np.log(scale)
-    log_ends = np.stack([log_sd.min(axis=0), log_sd.max(axis=0)]) + np.log(scale)
+    lowest = log_sd.min(axis=0)
+    highest = log_sd.max(axis=0)
+    log_ends = np.stack([lowest, highest]) + np.log(scale)
     return Scatter(
         region, mean_terms, spread_terms, degrees, log_ends, residuals, share, factor, bandwidth
     )
@@ -245,25 +256,24 @@ def _fit_output(
         precision = np.sqrt(weights * np.exp(-log_variance))
         weighted = basis * precision[:, None]
         orthogonal, values, rotation = np.linalg.svd(weighted, full_matrices=False)
-        inverse = np.where(
-            values > 1e-9 * values[0],
-            1 / values,
-            0.0,
-        )
-        beta = rotation.T @ (inverse * (orthogonal.T @ (precision * y)))
+        is_regular = values > 1e-9 * values[0]
+        inverse = np.where(is_regular, 1 / values, 0.0)
+        projected = orthogonal.T @ (precision * y)
+        beta = rotation.T @ (inverse * projected)
         leverage = np.minimum((orthogonal**2).sum(axis=1), 0.9)
-        square = (y - basis @ beta) ** 2 / (1 - leverage)
+        difference = y - basis @ beta
+        square = difference**2 / (1 - leverage)
         for _ in range(3):
             ratio = np.minimum(square * np.exp(-log_variance), 1e6)
-            step = np.linalg.solve(
-                information,
-                of_spread.T @ (weights * (ratio - 1)),
-            )
-            change = of_spread @ step
-            gamma = gamma + step * min(1.0, 2.0 / max(np.abs(change).max(), 1e-300))
+            score = of_spread.T @ (weights * (ratio - 1))
+            step = np.linalg.solve(information, score)
+            change = np.abs(of_spread @ step)
+            largest = max(change.max(), 1e-300)
+            gamma = gamma + step * min(1.0, 2.0 / largest)
             floor = 2 * np.log(1e-8 * scale)
             log_variance = np.maximum(of_spread @ gamma, floor)
-    residuals = (y - basis @ beta) * np.exp(-0.5 * log_variance) / np.sqrt(1 - leverage)
+    inverse_sd = np.exp(-0.5 * log_variance)
+    residuals = (y - basis @ beta) * inverse_sd / np.sqrt(1 - leverage)
     return beta, 0.5 * gamma, residuals
 
 
@@ -282,7 +292,8 @@ def emulator_draws(
     """
     rng = np.random.default_rng([seed, 7])
     n = int(places.max()) + 1
-    weights = rng.dirichlet(np.ones(n), count) * n
+    shares = rng.dirichlet(np.ones(n), count)
+    weights = shares * n
     return [fit_scatter(region, x, y, places, degrees, row) for row in weights]
 
 
@@ -299,31 +310,25 @@ def chosen_degrees(region: Region, x: Floats, y: Floats, places: Indices) -> tup
     sums = np.zeros((n, y.shape[1]))
     np.add.at(sums, places, y)
     counts = np.bincount(places)
-    means = sums / counts[:, None]
+    of_counts = counts[:, None]
+    means = sums / of_counts
     _, first = np.unique(places, return_index=True)
     errors = []
     for degree in range(1, most + 1):
-        fit = fit_scatter(
-            region,
-            x,
-            y,
-            places,
-            (degree, spread),
-        )
+        fit = fit_scatter(region, x, y, places, (degree, spread))
         _, sd = fit.moments(x[first])
         basis = legendre_products(unit[first], degree)
         total = 0.0
         for of_output, of_spread in zip(means.T, sd.T, strict=True):
             precision = np.sqrt(counts) / of_spread
-            orthogonal = np.linalg.svd(
-                basis * precision[:, None],
-                full_matrices=False,
-            )[0]
+            orthogonal = np.linalg.svd(basis * precision[:, None], full_matrices=False)[0]
             scaled = precision * of_output
-            residuals = scaled - orthogonal @ (orthogonal.T @ scaled)
-            left_out = residuals / np.maximum(1 - (orthogonal**2).sum(axis=1), 0.1)
+            fitted = orthogonal @ (orthogonal.T @ scaled)
+            leverage = (orthogonal**2).sum(axis=1)
+            left_out = (scaled - fitted) / np.maximum(1 - leverage, 0.1)
             # The sd of this degree would hide its misfit, so that left-out errors are in the units
             # of the output.
-            total += float(np.log(((left_out * of_spread) ** 2).mean()))
+            squares = (left_out * of_spread) ** 2
+            total += float(np.log(squares.mean()))
         errors.append(total)
     return int(np.argmin(errors)) + 1 if errors else 0, spread

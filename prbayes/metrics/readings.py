@@ -127,7 +127,8 @@ class Readings:
         terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
             step = positive_scale(self.step)[:, None]
-            inside = log_interval_probability(z - step / (2 * sd), z + step / (2 * sd), xp)
+            half = step / (2 * sd)
+            inside = log_interval_probability(z - half, z + half, xp)
             is_rounded = ((self.step > 0) & self.is_measured)[:, None]
             terms = xp.where(is_rounded, inside - np.log(step), terms)
         if self.is_censored.any():
@@ -135,7 +136,9 @@ class Readings:
             far = 1e30
             lower = np.where(self.is_censored, np.maximum(self.lower, -far), 0.0)[:, None]
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
-            inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
+            low = (lower - outputs) / sd
+            high = (upper - outputs) / sd
+            inside = log_interval_probability(low, high, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
         for code in _codes(self):
             is_count = ((self.family == code) & self.is_measured)[:, None]

@@ -198,7 +198,8 @@ class SummaryDiscrepancy(Discrepancy):
             return log_l
         expected, w_variance, covariance = self._sum_of_squares(strata, expected_sum, variance, xp)
         center, scatter = _cube_root(w_variance / expected**2, n, xp)
-        ratio = (n - 1) * (summary.sd / self._unit) ** 2 / expected
+        sum_of_squares = (n - 1) * (summary.sd / self._unit) ** 2
+        ratio = sum_of_squares / expected
         square_score = (ratio ** (1 / 3) - center) / xp.sqrt(scatter)
         log_l = log_l - 0.5 * xp.log(scatter) - xp.log(expected) / 3
         if summary.mean is None:

@@ -52,9 +52,12 @@ def margins(evaluator: Evaluator) -> list[Margin]:
         inputs = node.inputs
         names = aleatory_names(inputs, node.responses.function)
         group = [node.group] if node.group else []
+        # The noise of a random response is no input that varies between specimens.
+        noise = inputs.aleatory[-1] if node.responses.repeats > 1 else None
         for position, (name, dist) in enumerate(zip(names, inputs.aleatory, strict=True)):
             is_listed = any(m.dist is dist and m.group == node.group for m in out)
-            if is_listed or is_condition(dist):
+            is_population = not is_condition(dist) and dist is not noise
+            if is_listed or not is_population:
                 continue
             if element_name(name, group) in taken:
                 name = f"{name} of {node.name}"

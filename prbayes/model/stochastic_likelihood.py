@@ -33,15 +33,9 @@ def points_of_random_response(
     """
     coordinates = likelihood.coordinates
     n_noise = len(data.output_names)
-    noise = Noise(
-        coordinates.center[-n_noise:],
-        coordinates.half_width[-n_noise:],
-    )
+    noise = Noise(coordinates.center[-n_noise:], coordinates.half_width[-n_noise:])
     repeats = likelihood.measurements[0].responses.repeats
-    return shared_points(
-        RandomResponse(run, data, repeats, noise),
-        earlier,
-    )
+    return shared_points(RandomResponse(run, data, repeats, noise), earlier)
 
 
 def random_cost(likelihood: SpecimenLikelihood, stated: int | None) -> RunCost:
@@ -49,21 +43,12 @@ def random_cost(likelihood: SpecimenLikelihood, stated: int | None) -> RunCost:
     (measurement,) = likelihood.measurements
     options, repeats = RandomRunOptions(), measurement.responses.repeats
     n_inputs = likelihood.coordinates.size - measurement.rows.shape[1]
-    count = repeats * options.distinct_inputs(
-        stated,
-        n_inputs,
-        repeats,
-    )
+    count = repeats * options.distinct_inputs(stated, n_inputs, repeats)
     growth = (
         f"in all, {repeats} with the same inputs; doubled, up to {max(options.most, count)}, until "
         "the readings do not choose between the emulators that the runs allow"
     )
-    return RunCost(
-        count,
-        0,
-        max(options.most, count),
-        growth,
-    )
+    return RunCost(count, 0, max(options.most, count), growth)
 
 
 def refuse_random(measurement: Measurement, partners: Sequence[SpecimenLikelihood]) -> None:

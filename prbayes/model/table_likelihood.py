@@ -100,20 +100,24 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
         domain = table.surrogate.domain
         places = [m.responses.inputs.arguments.index(a) for a in range(len(m.inputs.aleatory))]
         values = domain.arguments(table.points)
+        inputs = [domain.inputs[place] for place in places]
         runs.append(coordinates.of([values[place] for place in places], 1))
-        lows.append(coordinates.of([domain.inputs[place].low for place in places], 0))
-        highs.append(coordinates.of([domain.inputs[place].high for place in places], 0))
-    low, high = np.max(lows, axis=0), np.min(highs, axis=0)
+        lows.append(coordinates.of([x.low for x in inputs], 0))
+        highs.append(coordinates.of([x.high for x in inputs], 0))
+    low = np.max(lows, axis=0)
+    high = np.min(highs, axis=0)
     # An input may be negative in the table, though its coordinate is logarithmic.
     low = np.where(np.isfinite(low), low, bounds[0])
     ranges = np.stack([low, high])
-    box = np.stack([np.maximum(bounds[0], low - (high - low) / 2), bounds[1]])
-    box[1] = np.minimum(bounds[1], high + (high - low) / 2)
-    if (box[0] >= box[1]).any():
+    margin = (high - low) / 2
+    lower = np.maximum(bounds[0], low - margin)
+    upper = np.minimum(bounds[1], high + margin)
+    is_empty = lower >= upper
+    if is_empty.any():
         names = _column_names(likelihood)
         prior = _as_inputs(coordinates, bounds)
         table_ends = _as_inputs(coordinates, ranges)
-        j = int(np.argmax(box[0] >= box[1]))
+        j = int(np.argmax(is_empty))
         raise DesignError(
             f"{likelihood.name}: got runs with {names[j]} from {table_ends[0, j]:.4g} to "
             f"{table_ends[1, j]:.4g}, and a prior of {prior[0, j]:.4g} to {prior[1, j]:.4g}, "
@@ -122,8 +126,10 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
     z = np.unique(np.concatenate(runs), axis=0)
     z = z[np.isfinite(z).all(axis=1)]
     y = OfTables.of(likelihood, Runs.__call__)(z)
-    residuals = OfTables.of(likelihood, left_out_nearby)(z[near_readings(y, data.readings)])
-    error = 2 * np.sqrt((residuals**2).mean(axis=0))
+    near = z[near_readings(y, data.readings)]
+    residuals = OfTables.of(likelihood, left_out_nearby)(near)
+    mean_square = (residuals**2).mean(axis=0)
+    error = 2 * np.sqrt(mean_square)
     error = np.maximum(error, data.options.floor * data.readings.spread())
     # The step of the differences is a thousandth, over which the surface changes by far more than
     # the rounding noise of a Gaussian process.

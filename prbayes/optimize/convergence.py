@@ -366,18 +366,25 @@ def _newton_step(objective: Objective, t: Floats, apart: float) -> tuple[Floats,
     The gain is infinite if the minimum is farther away than ten times the distance of the
     gradients, if there is none, or if the objective is not finite at one of them.
     """
-    pairs = [(objective(t + step)[1], objective(t - step)[1]) for step in apart * np.eye(t.size)]
-    if not np.isfinite(objective.values[-2 * t.size :]).all():
+    steps = apart * np.eye(t.size)
+    pairs = [(objective(t + step)[1], objective(t - step)[1]) for step in steps]
+    latest = objective.values[-2 * t.size :]
+    if not np.isfinite(latest).all():
         return np.zeros(t.size), np.inf, np.zeros((0, t.size))
     gradient = np.mean(pairs, axis=(0, 1))
-    hessian = np.array([up - down for up, down in pairs]) / (2 * apart)
-    curvatures, axes = np.linalg.eigh((hessian + hessian.T) / 2)
+    differences = np.array([up - down for up, down in pairs])
+    hessian = differences / (2 * apart)
+    symmetric = (hessian + hessian.T) / 2
+    curvatures, axes = np.linalg.eigh(symmetric)
     slope = axes.T @ gradient
-    downhill = np.where(slope > 0, -1.0, 1.0)[:, None] * axes.T
+    sign = np.where(slope > 0, -1.0, 1.0)
+    downhill = sign[:, None] * axes.T
     reach = 10.0 * apart
+    endless = np.where(slope > 0, -np.inf, np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        full = np.where(curvatures > 0, -slope / curvatures, np.where(slope > 0, -np.inf, np.inf))
-    full[(curvatures == 0) & (slope == 0)] = 0.0
+        full = np.where(curvatures > 0, -slope / curvatures, endless)
+    is_flat = (curvatures == 0) & (slope == 0)
+    full[is_flat] = 0.0
     shift = np.clip(full, -reach, reach)
     # the minimum is far away, or there is none, as on a saddle
     if not (np.abs(full) <= reach).all():

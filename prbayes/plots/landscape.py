@@ -301,32 +301,42 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     path = free_elements(evaluator, optimum.search.trace["theta"])
     local_optima = np.array([mode["theta"] for mode in optimum.local_optima])
     modes = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
-    prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
-    errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
+    prior_thetas = evaluator.hyperparameters.prior_thetas(1000, 0)
+    prior = free_elements(evaluator, prior_thetas)
+    stderr = labelled(optimum.evaluator, optimum.stderr, {})
+    errors = single_elements(stderr.data_vars)
 
     axes = []
     for name in names:
         # The optimiser may have started far out. Its path widens the axis to the central 98% of the
         # prior at most.
         bulk = np.quantile(prior[name], (0.01, 0.99))
-        marked = np.append(np.clip(path[name], *bulk), modes[name])
+        limited = np.clip(path[name], *bulk)
+        marked = np.append(limited, modes[name])
+        lowest, highest = marked.min(), marked.max()
         # Beyond four standard errors the normal approximation has a probability of 6e-5. If the
         # error is unknown, the axis is as wide as the prior.
         reach = 4 * errors[name]
         if not 0 < reach < np.inf:
             reach = float(bulk[1] - bulk[0]) / 2
-        first, last = center[name][0] - reach, center[name][0] + reach
+        middle = center[name][0]
+        first = middle - reach
+        last = middle + reach
         # All marked points are inside the axis, with room for their markers.
-        margin = 0.04 * (max(last, marked.max()) - min(first, marked.min()))
+        margin = 0.04 * (max(last, highest) - min(first, lowest))
         ends = []
-        for end in (min(first, marked.min() - margin), max(last, marked.max() + margin)):
+        for end in (min(first, lowest - margin), max(last, highest + margin)):
             # The objective exists within the support of the priors alone. The axis ends at the last
             # of 32 steps that is inside.
-            steps = np.linspace(center[name][0], end, 33)
+            steps = np.linspace(middle, end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
             ok = np.isfinite(thetas).all(axis=1)
             ok[ok] = in_support(evaluator.hyperparameters, thetas[ok])
-            ends.append(end if ok.all() else float(steps[max(int(np.argmin(ok)) - 1, 0)]))
+            if ok.all():
+                ends.append(end)
+                continue
+            last_inside = max(int(np.argmin(ok)) - 1, 0)
+            ends.append(float(steps[last_inside]))
         axes.append(np.linspace(ends[0], ends[1], points))
 
     coordinates = np.meshgrid(*axes, indexing="ij")

@@ -201,14 +201,13 @@ def _draw_percentiles(
     axis: Any, x: Floats, y: Floats, replicates: Floats, places: Indices, prob: float
 ) -> None:
     """Draw percentiles of readings as lines, and those of replicates as bands, over the bins."""
-    numbers = np.unique(places)
-    middles = np.array([np.median(x[places == k]) for k in numbers])
-    order = np.argsort(middles)
-    numbers, middles = numbers[order], middles[order]
+    of_bins = [places == k for k in np.unique(places)]
+    of_bins.sort(key=lambda rows: np.median(x[rows]))
+    middles = [np.median(x[rows]) for rows in of_bins]
     tail = (1 - prob) / 2
     for level, color, style in ((0.05, GREY, "--"), (0.5, BLUE, "-"), (0.95, GREY, "--")):
-        measured = [np.quantile(y[places == k], level) for k in numbers]
-        drawn = [np.quantile(replicates[:, places == k], level, axis=1) for k in numbers]
+        measured = [np.quantile(y[rows], level) for rows in of_bins]
+        drawn = [np.quantile(replicates[:, rows], level, axis=1) for rows in of_bins]
         low, high = np.quantile(drawn, [tail, 1 - tail], axis=1)
         is_median = level == 0.5
         text = "median" if is_median else "5 and 95 % percentile"

@@ -103,7 +103,9 @@ def plot_residuals(
         if horizontal is None:
             for key, color, text in (("PRED", GREY, "population"), ("IPRED", BLUE, "specimen")):
                 axis.scatter(data[key], data["DV"], 12, color=color, label=f"{text} ({key})")
-            limits = [float(np.nanmin(data["DV"])), float(np.nanmax(data["DV"]))]
+            lowest = float(np.nanmin(data["DV"]))
+            highest = float(np.nanmax(data["DV"]))
+            limits = [lowest, highest]
             axis.plot(limits, limits, color=ink(), linewidth=1)
             axis.set(xlabel=f"predicted {label}", ylabel=f"measured {label}")
             continue

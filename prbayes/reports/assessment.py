@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.special import ndtri
 
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json, sentences_of
@@ -62,9 +63,9 @@ def verdict(m: Material) -> list[Section]:
         tests = m.tests.values()
         p = enumerated([f"{t.p_value:.{p_digits(t.p_value, t.alpha)}g}" for t in tests])
         text.append(f"Measurements of {_tested(m)} agree with the model (p = {p}).")
-        count = max(np.unique(t.specimens).size for t in tests)
-        # A shift by 1.96 standard errors is found by at most half of all tests with alpha = .05.
-        shift = 1.96 / np.sqrt(count)
+        # A normal test of the mean finds a shift by so many standard errors in half of all cases.
+        shifts = [ndtri(1 - t.alpha / 2) / np.sqrt(np.unique(t.specimens).size) for t in tests]
+        shift = min(shifts)
         text.append(
             f"A shift of the mean by {shift:.1f} standard deviations of the specimens can remain "
             "unseen."

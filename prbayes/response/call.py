@@ -109,7 +109,7 @@ def takes_single_points(function: Function) -> bool:
 
     With a generator for each point its numbers would otherwise depend on the chunk of the point.
     """
-    return isinstance(function, scalar) or getattr(function, "has_generator_for_each_point", False)
+    return isinstance(function, scalar) or getattr(function, "_has_generators", False)
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def refuse_misfit(
 
 def repeats_of(function: Function) -> int:
     """Return how many runs with the same inputs a random response needs; 1 for another one."""
-    return int(getattr(unwrapped(function), "random_repeats", 1))
+    return int(getattr(unwrapped(function), "_random_repeats", 1))
 
 
 def check_call_settings(

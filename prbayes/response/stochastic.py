@@ -88,10 +88,10 @@ class Stochastic:
         self.repeats = positive_integer(repeats, f"{label}: repeats", minimum=2)
         self.random_seed = positive_integer(random_seed, f"{label}: random_seed", minimum=0)
         # The numbers of a point would depend on its chunk if a chunk had one generator.
-        self.has_generator_for_each_point = "rng" in _parameters(function)
+        self._has_generators = "rng" in _parameters(function)
 
     @property
-    def random_repeats(self) -> int:
+    def _random_repeats(self) -> int:
         """Number of runs with the same inputs, by which simulators know a random response."""
         return self.repeats
 
@@ -100,7 +100,7 @@ class Stochastic:
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def __repr__(self) -> str:
-        seed = f", random_seed={self.random_seed}" if self.has_generator_for_each_point else ""
+        seed = f", random_seed={self.random_seed}" if self._has_generators else ""
         return f"prb.response.Stochastic({self.__name__}, repeats={self.repeats}{seed})"
 
     @property
@@ -114,7 +114,7 @@ class Stochastic:
     def __call__(self, *inputs: Any) -> Any:
         """Return the response; the last input is the noise, which numbers runs."""
         *arguments, noise = inputs
-        if not self.has_generator_for_each_point:
+        if not self._has_generators:
             return self.function(*arguments)
         numbers = [np.ascontiguousarray(x, dtype=np.float64) for x in (*arguments, noise)]
         digest = zlib.crc32(b"".join(x.tobytes() for x in numbers))
@@ -123,7 +123,7 @@ class Stochastic:
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Any) -> None:
         """Raise if the function does not take the inputs."""
         function = self.function
-        if self.has_generator_for_each_point:
+        if self._has_generators:
             function = partial(function, rng=None)
         refuse_misfit(name, function, sizes[:-1], outputs)
 

@@ -76,7 +76,8 @@ def compare(
     metrics : sequence of Metric, optional
         Under which each estimate is scored, whatever it was made with. By default all four where
         that costs no response (`Reweighted`); under the other propagations each result costs n
-        responses per simulator.
+        responses per simulator. Outputs that few specimens share, such as readings at times of
+        their own, have the log-likelihood by specimen alone.
 
     Returns
     -------

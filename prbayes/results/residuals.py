@@ -51,7 +51,8 @@ def residuals(
     .. math:: \mathrm{CWRES}_i = C_i^{-1/2} \bigl(y_i - f(\hat\eta_i) + G_i \hat\eta_i\bigr),
         \qquad C_i = G_i \Omega G_i^T + \Sigma_i.
 
-    They are close to independent standard normal numbers if the model is right.
+    They are close to independent standard normal numbers if the model is right. Of a posterior the
+    moments are those of all its populations together.
 
     Parameters
     ----------

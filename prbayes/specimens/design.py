@@ -289,8 +289,10 @@ def extended(
     rng: np.random.Generator,
 ) -> Emulation:
     """Return the emulation with a batch of ``count`` runs."""
-    n_possible, n_explored = max(2, count // 4), max(2, count // 8)
-    n_sampled = max(data.options.sampled, (count - n_explored - n_possible) // 2)
+    n_possible = max(2, count // 4)
+    n_explored = max(2, count // 8)
+    rest = count - n_explored - n_possible
+    n_sampled = max(data.options.sampled, rest // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
     possible = likely.possible(data, n_possible, rng)
     scale = likely.scale(data)
@@ -301,16 +303,20 @@ def extended(
     noise = rng.standard_normal((len(near), len(data.free)))
     near[:, data.free] += 0.4 * scale[data.free] * noise
     noise = 2.0 * rng.standard_normal((len(of_population), len(data.free)))
-    of_population[:, data.free] = likely.population.mean + noise @ likely.population.root.T
-    prior = data.inner[rng.permutation(len(data.inner))[:1024]].copy()
+    population = likely.population
+    of_population[:, data.free] = population.mean + noise @ population.root.T
+    of_inner = rng.permutation(len(data.inner))[:1024]
+    prior = data.inner[of_inner].copy()
     is_condition = ~np.isnan(data.known[0])
-    of_specimens = data.known[rng.integers(0, len(data.known), len(prior))]
+    owners = rng.integers(0, len(data.known), len(prior))
+    of_specimens = data.known[owners]
     prior[:, is_condition] = of_specimens[:, is_condition]
     of_prior = data.scale(data.inner[:, data.free].std(axis=0))
     runs = np.concatenate([emulation.z, sampled, possible])
     # Likely inputs may have a run already, so that only the new ones count.
-    n_new = int(_is_new(emulation.z, runs[len(emulation.z) :], scale).sum())
-    far = farthest(runs, near, max(0, count - n_explored - n_new - 3), scale)
+    is_new = _is_new(emulation.z, runs[len(emulation.z) :], scale)
+    n_far = max(0, count - n_explored - int(is_new.sum()) - 3)
+    far = farthest(runs, near, n_far, scale)
     uncertain = _explored(data, emulation, runs, of_population, 3, scale)
     runs = np.concatenate([runs, far, uncertain])
     explored = _explored(data, emulation, runs, prior, n_explored, of_prior)
@@ -549,16 +555,19 @@ def audited(
     candidates, owners = likely.sample(64 * data.options.sampled, rng)
     # Half of the runs are drawn from the quarter of the candidates with the largest predictive
     # variance.
-    deviation = np.sqrt(emulation.surface.variance(candidates)) / data.readings.spread()
-    order = np.argsort(-deviation.max(axis=1), kind="stable")[: len(candidates) // 4]
-    rows = rng.permutation(order)[: len(sampled)]
+    variance = emulation.surface.variance(candidates)
+    deviation = np.sqrt(variance) / data.readings.spread()
+    order = np.argsort(-deviation.max(axis=1), kind="stable")
+    least_certain = order[: len(candidates) // 4]
+    rows = rng.permutation(least_certain)[: len(sampled)]
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
     z = np.concatenate([sampled, candidates[rows], possible])
     grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
-    weighted = np.sqrt(2 * stratum)[:, None] * at_audited
+    root_weights = np.sqrt(2 * stratum)
+    weighted = root_weights[:, None] * at_audited
     audited_z = z[: len(specimens)]
     error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
     bias = max(bias, _bias_of_possible(data, at_possible), emulation.bias)
@@ -566,12 +575,15 @@ def audited(
     if (measured <= 2 * stated).all() and bias <= 1.5 * data.options.bias:
         # Eight runs may miss the places where the emulator is wrong, so that the new error is the
         # geometric mean of the stated and the measured one.
-        ratio = np.sqrt(((error / emulation.error) ** 2).mean())
+        squares = (error / emulation.error) ** 2
+        ratio = np.sqrt(squares.mean())
         error = np.sqrt(min(ratio, 1.0)) * emulation.error
         return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
     grown, left_out = _refitted(data, grown, likely.population)
     if bias <= 1.5 * data.options.bias:
-        at_audited = left_out[len(emulation.z) :][: is_new[: len(specimens)].sum()]
+        n_audited = is_new[: len(specimens)].sum()
+        of_new_runs = left_out[len(emulation.z) :]
+        at_audited = of_new_runs[:n_audited]
         error = _improved(data, error, at_audited)
     else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)

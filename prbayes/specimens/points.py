@@ -314,14 +314,19 @@ def _starts(
 
     free, n = data.free, len(data.known)
     rng = np.random.default_rng([data.seed, 2])
-    of_prior = data.inner[rng.permutation(len(data.inner))[: most // 2]]
-    a = 2.0 * ndtri(sobol(most // 2, len(free), data.seed))
+    half = most // 2
+    of_inner = rng.permutation(len(data.inner))[:half]
+    of_prior = data.inner[of_inner]
+    uniform = sobol(half, len(free), data.seed)
+    a = 2.0 * ndtri(uniform)
     a = np.concatenate([residuals.whitened(of_prior), a])
     # In the units of the prior's spread: a narrow population would leave regions far apart.
-    _, near = cKDTree(a).query(a, min(len(a), 4 + 2 * len(free)))
+    n_near = min(len(a), 4 + 2 * len(free))
+    _, near = cKDTree(a).query(a, n_near)
     # Without conditions all specimens have the same outputs at the starts.
     is_common = len(free) == data.known.shape[1]
-    common = emulation.values(residuals.coordinates(np.zeros(len(a), dtype=int), a))[None]
+    of_first = residuals.coordinates(np.zeros(len(a), dtype=int), a)
+    common = emulation.values(of_first)[None]
     starts = []
     for rows in np.array_split(np.arange(n), 1 + n * len(a) // IN_CACHE):
         values = common
@@ -339,10 +344,14 @@ def _starts(
         for column in near[:, 1:].T:
             is_minimum &= distance <= distance[:, column]
         # Minima come first. Positive numbers have the order of their bits, whose first one is free.
-        keys = distance.view(np.uint64) | (~is_minimum).astype(np.uint64) << np.uint64(63)
-        nearest = np.argpartition(keys, data.options.starts, axis=1)[:, : data.options.starts]
-        order = np.argsort(np.take_along_axis(keys, nearest, axis=1), axis=1, kind="stable")
-        starts.append(a[np.take_along_axis(nearest, order, axis=1)])
+        first_bit = (~is_minimum).astype(np.uint64) << np.uint64(63)
+        keys = distance.view(np.uint64) | first_bit
+        count = data.options.starts
+        nearest = np.argpartition(keys, count, axis=1)[:, :count]
+        of_nearest = np.take_along_axis(keys, nearest, axis=1)
+        order = np.argsort(of_nearest, axis=1, kind="stable")
+        rows_in_order = np.take_along_axis(nearest, order, axis=1)
+        starts.append(a[rows_in_order])
     return np.concatenate(starts)
 
 

@@ -469,35 +469,45 @@ class Proposals:
         a = self.modes.a[mode].copy()
         value, jacobian = self.mapped(mode, a)
         fraction = np.ones(len(a))
-        converged, last = np.zeros(len(a), dtype=bool), np.full(len(a), np.inf)
+        converged = np.zeros(len(a), dtype=bool)
+        last = np.full(len(a), np.inf)
         active = np.arange(len(a))
         for _ in range(25):
-            step = _solutions(jacobian[active], xi[active] - value[active])
+            residual = xi[active] - value[active]
+            step = _solutions(jacobian[active], residual)
             length = np.sqrt((step**2).sum(axis=1))
             usable = np.isfinite(length) & (fraction[active] > 0.1)
-            active, step, length = active[usable], step[usable], length[usable]
+            active = active[usable]
+            step = step[usable]
+            length = length[usable]
             if not active.size:
                 break
-            longest = np.maximum(2.0, np.sqrt((a[active] ** 2).sum(axis=1)))
-            step *= (fraction[active] / np.maximum(length / longest, 1.0))[:, None]
+            from_origin = np.sqrt((a[active] ** 2).sum(axis=1))
+            longest = np.maximum(2.0, from_origin)
+            factor = fraction[active] / np.maximum(length / longest, 1.0)
+            step *= factor[:, None]
             trial = a[active] + step
             new_value, new_jacobian = self.mapped(mode[active], trial)
-            accepted = np.linalg.slogdet(new_jacobian)[0] == self.orientation[mode[active]]
+            sign, _ = np.linalg.slogdet(new_jacobian)
+            accepted = sign == self.orientation[mode[active]]
             is_whole = accepted & (fraction[active] == 1.0)
             to = active[accepted]
-            a[to], value[to] = trial[accepted], new_value[accepted]
+            a[to] = trial[accepted]
+            value[to] = new_value[accepted]
             jacobian[to] = new_jacobian[accepted]
             fraction[active] = np.where(accepted, 1.0, fraction[active] / 2)
             distance = np.abs(xi[active] - value[active]).max(axis=1)
             # Rounding of the emulator may end the decrease. At a fold, where the determinant
             # vanishes, and beside inputs without a response, a small distance may be one to values
             # that no inputs have.
-            is_regular = np.linalg.slogdet(jacobian[active])[1] > self.log_det[mode[active]] - 1.0
+            _, log_size = np.linalg.slogdet(jacobian[active])
+            is_regular = log_size > self.log_det[mode[active]] - 1.0
             is_last = is_whole & is_regular & (distance < 0.01) & (distance > last[active] / 2)
             converged[active] = (distance < 1e-4) | is_last
             last[active] = distance
             active = active[~converged[active]]
-        log_det = np.linalg.slogdet(np.where(np.isfinite(jacobian), jacobian, 0.0))[1]
+        finite = np.where(np.isfinite(jacobian), jacobian, 0.0)
+        _, log_det = np.linalg.slogdet(finite)
         return a, value, log_det, converged
 
     @one_thread()
@@ -684,7 +694,8 @@ def _log_mixture(
 def without_covered(proposals: Proposals) -> Proposals:
     """Leave out modes in the bulk of the proposal of a better mode of the same specimen."""
     residuals, modes = proposals.residuals, proposals.modes
-    order = np.lexsort((modes.misfit + 0.05 * (modes.a**2).sum(axis=1), modes.specimen))
+    squares = (modes.a**2).sum(axis=1)
+    order = np.lexsort((modes.misfit + 0.05 * squares, modes.specimen))
     modes = modes.rows(order)
     ordered = Proposals.at_modes(residuals, modes)
     is_kept = np.ones(len(order), dtype=bool)
@@ -692,16 +703,20 @@ def without_covered(proposals: Proposals) -> Proposals:
         for better in modes.table.T[:k]:
             pairs = column >= 0
             at, rows = better[pairs], column[pairs]
-            pairs = is_kept[at] & is_kept[rows] & (modes.scale[at] == modes.scale[rows])
+            has_same_scale = modes.scale[at] == modes.scale[rows]
+            pairs = is_kept[at] & is_kept[rows] & has_same_scale
             at, rows = at[pairs], rows[pairs]
             value, jacobian = ordered.mapped(at, modes.a[rows])
             sign, log_det = np.linalg.slogdet(jacobian)
             is_in_bulk = (value**2).sum(axis=1) < 1.0
-            is_in_bulk &= (sign == ordered.orientation[at]) & (log_det > ordered.log_det[at] - 1.0)
-            at, rows, value = at[is_in_bulk], rows[is_in_bulk], value[is_in_bulk]
-            end, _, _, converged = ordered.solved(at, value)
-            is_reached = np.abs(end - modes.a[rows]).max(axis=1, initial=0) < 1e-2
-            is_kept[rows[converged & is_reached]] = False
+            is_in_bulk &= sign == ordered.orientation[at]
+            is_in_bulk &= log_det > ordered.log_det[at] - 1.0
+            rows = rows[is_in_bulk]
+            end, _, _, converged = ordered.solved(at[is_in_bulk], value[is_in_bulk])
+            distance = np.abs(end - modes.a[rows])
+            is_reached = distance.max(axis=1, initial=0) < 1e-2
+            is_covered = converged & is_reached
+            is_kept[rows[is_covered]] = False
     return Proposals.at_modes(residuals, modes.rows(np.flatnonzero(is_kept)))
 
 

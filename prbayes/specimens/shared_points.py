@@ -55,10 +55,8 @@ class RandomRunOptions:
 
     def distinct_inputs(self, stated: int | None, n_inputs: int, repeats: int) -> int:
         """Return the number of distinct inputs of runs, without growth."""
-        return max(
-            (stated or max(self.runs, 64 * n_inputs)) // repeats,
-            32,
-        )
+        runs = stated or max(self.runs, 64 * n_inputs)
+        return max(runs // repeats, 32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +79,15 @@ class RandomRuns:
     def inside(self, region: Region) -> RandomRuns:
         """Return the runs in a region, all of them if it has fewer than eight inputs."""
         unit = region.unit(self.z[:, : len(region.center)])
-        part = self.rows((np.abs(unit) <= 1.0 + 1e-9).all(axis=1))
-        return part if len(np.unique(part.places)) >= 8 else self
+        is_inside = np.abs(unit) <= 1.0 + 1e-9
+        part = self.rows(is_inside.all(axis=1))
+        n_inputs = len(np.unique(part.places))
+        return part if n_inputs >= 8 else self
 
     def rows(self, is_used: Bools) -> RandomRuns:
         """Return a part of the runs."""
-        _, places = np.unique(
-            self.places[is_used],
-            return_inverse=True,
-        )
-        return RandomRuns(
-            self.z[is_used],
-            self.y[is_used],
-            places,
-        )
+        _, places = np.unique(self.places[is_used], return_inverse=True)
+        return RandomRuns(self.z[is_used], self.y[is_used], places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +99,8 @@ class Noise:
 
     def of(self, z: Floats) -> Floats:
         """Return the noise of coordinates, (..., d) -> (..., m)."""
-        return np.asarray(self.center + self.scale * z[..., -len(self.scale) :])
+        of_noise = z[..., -len(self.scale) :]
+        return np.asarray(self.center + self.scale * of_noise)
 
     def coordinates(self, noise: Floats) -> Floats:
         """Return the coordinates of noise, (..., m)."""
@@ -138,10 +132,7 @@ class PointMass:
         log_b = self.log_b + coordinates.log_jacobian(self.z)
         x = [v[None] for v in coordinates.inputs(self.z)]
         points = WeightedPoints.of(density, x, log_b[None])
-        return np.maximum(
-            points.log_likelihoods(parents)[:, 0],
-            0.0,
-        )
+        return np.maximum(points.log_likelihoods(parents)[:, 0], 0.0)
 
 
 type PopulationShare = ResponseShare | PointMass
@@ -169,10 +160,7 @@ class ScatterSurface:
 
     def __call__(self, z: Floats, columns: Any = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
-        return DifferencedResponse(self.values, step=1e-4)(
-            z,
-            columns,
-        )
+        return DifferencedResponse(self.values, step=1e-4)(z, columns)
 
     def variance(self, z: Floats) -> Floats:
         """Return zeros: the error of the emulator is part of the likelihood."""
@@ -193,12 +181,14 @@ class RandomResponse:
     def free(self) -> Indices:
         """Columns of the unknown inputs."""
         free = self.data.free
-        return np.asarray(free[free < self.data.known.shape[1] - len(self.noise.scale)])
+        n_inputs = self.data.known.shape[1] - len(self.noise.scale)
+        return np.asarray(free[free < n_inputs])
 
     @property
     def conditions(self) -> Indices:
         """Columns of the known inputs."""
-        return np.asarray(np.flatnonzero(~np.isnan(self.data.known[0])))
+        is_known = ~np.isnan(self.data.known[0])
+        return np.asarray(np.flatnonzero(is_known))
 
     def region(self, specimens: Floats, reach: float) -> Region:
         """Return the region of specimens (n, d), and of the conditions."""
@@ -209,8 +199,10 @@ class RandomResponse:
         root[np.ix_(self.free, self.free)] = reach * normal.root
         for column in self.conditions:
             values = self.data.known[:, column]
-            center[column] = (values.min() + values.max()) / 2
-            root[column, column] = max(np.ptp(values) / 2, 1e-9)
+            low, high = values.min(), values.max()
+            center[column] = (low + high) / 2
+            half_width = (high - low) / 2
+            root[column, column] = max(half_width, 1e-9)
         return Region(center, root)
 
     def at(self, region: Region, u: Floats, spread: float = 1.4) -> tuple[Floats, Floats]:
@@ -224,29 +216,20 @@ class RandomResponse:
         normal = ndtri(tail + (1 - 2 * tail) * u)
         unit = np.zeros((len(u), len(region.center)))
         unit[:, self.free] = normal / reach
-        log_q = (-0.5 * normal**2 - 0.5 * np.log(2 * np.pi) + np.log(reach)).sum(axis=1)
+        constant = np.log(reach) - 0.5 * np.log(2 * np.pi)
+        log_density = constant - 0.5 * normal**2
+        log_q = log_density.sum(axis=1)
         log_q -= len(self.free) * np.log(1 - 2 * tail)
         root = region.root[np.ix_(self.free, self.free)]
         return region.at(unit), log_q - np.linalg.slogdet(root)[1]
 
     def runs_in(self, region: Region, count: int, seed: int, first: int) -> RandomRuns:
         """Compute runs at ``count`` inputs of a region; ``first`` is the number of earlier runs."""
-        u = sobol(
-            count,
-            len(self.free) + len(self.conditions),
-            seed,
-        )
+        u = sobol(count, len(self.free) + len(self.conditions), seed)
         # Runs are nearly uniform, because few at the ends would leave the spread open there.
-        x, _ = self.at(
-            region,
-            u[:, : len(self.free)],
-            spread=8.0,
-        )
+        x, _ = self.at(region, u[:, : len(self.free)], spread=8.0)
         for place, column in enumerate(self.conditions, start=len(self.free)):
-            x[:, column] = np.quantile(
-                self.data.known[:, column],
-                u[:, place],
-            )
+            x[:, column] = np.quantile(self.data.known[:, column], u[:, place])
         low, high = self.data.prior.min(axis=0), self.data.prior.max(axis=0)
         width = x.shape[1]
         inside = np.clip(x, low[:width], high[:width])
@@ -254,10 +237,8 @@ class RandomResponse:
         places = np.repeat(np.arange(count), self.repeats)
         # The noise of a run is its number, so that a store keeps each of the repeated runs.
         number = first + np.arange(len(places))
-        noise = np.asarray(
-            4.0 * (2 * ((number * 0.6180339887498949) % 1.0) - 1),
-            dtype=np.float64,
-        )
+        even = (number * 0.6180339887498949) % 1.0
+        noise = np.asarray(4.0 * (2 * even - 1), dtype=np.float64)
         z = np.column_stack([x[places], self.noise.coordinates(noise[:, None])])
         y = self.run(z)
         is_finite = np.isfinite(y).all(axis=1)
@@ -274,8 +255,8 @@ class RandomResponse:
         region = self.region(self.data.inner, self.options.reach)
         runs = self.runs_in(region, count, self.data.seed, 0)
         _, first = np.unique(runs.places, return_index=True)
-        is_same = (runs.y == runs.y[first][runs.places]).all(axis=1)
-        if is_same.all():
+        of_first = runs.y[first][runs.places]
+        if (runs.y == of_first).all():
             raise DesignError(
                 f"{self.data.name}: got the same response in all repeated runs with the same "
                 "inputs, expected a random one; pass the function itself without "
@@ -297,51 +278,32 @@ class RandomResponse:
         The coordinates of the noise are those that give the readings, and A has their density.
         """
         readings, of_specimens = self.data.readings, self.data.known
-        values = np.where(
-            readings.is_measured,
-            readings.values,
-            np.nan,
-        )
+        values = np.where(readings.is_measured, readings.values, np.nan)
         n, count = len(of_specimens), len(u)
         x, log_q = self.at(region, u)
-        x = np.repeat(
-            x[None],
-            n if self.conditions.size else 1,
-            axis=0,
-        )
+        x = np.repeat(x[None], n if self.conditions.size else 1, axis=0)
         x[:, :, self.conditions] = of_specimens[: len(x), None, self.conditions]
         logs = [scatter.log_density(x, values, readings.error) for scatter in scatters]
         noise = scatters[0].noise(x, values)
-        log_noise = -0.5 * noise**2 - 0.5 * np.log(2 * np.pi) + np.log(self.noise.scale)
+        constant = np.log(self.noise.scale) - 0.5 * np.log(2 * np.pi)
+        log_noise = constant - 0.5 * noise**2
         log_proposal = log_q + np.log(count) + log_noise.sum(axis=-1)
         of_noise = self.noise.coordinates(noise)
-        z = np.concatenate(
-            [np.broadcast_to(x, (n, *x.shape[1:])), of_noise],
-            axis=2,
-        )
+        z = np.concatenate([np.broadcast_to(x, (n, *x.shape[1:])), of_noise], axis=2)
         tilts = np.empty((n, count, 0))
         if len(scatters) > 1:
-            tilts = np.clip(
-                np.stack(logs[1:], axis=2) - logs[0][..., None],
-                -100.0,
-                100.0,
-            )
-        flat = x if len(x) == n else np.repeat(x, n, axis=0)
-        outputs = (
-            scatters[0]
-            .outputs(flat.reshape(n * count, -1), noise.reshape(n * count, -1))
-            .reshape(n, count, -1)
-        )
-        single = np.ones(n, dtype=np.intp), np.zeros((n, count), dtype=np.intp)
+            of_draws = np.stack(logs[1:], axis=2)
+            change = of_draws - logs[0][..., None]
+            tilts = np.clip(change, -100.0, 100.0)
+        of_all = x if len(x) == n else np.repeat(x, n, axis=0)
+        flat = of_all.reshape(n * count, -1)
+        flat_noise = noise.reshape(n * count, -1)
+        outputs = scatters[0].outputs(flat, flat_noise)
+        outputs = outputs.reshape(n, count, -1)
+        n_roots = np.ones(n, dtype=np.intp)
+        mode = np.zeros((n, count), dtype=np.intp)
         log_a = logs[0] - log_proposal
-        return SpecimenPoints(
-            z,
-            outputs,
-            log_a,
-            log_proposal,
-            *single,
-            tilts=tilts,
-        )
+        return SpecimenPoints(z, outputs, log_a, log_proposal, n_roots, mode, tilts=tilts)
 
     def cube(self, count: int) -> Floats:
         """Return places of points in two independent halves, (count, free)."""
@@ -361,20 +323,18 @@ class RandomResponse:
 
 def half_of(points: SpecimenPoints, part: slice) -> SpecimenPoints:
     """Return half of the points, with the numbers A of all points."""
-    log_a, log_proposal = points.log_a[:, part] + np.log(2), points.log_proposal[:, part]
     z = points.z[:, part]
-    return replace(
-        points,
-        z=z,
-        log_a=log_a,
-        log_proposal=log_proposal - np.log(2),
-    )
+    log_a = points.log_a[:, part] + np.log(2)
+    log_proposal = points.log_proposal[:, part] - np.log(2)
+    return replace(points, z=z, log_a=log_a, log_proposal=log_proposal)
 
 
 def log_likelihoods_of(draws: DrawsWithMass, points: SpecimenPoints) -> Floats:
     """Return log-likelihoods of all specimens at a quarter of the draws, (S, 1)."""
-    logs = draws.log_likelihoods(points.z, points.log_a).sum(axis=1)
-    return np.asarray(logs - draws.log_share(PointMass.of(points))[::4])[:, None]
+    logs = draws.log_likelihoods(points.z, points.log_a)
+    mass = draws.log_share(PointMass.of(points))
+    result = logs.sum(axis=1) - mass[::4]
+    return np.asarray(result)[:, None]
 
 
 def agreeing_shared_points(
@@ -387,21 +347,13 @@ def agreeing_shared_points(
     limit = 2 * half_limit * per_hyperparameter(draws)
     count = options.points
     while True:
-        points = response.points(
-            scatters[:1],
-            region,
-            response.cube(count),
-        )
+        points = response.points(scatters[:1], region, response.cube(count))
         parts = slice(count // 2), slice(count // 2, None)
         halves = [log_likelihoods_of(draws, half_of(points, part)) for part in parts]
         first, second = halves
         difference = half_difference(first, second)
         if difference[1] <= limit:
-            points = response.points(
-                scatters,
-                region,
-                response.cube(count),
-            )
+            points = response.points(scatters, region, response.cube(count))
             return replace(points, difference=difference[1])
         if 2 * count > options.most_points:
             raise DesignError(
@@ -510,23 +462,13 @@ def coarse_draws(response: RandomResponse, runs: RandomRuns, region: Region) -> 
     """Return posterior draws from the emulator of the first runs."""
     scatters = response.emulators(region, runs, 0)
     return posterior_of(
-        response,
-        response.points(
-            scatters,
-            region,
-            response.cube(response.options.points),
-        ),
+        response, response.points(scatters, region, response.cube(response.options.points))
     )
 
 
 def posterior_of(response: RandomResponse, points: SpecimenPoints) -> DrawsWithMass:
     """Return posterior draws of the hyperparameters given shared points."""
-    draws = response.data.posterior(
-        points.z,
-        points.log_a,
-        None,
-        PointMass.of(points),
-    )
+    draws = response.data.posterior(points.z, points.log_a, None, PointMass.of(points))
     return cast(DrawsWithMass, draws)
 
 
@@ -540,10 +482,7 @@ def draw_shares(draws: DrawsWithMass, points: SpecimenPoints) -> tuple[Floats, f
     first = draws.log_likelihoods(points.z, points.log_a).sum(axis=1)
     logs = np.stack(
         [
-            draws.log_likelihoods(
-                points.z,
-                points.log_a + tilt,
-            ).sum(axis=1)
+            draws.log_likelihoods(points.z, points.log_a + tilt).sum(axis=1)
             for tilt in np.moveaxis(points.tilts, 2, 0)
         ],
         axis=1,
@@ -551,7 +490,8 @@ def draw_shares(draws: DrawsWithMass, points: SpecimenPoints) -> tuple[Floats, f
     shares = np.exp(logs - logsumexp(logs, axis=1, keepdims=True))
     ratio = logs - first[:, None]
     of_draws = np.exp(ratio - logsumexp(ratio, axis=0))
-    thetas = draws.thetas[:: len(draws.thetas) // len(first)][: len(first)]
+    step = len(draws.thetas) // len(first)
+    thetas = draws.thetas[::step][: len(first)]
     means = of_draws.T @ thetas
     sd = np.maximum(thetas.std(axis=0), 1e-300)
     return shares, float((means.std(axis=0) / sd).max())
@@ -567,15 +507,15 @@ def scatter_findings(response: RandomResponse, scatter: Scatter, runs: RandomRun
     sums = np.zeros((len(counts), residuals.shape[1]))
     np.add.at(sums, runs.places, residuals)
     means = sums / counts[:, None]
-    within = ((residuals - means[runs.places]) ** 2).sum(axis=0)
+    deviations = residuals - means[runs.places]
+    within = (deviations**2).sum(axis=0)
     between = (counts[:, None] * means**2).sum(axis=0)
     df = len(counts) - len(scatter.mean_terms), len(residuals) - len(counts)
     findings = []
     for j, label in enumerate(data.output_names):
-        p_fit = fdtrc(
-            *df,
-            (between[j] / df[0]) / (within[j] / df[1]),
-        )
+        explained = between[j] / df[0]
+        unexplained = within[j] / df[1]
+        p_fit = fdtrc(*df, explained / unexplained)
         if p_fit < level / len(data.output_names):
             text = (
                 f"{data.name}: the mean of {label} given the inputs has more detail than the "
@@ -605,7 +545,10 @@ def _p_of_halves(x: Floats, residuals: Floats) -> float:
     is_low = x <= np.median(x)
     if is_low.all():
         return 1.0
-    return float(ks_2samp(residuals[is_low], residuals[~is_low]).pvalue)
+    below = residuals[is_low]
+    above = residuals[~is_low]
+    test = ks_2samp(below, above)
+    return float(test.pvalue)
 
 
 def _unreached(response: RandomResponse, points: SpecimenPoints) -> list[Finding]:
@@ -616,17 +559,15 @@ def _unreached(response: RandomResponse, points: SpecimenPoints) -> list[Finding
     is_far = noise >= 3.99
     if not is_far.any():
         return []
-    data, row = response.data, int(np.argmax(is_far))
+    data = response.data
+    row = int(np.argmax(is_far))
+    count = int(is_far.sum())
     label = row if data.labels is None else data.labels[row]
     text = (
-        f"{data.name}: got {int(is_far.sum())} specimens, such as {label}, whose readings no input "
+        f"{data.name}: got {count} specimens, such as {label}, whose readings no input "
         "explains by less than four standard deviations of the scatter, expected none; look at "
         "these readings, their units and the priors."
     )
     return [
-        Finding(
-            "readings-misfit",
-            text,
-            "likelihood_findings.md#readings-that-no-inputs-reproduce",
-        )
+        Finding("readings-misfit", text, "likelihood_findings.md#readings-that-no-inputs-reproduce")
     ]

@@ -9,6 +9,7 @@ from decisions import OBSERVED, doubled, jeffreys, normal, same
 from scipy.special import ndtr
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes.decision.p_box import _distribution_functions
 from prbayes.decision.populations import Populations
 
@@ -90,3 +91,31 @@ def test_other_units_and_equal_and_failed_values() -> None:
     # Specimens that failed are above all others.
     last = box(lambda x: np.where(x > 1.0, np.inf, x))["mean"].values[-1]
     assert last == pytest.approx(ndtr((1.0 - MU) / SIGMA).mean(), abs=0.02)
+
+
+def test_specimens_without_response_may_have_any_value() -> None:
+    at = float((MU + 1.8 * SIGMA).mean())
+    found = box(lambda x: np.where(x > at, np.nan, x))
+    whole = box(lambda x: np.minimum(x, at))
+    (finding,) = from_json(found.attrs["findings"])
+    assert finding.code == "specimens-left-out"
+    y = float(found.y[np.abs(found["mean"].values - 0.9).argmin()])
+    k = {"y": y, "method": "nearest"}
+    for band in ("pointwise", "simultaneous"):
+        lower, upper = (float(found[name].sel(band=band).sel(**k)) for name in ("lower", "upper"))
+        complete = float(whole["mean"].interp(y=y))  # all left-out specimens are above y
+        assert lower < complete < upper
+        # Without them the distribution function would be too high by their share.
+        assert lower < float(found["mean"].sel(**k)) * (1 - 0.03)
+
+
+def test_other_decisions_report_specimens_without_response() -> None:
+    at = float((MU + 1.8 * SIGMA).mean())
+    model, x = normal()
+
+    def response(x: Any) -> Any:
+        return np.where(x > at, np.nan, x)
+
+    table = prb.sensitivity(POSTERIOR, prb.decision.Mean(response, x), model=model)
+    codes = [finding.code for finding in from_json(table.attrs["findings"])]
+    assert "specimens-left-out" in codes

@@ -79,6 +79,7 @@ def test_predictions_have_the_scatter(calibrated: Any) -> None:
         predicted = prb.predict(result, response, x, stored=stored, n_draws=100, **arguments)
         sd = np.hypot(2 * float(result["posterior"]["s"].mean()), 0.5)
         assert float(predicted.std()) == pytest.approx(sd, rel=0.15)
+    assert set(prb.population(result, model=model).name.values) == {"x"}
     individuals = prb.individuals(result, model=model)
     assert "noise" in str(individuals)
     with pytest.raises(TypeError, match="random response of a simulator of the model"):
