@@ -10,7 +10,7 @@ those of the first ones have none; their observed variables are parameters of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import batched
 from typing import Any
 
@@ -25,7 +25,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Floats, Indices, called
+from prbayes._validate import Bools, Floats, Indices, called
 from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -462,34 +462,50 @@ def draw_readings(
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
         specimens = first[inverse]
 
-    def draw_outputs() -> Floats:
-        inputs = population_inputs(likelihood, values, like, rng)
-        return response_at(likelihood, [x[:, specimens] for x in inputs])
-
-    outputs = draw_outputs()
-    # Specimens without a response are drawn again, because they would not be measured.
-    for _ in range(32):
-        is_missing = np.isnan(outputs).any(axis=-1)
-        if not is_missing.any():
-            break
-        outputs[is_missing] = draw_outputs()[is_missing]
     columns, measurements, like_read = slice(None), likelihood.measurements, likelihood.readings
     if measurement is not None:
         columns, measurements = output_columns(likelihood, measurement), (measurement,)
         like_read = unit_readings(measurement)
 
-    def read(outputs: Floats) -> Floats:
-        return read_outputs(rng, outputs[..., columns], like_read, measurements, values)
+    def draw_outputs(part: Mapping[str, Floats]) -> Floats:
+        inputs = population_inputs(likelihood, part, like, rng)
+        return response_at(likelihood, [x[:, specimens] for x in inputs])
 
-    readings = read(outputs)
+    def draw(part: Mapping[str, Floats]) -> Floats:
+        # Specimens without a response are drawn again, because they would not be measured.
+        outputs = _drawn_again(draw_outputs, part, lambda y: np.isnan(y).any(axis=-1), 32)
+        return read_outputs(rng, outputs[..., columns], like_read, measurements, part)
+
     selection = selection_of(measurements)
-    # Specimens beyond the limits of a selection are drawn again, too.
-    for _ in range(256):
-        is_unseen = np.array(False) if selection is None else ~selection.is_seen(readings)
-        if not is_unseen.any():
-            break
-        readings[is_unseen] = read(draw_outputs())[is_unseen]
+    if selection is None:
+        readings = draw(values)
+    else:
+        # Specimens beyond the limits of a selection are drawn again, too.
+        readings = _drawn_again(draw, values, lambda y: ~selection.is_seen(y), 256)
     return readings if measurement is None else readings.reshape(-1, n, *measurement.event)
+
+
+def _drawn_again(
+    draw: Callable[[Mapping[str, Floats]], Floats],
+    values: Mapping[str, Floats],
+    is_refused: Callable[[Floats], Bools],
+    tries: int,
+) -> Floats:
+    """Draw specimens (P, n, m), and again those that are refused, (P, n), at most ``tries`` times.
+
+    Only populations with such a specimen are drawn again. A specimen refused each time is NaN.
+    """
+    drawn = draw(values)
+    for _ in range(tries):
+        refused = is_refused(drawn)
+        populations = np.flatnonzero(refused.any(axis=1))
+        if not populations.size:
+            return drawn
+        part = {name: x[populations] for name, x in values.items()}
+        is_again = refused[populations][..., None]
+        drawn[populations] = np.where(is_again, draw(part), drawn[populations])
+    drawn[is_refused(drawn)] = np.nan
+    return drawn
 
 
 def population_inputs(

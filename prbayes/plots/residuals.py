@@ -59,7 +59,8 @@ def plot_residuals(
     -------
     matplotlib.figure.Figure
         With the panels ``{name}``, ``{name}, CWRES against PRED`` and, for outputs with labels that
-        are numbers, such as ``time``, ``{name}, CWRES against time``.
+        are numbers, such as ``time``, ``{name}, CWRES against time``. Selected specimens have the
+        first alone.
 
     Raises
     ------
@@ -89,6 +90,8 @@ def plot_residuals(
     plan: dict[str, tuple[str, str | None]] = {}
     for name, data in datasets.items():
         plan[name] = name, None
+        if not np.isfinite(data["CWRES"]).any():
+            continue
         plan[f"{name}, CWRES against PRED"] = name, "PRED"
         dim = str(data["DV"].dims[-1])
         if dim != "specimen" and data[dim].dtype.kind in "iuf":

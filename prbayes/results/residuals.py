@@ -72,7 +72,8 @@ def residuals(
         ``DV`` (readings), ``PRED`` (response at the mean inputs of the population), ``IPRED`` (at
         the mean inputs of the specimen), ``IWRES`` (residual of ``IPRED`` in standard deviations of
         the reading error; NaN for exact readings), ``CWRES``, and ``eta`` with dimensions
-        (specimen, input). NaN where nothing was measured, or a reading is censored.
+        (specimen, input). NaN where nothing was measured, or a reading is censored; ``CWRES`` of
+        selected specimens are NaN.
 
     Raises
     ------
@@ -110,6 +111,9 @@ def residuals(
         ]
         conditional = _conditional_residuals(linear, parts)
         for m, part, values in zip(likelihood.measurements, parts, conditional, strict=True):
+            # The residuals of selected specimens are not normal with mean zero.
+            is_whole_population = m.metric.selected is None
+            values = values if is_whole_population else np.full_like(values, np.nan)
             datasets[m.name] = _labelled_residuals(m, part, values, linear)
     return ResidualTable.from_dict(datasets)
 
@@ -142,14 +146,16 @@ class ResidualTable(Tree):
     def to_view(self) -> View:
         """Return what a reader sees."""
         rows = []
+        sentences = ["A right model has CWRES with mean 0 and sd 1."]
         for name, tree in self.children.items():
+            if np.isfinite(tree["DV"]).any() and not np.isfinite(tree["CWRES"]).any():
+                sentences.append(f"{name} has no CWRES, as its specimens are selected.")
             for key in ("IWRES", "CWRES"):
                 x = np.asarray(tree[key])
                 x = x[np.isfinite(x)]
                 numbers = (x.mean(), x.std(), np.abs(x).max()) if x.size else (np.nan,) * 3
                 rows.append([f"{key} of {name}", f"{x.size}", *(f"{n:.3g}" for n in numbers)])
         header = ["", "readings", "mean", "sd", "largest"]
-        sentences = ["A right model has CWRES with mean 0 and sd 1."]
         return View("Residuals of the measured specimens", header, rows, sentences)
 
 

@@ -13,6 +13,7 @@ import prbayes as prb
 from benchmarks import selection as study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import selection_of
+from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.response.compile import PLAIN
 from prbayes.specimens.selection import Selection
 
@@ -60,6 +61,28 @@ def test_log_likelihoods_of_a_selection_are_exact(share: float, error: float) ->
     assert float(logp(at)) == pytest.approx(evaluator(theta[40:41]).log_other[0], rel=1e-9)
     drawn = pm.draw(pm.do(model, {"mu": 0.7, "sigma": 0.6})["y"], 50, random_seed=0, mode=PLAIN)
     assert drawn.min() >= limit
+    # Of the second population nothing is seen, unless by an error of its reading.
+    populations = {"mu": np.array([0.7, -30.0]), "sigma": np.array([0.6, 0.1])}
+    (likelihood,) = evaluator.likelihoods
+    drawn = draw_readings(likelihood, np.random.default_rng(0), populations, 5)
+    assert drawn[0].min() >= limit
+    is_seen = ~np.isnan(drawn[1])
+    assert (drawn[1][is_seen] >= limit).all()
+    assert error or not is_seen.any()
+
+
+def test_selected_specimens_have_no_conditional_residuals() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
+        metric = prb.LogLikelihood(selected=(1.0, None))
+        y = np.array([1.2, 1.5, 1.9, 2.6, 1.1, 3.4])
+        prb.Simulator("y", np.exp, x, observed=y, metric=metric)
+    residuals = prb.residuals(prb.minimize(model, progressbar=False))
+    assert np.isnan(residuals["y"]["CWRES"]).all()
+    assert residuals["y"]["eta"].notnull().all()
+    assert "y has no CWRES, as its specimens are selected." in str(residuals)
+    figure = prb.plots.plot_residuals(residuals)
+    assert [axis.get_label() for axis in figure.axes] == ["y"]
 
 
 def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
