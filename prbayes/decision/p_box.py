@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,15 @@ def p_box(
     lost = max(sample.lost for sample in samples)
     answer = "the mean is that of the others, and the bands contain them at either end"
     findings = findings_of(response) + left_out_findings(name, lost, answer)
+
+    def tails(sample: ResponseSample) -> str:
+        populations = sample.populations
+        functions = [_mean_function(replace(x, populations=populations), y) for x in samples]
+        low = min(_place(function, y, 0.01) for function in functions)
+        high = max(_place(function, y, 0.99) for function in functions)
+        return f"{low:.4g} and {high:.4g}"
+
+    findings += samples[0].compared("the 1% and 99% quantiles are", tails)
     data: dict[str, Any] = {
         "lower": (["band", "y"], lowest),
         "upper": (["band", "y"], highest),
@@ -227,6 +237,12 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     # Specimens without response may be above all values, or below them.
     lower, upper = lower * (1 - sample.lost), upper * (1 - sample.lost) + sample.lost
     return lower, upper, mean, error
+
+
+def _mean_function(sample: ResponseSample, y: Floats) -> Floats:
+    """Return the distribution function of a new specimen at y, (m,)."""
+    functions = _distribution_functions(sample, y)
+    return np.asarray(functions.mean(axis=0))
 
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:

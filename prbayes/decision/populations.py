@@ -324,6 +324,15 @@ class ResponseSample:
         """
         return np.concatenate([functional(self.values, w) for w in self.weight_batches(thetas)])
 
+    def compared(self, question: str, answer: Callable[[ResponseSample], str]) -> Findings:
+        """Report the answers to a question under the families that the data do not separate."""
+        nested, findings = NestedPopulations.of(self.populations)
+        if nested is None:
+            return findings
+        simpler = replace(self, populations=nested.populations)
+        answers = f"{answer(self)}, or {answer(simpler)} under the {nested.name} family"
+        return report(nested.finding(f"{question} {answers}"))
+
     @cached_property
     def lost(self) -> float:
         """The share of a population that has no response, the median over populations."""
@@ -628,6 +637,21 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
     return np.asarray(optimum.theta + z @ root.T)
 
 
+def quantity_by_family(
+    sample: ResponseSample, quantity: Quantity, prob: float = INTERVAL
+) -> Findings:
+    """Report a quantity under the families that the data do not separate."""
+
+    def answer(sample: ResponseSample) -> str:
+        by_draw = sample.evaluate(quantity.of, sample.populations.thetas)
+        by_draw = by_draw[~np.isnan(by_draw)]
+        lower, upper = quantiles_of(by_draw, tail_levels(prob))
+        interval = f"{percentage(prob)} interval {lower:.4g} to {upper:.4g}"
+        return f"{by_draw.mean():.4g} ({interval})"
+
+    return sample.compared("the quantity is", answer)
+
+
 def output_column(responses: Responses, values: Floats, output: Any) -> int | None:
     """Return the column of an output, or None for a response with one number; or raise."""
     if values.ndim == 1:
@@ -724,6 +748,7 @@ def evaluate(
     populations = Populations.of(result, model, n_draws, caller, calling)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
     findings, error = checked_quantity(sample, quantity)
+    findings += quantity_by_family(sample, quantity, prob)
     by_draw = sample.evaluate(quantity.of, populations.thetas)
     (center,) = sample.evaluate(quantity.of, populations.center[None])
     lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], tail_levels(prob))

@@ -25,6 +25,7 @@ from prbayes.decision.populations import (
     Populations,
     ResponseSample,
     checked_quantity,
+    quantity_by_family,
     standard_deviation,
 )
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -165,6 +166,7 @@ def sensitivity(
     )
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
     findings, error = checked_quantity(sample, quantity)
+    findings += quantity_by_family(sample, quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_points, seed)
     inputs, obstacle = input_indices(sample, quantity, n_points, seed, computed=computed)
     findings += report(*_constant_findings(hyperparameters, quantity))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import Any
 
@@ -265,6 +266,32 @@ def test_the_probability_has_both_families() -> None:
         assert text.count("requirement met") == 2
         assert f"it is {float(table.probability):.2g} (89% interval" in text
         assert table.attrs["responses"] == 2 * settings.get("n_points", 0)
+
+
+@pytest.mark.long
+def test_quantities_have_both_families() -> None:
+    model, x, result = problem()
+    quantile = prb.decision.Quantile(np.positive, x, probability=0.99)
+    candidates = {"more": prb.decision.Condition(fold, x)}
+    tables = [
+        prb.decision.p_box(result, np.positive, x, model=model),
+        prb.decision.evaluate(result, quantile, model=model),
+        prb.sensitivity(result, quantile, model=model, n_points=64),
+        prb.plan(result, candidates, model=model, quantity=quantile, k=5),
+    ]
+    draws = normal_posterior()["posterior"]
+    mu, s = (draws[name].values.ravel() for name in ("mu", "s"))
+    scatter = np.random.default_rng(0).normal(size=(200, mu.size))
+    of_new_specimens = float(np.quantile(mu + s * scatter, 0.99))
+    mean_quantile = float((mu + ndtri(0.99) * s).mean())
+    expected = [of_new_specimens, *[mean_quantile] * 3]
+    for table, value in zip(tables, expected, strict=True):
+        (finding,) = (f for f in from_json(table.attrs["findings"]) if f.code == "two-families")
+        _, _, simpler = finding.text.partition(", or ")
+        assert simpler.endswith("under the normal family.")
+        number = re.findall(r"-?\d+\.\d+", simpler.partition("(")[0])[-1]
+        assert float(number) == pytest.approx(value, rel=0.03)
+    assert f"the quantity is {float(tables[1].estimate):.4g} (89% interval" in str(tables[1])
 
 
 @pytest.mark.long
