@@ -17,7 +17,7 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from prbayes._validate import AT_ONCE, Floats, Indices, Shape
+from prbayes._validate import AT_ONCE, ArrayFunction, Floats, Indices, Shape
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -37,7 +37,6 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
 from prbayes.specimens.coordinates import Coordinates
-from prbayes.specimens.emulation import Surface
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class EmulatedResponse:
     coordinates: Coordinates
     z: Floats  # (n, d): coordinates of the runs
     y: Floats  # (n, m): outputs of the runs; +inf is a failed specimen, NaN no response
-    surface: Surface  # surface through the finite runs
+    outputs: ArrayFunction  # all outputs at coordinates (k, d) between the finite runs
     columns: slice  # columns of the surface that belong to the response
     event: Shape  # shape of a specimen's outputs, () or (m,)
     error: Floats  # (m,): root mean square cross-validation error near the specimens
@@ -102,6 +101,23 @@ class EmulatedResponse:
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
 
+    def share_beyond(self, inputs: Sequence[Floats], values: Floats) -> float:
+        """Return the share of specimens, with responses (n, *event), beyond the runs' range.
+
+        It counts those that twice the end slope would move by a tenth of the standard deviation.
+        """
+        z = self.coordinates.of(inputs, 1)
+        rows = np.flatnonzero((np.abs(z - self._in_range(z)) > 1e-9).any(axis=1))
+        if not self.is_continued or not rows.size:
+            return 0.0
+        columns = values.reshape(len(z), -1)
+        finite = columns[np.isfinite(columns).all(axis=1)]
+        steeper = self.steepened([x[rows] for x in inputs]).reshape(len(rows), -1)
+        with np.errstate(invalid="ignore"):  # Infinite outputs, of failed specimens, stay.
+            change = np.abs(steeper - columns[rows])
+        is_moved = change > 0.1 * finite.std(axis=0)
+        return float(is_moved.any(axis=1).sum() / len(z))
+
     @cached_property
     def _width(self) -> Floats:
         """The runs' range in each coordinate, (d,)."""
@@ -113,7 +129,7 @@ class EmulatedResponse:
 
     def _at(self, z: Floats) -> Floats:
         """Return the outputs at coordinates within the runs' range, (n, m)."""
-        values = self.surface.values(z)[:, self.columns]
+        values = self.outputs(z)[:, self.columns]
         return with_failures(values, z / self._width, self.z / self._width, self.y)
 
 
@@ -185,7 +201,7 @@ class EmulatedSimulator:
             self.likelihood.coordinates,
             emulation.z,
             emulation.y[:, columns],
-            emulation.surface,
+            emulation.extended,
             columns,
             self.measurement.event,
             emulation.error[columns],
@@ -258,7 +274,8 @@ def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedR
     near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
     surface = fit_emulator(z[rows], y[rows], near)
     error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
-    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
+    event = values.shape[1:]
+    return EmulatedResponse(coordinates, z, y, surface.values, slice(None), event, error)
 
 
 type PopulationSimulator = Node | EmulatedSimulator

@@ -540,7 +540,7 @@ def response_at(likelihood: SpecimenLikelihood, inputs: Sequence[Floats]) -> Flo
     emulation = prepared(likelihood).emulation
     flat = [x.reshape(-1, *x.shape[2:]) for x in inputs]
     z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
-    return np.asarray(emulation.values(z)).reshape(*inputs[0].shape[:2], -1)
+    return np.asarray(emulation.predicted(z)).reshape(*inputs[0].shape[:2], -1)
 
 
 def read_outputs(

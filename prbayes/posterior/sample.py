@@ -190,7 +190,7 @@ def draw_posterior(
         if chains is None:
             text = "The posterior is drawn by sequential Monte Carlo, from the prior."
             announce(text, visible=settings.progressbar)
-            return smc.sample(evaluator, settings)
+            return smc.sample(evaluator, settings, is_audited=is_audited)
         if modes is not None:
             findings += report(*mode_findings(target, modes, chains.thetas))
             chains = replace(chains, findings=findings)

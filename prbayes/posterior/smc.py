@@ -45,6 +45,7 @@ from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
+from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
@@ -251,7 +252,7 @@ def sample_smc(
         nullcontext() if cores is None else threadpool_limits(cores),
     ):
         evaluator = evaluator_of(model, optimum, "sample_smc")
-        tree = sample(evaluator, settings)
+        tree = sample(evaluator, settings, is_audited=True)
         if not return_inferencedata:
             return as_multitrace(tree, evaluator)  # type: ignore[no-any-return]
         return selected(tree, names, keywords)
@@ -312,8 +313,13 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
     return evaluator
 
 
-def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
-    """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
+def sample(
+    evaluator: Evaluator, settings: SamplingSettings, *, is_audited: bool = False
+) -> xr.DataTree:
+    """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``.
+
+    An audit of emulators needs the data of the evaluator's model, as in `prbayes.sample`.
+    """
     kind = settings.kind(evaluator)
     if settings.epsilon is not None and kind is not Likelihood.PSEUDO:
         raise ValueError(
@@ -322,7 +328,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
         )
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    earlier = epsilons(evaluator)
+    nodes, earlier = evaluator.nodes, epsilons(evaluator)
     try:
         with designs_as_before(evaluator) as restore_designs:
             if kind is Likelihood.PSEUDO:
@@ -330,13 +336,14 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
                 chains = _with_errors(evaluator, _chains_on_designs(evaluator, settings, optimum))
             else:
                 optimum = required_optimum(evaluator, settings, "sample_smc")
-                chains = _chains_on_designs(evaluator, settings, optimum)
+                is_audited &= kind is Likelihood.SPECIMENS
+                evaluator, chains = _audited_chains(evaluator, settings, optimum, is_audited)
             tree = result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
             if chains.stopped:
                 restore_designs()
             return tree
     finally:
-        for node, value in zip(evaluator.nodes, earlier, strict=True):
+        for node, value in zip(nodes, earlier, strict=True):
             node.epsilon.set_value(np.asarray(value))
 
 
@@ -515,6 +522,26 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
 
 
 # -- chains ----------------------------------------------------------------------------------------
+
+
+def _audited_chains(
+    evaluator: Evaluator, settings: SamplingSettings, optimum: Optimum | None, is_audited: bool
+) -> tuple[Evaluator, Chains]:
+    """Return chains, and the evaluator whose emulators are right at the inputs of their draws."""
+    # Stages of a checkpoint are those of one emulator.
+    rounds = MAX_ROUNDS if settings.checkpoint is None else 0
+    for round_ in range(rounds + 1):
+        chains = _chains_on_designs(evaluator, settings, optimum)
+        if not is_audited or chains.stopped:
+            break
+        thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
+        latest, findings = audited_evaluator(
+            evaluator, thetas, "the draws", is_last=round_ == rounds
+        )
+        if latest is evaluator:
+            return evaluator, replace(chains, findings=(*chains.findings, *findings))
+        evaluator = latest
+    return evaluator, chains
 
 
 def _chains_on_designs(

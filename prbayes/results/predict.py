@@ -232,6 +232,7 @@ def predict(
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
+    of_populations = (*_beyond_runs(label, drawn.beyond), *width_of_epsilon(result, model))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -241,7 +242,7 @@ def predict(
         "nan": missing,
         "specimens_id": _array_digest(*drawn.specimens),
         "random_seed": str(seed),
-        "findings": as_json((*findings_of(response), *report(*width_of_epsilon(result, model)))),
+        "findings": as_json((*findings_of(response), *report(*of_populations))),
         **_calibration_attributes(result, model),
         **provenance(result, model),
     }
@@ -480,6 +481,18 @@ def width_of_epsilon(result: Any, model: pm.Model | None) -> Findings:
     return (Finding("width-of-epsilon", text, "choose.md#epsilon-and-the-width-of-the-posterior"),)
 
 
+def _beyond_runs(label: str, share: float) -> Findings:
+    """Report more than 1 % of specimens whose response beyond the runs is not known."""
+    if share <= 0.01:
+        return ()
+    text = (
+        f"{label}: {share:.1%} of the specimens are beyond the range of the runs, where the "
+        "response is taken as constant, so that far quantiles are too moderate; pass "
+        "stored=False, which calls the response there."
+    )
+    return (Finding("beyond-runs", text, "decision.md#the-population-in-units"),)
+
+
 # -- responses -------------------------------------------------------------------------------------
 
 
@@ -493,6 +506,7 @@ class _Predicted:
     specimens: list[Floats]  # aleatory inputs, (k, n, *event) each
     source: str  # text on how the specimens were made
     error: Floats | None = None  # error of the emulator by output, (m,)
+    beyond: float = 0.0  # share of the specimens whose response beyond the runs is unknown
 
 
 def _predicted(
@@ -525,18 +539,22 @@ def _predicted(
             results.append(_Predicted(values, specimens, "new specimens"))
             continue
         emulated = emulated or emulator_of(simulator, responses)
-        values = emulated([x.reshape(-1, *x.shape[2:]) for x in specimens])
+        flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
+        values = emulated(flat)
+        beyond = emulated.share_beyond(flat, values)
         values = values.reshape(len(parents[0]), n, *emulated.event)
         runs = len(emulated.z)
         source = f"an interpolant through {runs} runs at those of {simulator.name}"
         if responses.same_as(simulator.responses):
             source = f"the emulator of {simulator.name} ({runs} runs)"
-        results.append(_Predicted(values, specimens, f"new specimens, by {source}", emulated.error))
+        source = f"new specimens, by {source}"
+        results.append(_Predicted(values, specimens, source, emulated.error, beyond))
     if len(results) == 1:
         return results[0]
     specimens = [x for result in results for x in result.specimens]
     values = np.stack([result.values for result in results], axis=1)
-    return replace(results[0], values=values, specimens=specimens)
+    beyond = max(result.beyond for result in results)
+    return replace(results[0], values=values, specimens=specimens, beyond=beyond)
 
 
 def with_known_conditions(

@@ -44,6 +44,12 @@ class CompressedSurface:
     surface: Emulator
     center: Floats  # (m,): mean of the readings of each output
     unit: Floats  # (m,): scale of each output, within which the surface is nearly linear in it
+    ends: Floats  # (2, d): ends of the runs near the data
+
+    def is_far(self, z: Floats) -> Bools:
+        """Return which coordinates, (k, d), are beyond the runs near the data."""
+        is_below, is_above = z < self.ends[0], z > self.ends[1]
+        return np.asarray((is_below | is_above).any(axis=1))
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), from values of the compressed surface."""
@@ -139,6 +145,51 @@ class Emulation:
         values[self.fails(z)] = np.nan
         return values
 
+    def predicted(self, z: Floats) -> Floats:
+        """Return outputs of any specimens, (k, m), NaN where the nearest run has no response."""
+        blocks = np.array_split(z, 1 + len(z) // IN_CACHE)
+        values = np.concatenate([self.extended(block) for block in blocks])
+        values[self.fails(z)] = np.nan
+        return values
+
+    def extended(self, z: Floats) -> Floats:
+        """Return outputs, (k, m), of the surface or of one through all runs.
+
+        The surface leaves out runs far from the specimens, and may be arbitrary there. Beyond the
+        runs near the data the smaller predictive variance decides, relative to the distance from
+        the data.
+        """
+        values, inner, outer = self.surface.values(z), self.surface, self._through_all_runs
+        if outer is None or not isinstance(inner, CompressedSurface):
+            return values
+        is_far = inner.is_far(z)
+        if not is_far.any():
+            return values
+        by_surface, relative = [], []
+        for surface in (inner, outer):
+            outputs = surface.values(z[is_far])
+            squares = (outputs - outer.center) ** 2 + outer.unit**2
+            by_surface.append(outputs)
+            relative.append(surface.variance(z[is_far]) / squares)
+        is_better = relative[1] < relative[0]
+        values[is_far] = np.where(is_better, by_surface[1], by_surface[0])
+        return values
+
+    @cached_property
+    def _through_all_runs(self) -> CompressedSurface | None:
+        """A surface that leaves out no run; None if the surface leaves out none."""
+        inner, is_finite = self.surface, np.isfinite(self.y).all(axis=1)
+        if not isinstance(inner, CompressedSurface):
+            return None
+        z, y = self.z[is_finite], self.y[is_finite]
+        _, first = np.unique(np.round(z, 9), axis=0, return_index=True)
+        if len(first) == len(inner.surface.z):
+            return None
+        near = y[~inner.is_far(z)]
+        spread = np.maximum(near.std(axis=0), 1e-12 * np.abs(y).max(axis=0))
+        compressed = np.arcsinh((y[first] - inner.center) / np.maximum(spread, 1e-300))
+        return replace(inner, surface=fit_emulator(z[first], compressed), unit=spread)
+
     def fails(self, z: Floats) -> Bools:
         """Return where the nearest run has no finite response."""
         return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
@@ -199,7 +250,9 @@ def fit_surface(
     unit = np.where(largest <= 100 * spread, 1e6 * np.maximum(largest, spread), 10 * spread)
     compressed = np.arcsinh((yg - center) / unit)
     start = previous.surface if isinstance(previous, CompressedSurface) else None
-    surface = CompressedSurface(fit_emulator(zg, compressed, inside, start=start), center, unit)
+    emulator = fit_emulator(zg, compressed, inside, start=start)
+    ends = np.stack([zg[inside].min(axis=0), zg[inside].max(axis=0)])
+    surface = CompressedSurface(emulator, center, unit, ends)
     errors = yg - surface.expanded(compressed - surface.surface.left_out)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = errors[copies.ravel()], inside[copies.ravel()]

@@ -197,7 +197,7 @@ def _sorted(
         return ResponseShare(z, log_b, count)
     # Beyond the runs' range the response is that at the end of the range.
     inside = np.clip(z[:count], emulation.box[0], emulation.box[1])
-    log_seen = selection.log_probability(emulation.surface.values(inside), emulation.error)
+    log_seen = selection.log_probability(emulation.extended(inside), emulation.error)
     with np.errstate(divide="ignore"):
         log_unseen = np.log(-np.expm1(log_seen))
     is_seen, is_unseen = log_seen > -100, log_unseen > -100

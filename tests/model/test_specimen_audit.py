@@ -1,6 +1,7 @@
 """Audit of emulators at likely inputs of posterior draws: poles, periods, and smooth responses."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,17 @@ def test_a_budget_that_ends_in_the_audit_keeps_the_optimum() -> None:
     again = prb.minimize(model)
     assert "budget-spent" not in {f.code for f in again.findings}
     assert again.point["mu"] == pytest.approx(PROBLEMS["pole"][3].mean(), rel=1e-3)
+
+
+def test_sequential_monte_carlo_is_audited(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"draws": 400, "random_seed": 1, "progressbar": False}
+    result = prb.sample_smc(model=build(*PROBLEMS["pole"]), chains=1, **settings)
+    expected, sd = exact(*PROBLEMS["pole"][1:])
+    # Four standard errors of 400 draws, which are correlated.
+    np.testing.assert_allclose(result.posterior["mu"].mean(), expected[0], atol=0.3 * sd[0])
+    model = build(*PROBLEMS["pole"])
+    with pytest.raises(DesignError, match="not smooth enough"):
+        prb.sample_smc(model=model, chains=1, checkpoint=tmp_path / "stages.npz", **settings)
 
 
 def test_a_budget_of_the_first_runs_gives_no_answer() -> None:

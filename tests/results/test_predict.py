@@ -13,6 +13,7 @@ from first_use import first_use
 from scipy.special import ndtri
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import DesignError
 from prbayes.response import variables
@@ -397,3 +398,23 @@ def test_a_prediction_with_failures_shows_moments_of_the_others() -> None:
     assert "each of 1 population," in shown
     assert "of the specimens fail (+inf)" in shown
     assert "inf  nan" not in shown
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wide_populations_have_the_response_of_runs_far_from_the_data(seed: int) -> None:
+    observed = np.square(np.random.default_rng(seed).normal(10, 1, 3))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 30))
+        prb.Simulator("y", np.square, x, observed=observed)
+    for sigma, codes in ((15.0, []), (60.0, ["beyond-runs"])):
+        result = tree(mu=np.full((1, 4), 10.0), sigma=np.full((1, 4), sigma))
+        predicted, computed = (
+            prb.predict(result, np.square, x, model=model, random_seed=1, stored=stored)
+            for stored in (True, False)
+        )
+        assert [f.code for f in from_json(predicted.attrs["findings"])] == codes
+        inside = computed.values < 50**2
+        # The runs between the data and those far from them are few.
+        np.testing.assert_allclose(
+            predicted.values[inside], computed.values[inside], rtol=0.1, atol=1.0
+        )
