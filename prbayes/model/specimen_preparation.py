@@ -315,7 +315,8 @@ class CheckedRuns:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         measurements = likelihood.measurements
-        inputs = likelihood.coordinates.inputs(z)
+        coordinates = likelihood.coordinates
+        inputs = coordinates.inputs(coordinates.within(z))
         parts = []
         for m in measurements:
             with m.responses.kept_runs():
@@ -388,6 +389,8 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         populations.posterior,
         coordinates.bounds,
         coordinates.ends,
+        coordinates.support,
+        coordinates.within,
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,

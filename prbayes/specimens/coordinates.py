@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._validate import AT_ONCE, Bools, Floats, Indices, Shape
-from prbayes.response.distributions import PopulationSampler, PriorSampler
+from prbayes.response.distributions import PopulationSampler, PriorSampler, fixed_ends
 from prbayes.response.inputs import Inputs
 
 
@@ -31,6 +31,11 @@ class Coordinates:
     # infinite numbers for other inputs.
     ends: Floats
     is_condition: Bools  # (d,): whether the value is known for each specimen
+    # (2, d): ends of the inputs that are the same for all populations; infinite without
+    support: Floats | None = None
+    # (2, d): ends of the inputs at which the response may be run: those of the support, or where
+    # the density may be infinite there, the bounds
+    reach: Floats | None = None
 
     @classmethod
     def of_prior(
@@ -83,7 +88,22 @@ class Coordinates:
         bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
         ends = np.where(is_infinite & ~is_condition, range_, [[-np.inf], [np.inf]])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition)
+        *fixed, is_closed = zip(*map(fixed_ends, inputs.aleatory), strict=True)
+        flat = np.stack([np.concatenate([x.ravel() for x in side]) for side in fixed])
+        support = (_logs(flat, is_log) - center) / half_width
+        support[:, is_condition] = [[-np.inf], [np.inf]]
+        reach = np.where(np.repeat(is_closed, sizes) | np.isinf(support), support, bounds)
+        return cls(
+            inputs.event_shapes,
+            is_log,
+            center,
+            half_width,
+            bounds,
+            ends,
+            is_condition,
+            support,
+            reach,
+        )
 
     @property
     def size(self) -> int:
@@ -106,6 +126,10 @@ class Coordinates:
             arrays.append(part.reshape(*z.shape[:-1], *shape))
             first = last
         return arrays
+
+    def within(self, z: Floats) -> Floats:
+        """Return coordinates (..., d) that are moved to where the response may be run."""
+        return z if self.reach is None else np.clip(z, *self.reach)
 
     def of(self, inputs: Sequence[Floats], batch_ndim: int) -> Floats:
         """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""

@@ -294,7 +294,8 @@ def extended(
     rest = count - n_explored - n_possible
     n_sampled = max(data.options.sampled, rest // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
-    possible = likely.possible(data, n_possible, rng)
+    sampled = data.within(sampled)
+    possible = data.within(likely.possible(data, n_possible, rng))
     scale = likely.scale(data)
     # Candidates for runs far from all others are inputs beside the likely ones, and specimens of
     # the whole population, because the emulator predicts both.
@@ -302,9 +303,11 @@ def extended(
     of_population = near.repeat(4, axis=0)
     noise = rng.standard_normal((len(near), len(data.free)))
     near[:, data.free] += 0.4 * scale[data.free] * noise
+    near = data.within(near)
     noise = 2.0 * rng.standard_normal((len(of_population), len(data.free)))
     population = likely.population
     of_population[:, data.free] = population.mean + noise @ population.root.T
+    of_population = data.within(of_population)
     of_inner = rng.permutation(len(data.inner))[:1024]
     prior = data.inner[of_inner].copy()
     is_condition = ~np.isnan(data.known[0])
@@ -562,7 +565,7 @@ def audited(
     rows = rng.permutation(least_certain)[: len(sampled)]
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
-    z = np.concatenate([sampled, candidates[rows], possible])
+    z = data.within(np.concatenate([sampled, candidates[rows], possible]))
     grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
@@ -622,7 +625,7 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
         if seed == 0 and not likely.is_known():
             return uncorrected
         rows = best_rows(modes.specimen, modes.misfit + 0.05 * (modes.a**2).sum(axis=1))
-        z = residuals.coordinates(modes.specimen[rows], modes.a[rows])
+        z = data.within(residuals.coordinates(modes.specimen[rows], modes.a[rows]))
         outputs = run(z)
         misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
         offsets[modes.specimen[rows]] += np.nan_to_num(misfit)

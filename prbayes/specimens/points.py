@@ -19,7 +19,7 @@ from scipy.special import ndtri
 
 from prbayes._finding import any_of
 from prbayes._stats import log_sum_exp, positive_scale
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.metrics.readings import Readings, scaled_errors
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
@@ -191,6 +191,10 @@ class SpecimenData:
     bounds: Floats | None = None  # (2, d): ends of data sets of the prior
     # (2, d): ends of the range of inputs, at which a density may be infinite
     ends: Floats | None = None
+    # (2, d): ends of the support of all populations; None if there are none
+    support: Floats | None = None
+    # Function that moves coordinates to where the response may be run.
+    within: ArrayFunction = np.asarray
     # (free,): columns of unknown coordinates, the narrowest possible populations first
     order: Indices | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
@@ -380,14 +384,21 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     emulation = proposals.residuals.response
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
+    if data.support is not None:
+        is_beyond = (z < data.support[0]) | (z > data.support[1])
+        log_proposal = np.where(is_beyond.any(axis=2), np.inf, log_proposal)
     parts = []
     for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
-        values = emulation.values(z[rows].reshape(-1, d))
-        values = values.reshape(len(rows), k, -1)
-        if emulation.offsets is not None:
-            values = values + emulation.offsets[rows, None]
+        columns, offsets = None, emulation.offsets
         if data.columns is not None:
-            values = np.take_along_axis(values, data.columns[rows, None], axis=2)
+            columns = data.columns[rows].repeat(k, axis=0)
+        values = emulation.values(z[rows].reshape(-1, d), columns)
+        values = values.reshape(len(rows), k, -1)
+        if offsets is not None:
+            of_rows = offsets[rows]
+            if data.columns is not None:
+                of_rows = np.take_along_axis(of_rows, data.columns[rows], axis=1)
+            values = values + of_rows[:, None]
         parts.append(values)
     outputs = np.concatenate(parts)
     log_a = reading_log_density(data, data.readings, outputs, emulation.error) - log_proposal
