@@ -3,7 +3,7 @@
 - *lasers*, *wear*: paths of degradation of 15 lasers and of 12 metal specimens (Meeker and Escobar,
   1998), and the probability F(t) that a lifetime is below t (`examples/degradation.py`).
 - *fission gas*: 31 experiments, each with a function of its own, under the priors of OpenTURNS'
-  worked answer (`examples/fission_gas.py`). The population is a truncated normal one. *published*
+  worked answer (`examples/fission_gas`). The population is a truncated normal one. *published*
   is the posterior that the published sampler has, without the mass of the population in its
   density.
 
@@ -133,7 +133,7 @@ def truncated_rule(low: float, high: float, sds: tuple[float, float], count: int
 
 def fission_posterior(functions: Any, readings: Any, errors: Any, normalised: bool) -> Draws:
     """Return the posterior of fission gas on a grid of the four hyperparameters."""
-    x, f, *of_diff, log_mass = truncated_rule(0.1, 40, (0.5, 40), 160, 36)
+    x, f, *of_diff, log_mass = truncated_rule(0.1, 40, (0.1, 40), 320, 40)
     z, g, *of_crack, other_mass = truncated_rule(1e-4, 1, (0.1, 10), 80, 36)
     inputs = np.meshgrid(x, z, indexing="ij")
     logs: Any = 0.0
@@ -195,7 +195,7 @@ def degradation(cell: str) -> tuple[Any, Draws, Callable[[Draws], Draws]]:
 
 def fission_gas(cell: str) -> tuple[Any, Draws, Callable[[Draws], Draws]]:
     """Return the model of fission gas and its reference."""
-    example = runpy.run_path(str(EXAMPLES / "fission_gas.py"))
+    example = runpy.run_path(str(EXAMPLES / "fission_gas" / "fission_gas.py"))
     functions, readings = example["experiments"]()
     published = cell.endswith("published")
     errors = example["reading_error"](readings)
@@ -220,8 +220,8 @@ def compared(cell: str, number: int) -> dict[str, Any]:
     return {"runs": runs, "cpu": seconds, "values": values}
 
 
-CELLS = ("lasers", "wear", "fission gas", "fission gas, published")
-STUDY = Study("published", __doc__ or "", CELLS, compared, data_sets=1)
+SPECIMENS = {"lasers": 15, "wear": 12, "fission gas": 31, "fission gas, published": 31}
+STUDY = Study("published", __doc__ or "", SPECIMENS, compared, data_sets=1)
 
 if __name__ == "__main__":
     STUDY.main()

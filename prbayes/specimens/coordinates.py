@@ -92,7 +92,9 @@ class Coordinates:
         flat = np.stack([np.concatenate([x.ravel() for x in side]) for side in fixed])
         support = (_logs(flat, is_log) - center) / half_width
         support[:, is_condition] = [[-np.inf], [np.inf]]
-        reach = np.where(np.repeat(is_closed, sizes) | np.isinf(support), support, bounds)
+        # Rounding of the map to inputs does not lead beyond an end.
+        inside = support + np.array([[1e-9], [-1e-9]])
+        reach = np.where(np.repeat(is_closed, sizes) | np.isinf(support), inside, bounds)
         return cls(
             inputs.event_shapes,
             is_log,

@@ -1,13 +1,13 @@
-"""Fission gas of measured experiments, each with a model of its own.
+"""Fission gas of 31 measured experiments, each with a model of its own.
 
 An experiment has one reading of the released share and a surrogate of its own, a Gaussian process
 through 225 runs. The factors of diffusion and cracking vary between experiments: truncated normal
-populations. Data and priors are those of a worked answer of OpenTURNS, see
-examples/fission_gas/README.md. Its sampler leaves the truncation out of the density of the
-populations, which `normalised=False` does as well. Twelve of the 31 experiments take half a minute;
-all of them are compared with a quadrature by `python -m benchmarks.published`.
+populations. Data and priors are those of a worked answer of OpenTURNS, see the README. Its sampler
+leaves the truncation out of the density of the populations, which `normalised=False` does as well.
+The numbers below are those of a quadrature (`python -m benchmarks.published`). It takes two
+minutes.
 
-Run: uv run python examples/fission_gas.py [--experiments 31]
+Run: uv run python examples/fission_gas/fission_gas.py
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ import pymc as pm
 
 import prbayes as prb
 
-DATA = Path(__file__).with_name("fission_gas")
+DATA = Path(__file__).parent
 ENDS = {"diff": (0.1, 40.0), "crack": (1e-4, 1.0)}
 SPREADS = {"diff": (0.1, 40.0), "crack": (0.1, 10.0)}
 # Mean and standard deviation by quadrature.
