@@ -53,10 +53,13 @@ class Emulator:
             jacobian = np.empty((*columns.shape, z.shape[1]))
             for k in np.unique(columns):
                 rows, slots = np.nonzero(columns == k)
-                values[rows, slots], jacobian[rows, slots] = self.surfaces[k](z[rows])
+                of_output = self.surfaces[k](z[rows])
+                values[rows, slots] = of_output[0]
+                jacobian[rows, slots] = of_output[1]
         else:
             parts, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
-            values, jacobian = np.stack(parts, axis=1), np.stack(slopes, axis=1)
+            values = np.stack(parts, axis=1)
+            jacobian = np.stack(slopes, axis=1)
             if self.components is not None and columns is None:
                 values = values @ self.components
                 jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
@@ -148,7 +151,8 @@ def fit_emulator(
         n_components = (sizes > 1e-3 * sizes[0]).sum()
         if of_point is None or 4 * of_point >= n_components:
             # Scores have unit spread, as scaled outputs have.
-            scores, components = np.sqrt(n) * u.T, (sizes / np.sqrt(n))[:, None] * directions
+            scores = np.sqrt(n) * u.T
+            components = (sizes / np.sqrt(n))[:, None] * directions
     if start is not None and (start.components is None) != (components is None):
         start = None
     surfaces: list[FittedSurface] = []

@@ -316,7 +316,8 @@ class CheckedRuns:
         likelihood = self.likelihood
         measurements = likelihood.measurements
         coordinates = likelihood.coordinates
-        inputs = coordinates.inputs(coordinates.within(z))
+        reached = coordinates.within(z)
+        inputs = coordinates.inputs(reached)
         parts = []
         for m in measurements:
             with m.responses.kept_runs():
@@ -387,10 +388,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         known,
         populations.prior_specimens(),
         populations.posterior,
-        coordinates.bounds,
-        coordinates.ends,
-        coordinates.support,
-        coordinates.within,
+        coordinates,
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,

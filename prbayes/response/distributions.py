@@ -153,12 +153,13 @@ def fixed_ends(dist: TensorVariable) -> tuple[Floats, Floats, bool]:
         ends = transform.args_fn(*dist.owner.inputs)
     elif kind in ("log", "logodds"):
         ends = pt.constant(0.0), pt.constant(1.0) if kind == "logodds" else None
-    low, high = (
-        end.data if isinstance(end, pt.TensorConstant) else unknown
-        for end, unknown in zip(ends, (-np.inf, np.inf), strict=True)
-    )
-    of_elements = np.zeros(event_shape(dist))
-    return low + of_elements, high + of_elements, kind == "interval"
+    shape = event_shape(dist)
+    low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
+    if isinstance(ends[0], pt.TensorConstant):
+        low[...] = ends[0].data
+    if isinstance(ends[1], pt.TensorConstant):
+        high[...] = ends[1].data
+    return low, high, kind == "interval"
 
 
 def _scalar_if_infinite(end: TensorVariable) -> Any:

@@ -326,7 +326,9 @@ def covariate_values(
     unknown = [name for name in names if name not in stated]
     numbers = {} if at is None else at
     if not isinstance(numbers, Mapping) or set(numbers) != set(unknown):
-        remedy = f"pass at={{{unknown[0]!r}: value}}" if unknown else "leave at= out"
+        remedy = "leave at= out"
+        if unknown:
+            remedy = f"pass at={{{unknown[0]!r}: value}}"
         raise ValueError(
             f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, "
             f"{unknown}; {remedy}"

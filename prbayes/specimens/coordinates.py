@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,24 +88,26 @@ class Coordinates:
         bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
         ends = np.where(is_infinite & ~is_condition, range_, [[-np.inf], [np.inf]])
-        *fixed, is_closed = zip(*map(fixed_ends, inputs.aleatory), strict=True)
-        flat = np.stack([np.concatenate([x.ravel() for x in side]) for side in fixed])
-        support = (_logs(flat, is_log) - center) / half_width
-        support[:, is_condition] = [[-np.inf], [np.inf]]
+        shapes = inputs.event_shapes
+        free = cls(shapes, is_log, center, half_width, bounds, ends, is_condition)
+        return free.with_ends(inputs)
+
+    def with_ends(self, inputs: Inputs) -> Coordinates:
+        """Return the coordinates with the ends that are the same for all populations."""
+        low, high, closed = [], [], []
+        for dist in inputs.aleatory:
+            lower, upper, is_closed = fixed_ends(dist)
+            low.append(lower.ravel())
+            high.append(upper.ravel())
+            closed.append(np.full(lower.size, is_closed))
+        flat = np.stack([np.concatenate(low), np.concatenate(high)])
+        support = (_logs(flat, self.is_log) - self.center) / self.half_width
+        support[:, self.is_condition] = [[-np.inf], [np.inf]]
+        is_end = np.concatenate(closed) | np.isinf(support)
         # Rounding of the map to inputs does not lead beyond an end.
-        inside = support + np.array([[1e-9], [-1e-9]])
-        reach = np.where(np.repeat(is_closed, sizes) | np.isinf(support), inside, bounds)
-        return cls(
-            inputs.event_shapes,
-            is_log,
-            center,
-            half_width,
-            bounds,
-            ends,
-            is_condition,
-            support,
-            reach,
-        )
+        inside = np.array([[1e-9], [-1e-9]])
+        reach = np.where(is_end, support, self.bounds) + inside
+        return replace(self, support=support, reach=reach)
 
     @property
     def size(self) -> int:

@@ -138,10 +138,11 @@ class Emulation:
 
     def values(self, z: Floats, columns: Columns = None) -> Floats:
         """Return the values alone."""
-        rows = np.array_split(np.arange(len(z)), 1 + len(z) // IN_CACHE)
-        own = [None if columns is None else columns[block] for block in rows]
-        blocks = zip(rows, own, strict=True)
-        values = np.concatenate([self.surface.values(z[block], c) for block, c in blocks])
+        parts = []
+        for rows in np.array_split(np.arange(len(z)), 1 + len(z) // IN_CACHE):
+            of_rows = None if columns is None else columns[rows]
+            parts.append(self.surface.values(z[rows], of_rows))
+        values = np.concatenate(parts)
         values[self.fails(z)] = np.nan
         return values
 
