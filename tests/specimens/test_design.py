@@ -16,6 +16,7 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.specimens import design
+from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.design import (
     audited,
     corrected,
@@ -25,7 +26,6 @@ from prbayes.specimens.design import (
     first_runs,
     most_runs,
 )
-from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import Emulation
 from prbayes.specimens.points import (
     Plausible,
