@@ -123,6 +123,19 @@ def tails() -> Iterator[Row]:
         ]
 
 
+def published_data() -> Iterator[Row]:
+    """Yield the largest offset and the range of widths of posteriors of published data."""
+    from benchmarks.published import SPECIMENS
+
+    for cell, row in single("published").items():
+        pairs = [(v["prbayes"], v["reference"]) for v in row["values"].values()]
+        offset = max(abs(mean - exact) / sd for (mean, *_), (exact, sd, *_) in pairs)
+        widths = [sd / exact for (_, sd, *_), (_, exact, *_) in pairs]
+        between = f"{short(min(widths))} to {short(max(widths))}"
+        costs = str(row["runs"]), f"{row['cpu']:.0f}"
+        yield [cell, str(SPECIMENS[cell]), *costs, short(offset), between]
+
+
 def discrepancy() -> Iterator[Row]:
     """Yield coverage and widths by the free shape and by the line, by true discrepancy."""
     figures = summary("discrepancy")
@@ -692,6 +705,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "thermal, tests": thermal_tests,
     "scoreboard, one output": lambda: _matrix(several=False),
     "scoreboard, several outputs": lambda: _matrix(several=True),
+    "published data": published_data,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"

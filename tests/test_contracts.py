@@ -29,6 +29,7 @@ from pymc.distributions.custom import CustomSymbolicDistRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
+from pymc.distributions.transforms import _default_transform
 from pymc.logprob.abstract import ValuedRV, _logprob
 from pymc.logprob.utils import CheckParameterValue
 from pymc.model.fgraph import clone_model
@@ -327,6 +328,21 @@ def test_value_variables_and_transforms() -> None:
     transform = model.rvs_to_transforms[sigma]
     assert transform.forward(sigma, *sigma.owner.inputs).owner is not None
     assert model.rvs_to_transforms[model["mu"]] is None
+
+
+def test_default_transforms_have_a_name_and_ends() -> None:
+    def transform(x: Any) -> Any:
+        return _default_transform(x.owner.op, x)
+
+    between = pm.Truncated.dist(pm.Gamma.dist(2.0, 1.0), 0.2, 3.0)
+    low, high = transform(between).args_fn(*between.owner.inputs)
+    assert (float(low.data), float(high.data)) == (0.2, 3.0)
+    names = {pm.LogNormal: "log", pm.HalfNormal: "log", pm.Beta: "logodds", pm.Uniform: "interval"}
+    for distribution, name in names.items():
+        parameters = () if distribution is pm.LogNormal else (1.0, 2.0)
+        x = distribution.dist(*parameters[: 1 if name == "log" else 2])
+        assert transform(x).name == name
+    assert transform(pm.Normal.dist()) is None
 
 
 # Distributions.

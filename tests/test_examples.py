@@ -108,3 +108,13 @@ def test_calculix_is_left_out_with_a_message_where_it_is_not(
     monkeypatch.setattr(sys, "argv", ["calculix.py"])
     runpy.run_path(str(EXAMPLES / "calculix.py"), run_name="__main__")
     assert capsys.readouterr().out.startswith("ccx is not on the path: install CalculiX")
+
+
+def test_surrogates_of_fission_gas_are_those_of_openturns() -> None:
+    module = runpy.run_path(str(EXAMPLES / "fission_gas" / "fission_gas.py"))
+    functions, readings = module["experiments"]()
+    assert (len(functions), readings[0], readings[-1]) == (31, 0.228, 0.018)
+    # Values of OpenTURNS 1.27 at one point.
+    values = [functions[k](25.514771324126027, 0.2698597350924939) for k in (0, 17, 30)]
+    expected = [0.1976217303423607, 0.10264471436628946, 0.03491357554045534]
+    np.testing.assert_allclose(values, expected, atol=1e-11)

@@ -31,7 +31,7 @@ ROUGH_CANDIDATES: tuple[Surface, ...] = (
 class Emulator:
     """Surfaces through the outputs of runs.
 
-    With more than six outputs the surfaces are those of principal components.
+    With more than six outputs the surfaces are mostly those of principal components.
     """
 
     z: Floats  # (n, d): inputs of the runs
@@ -47,22 +47,35 @@ class Emulator:
 
         With ``columns``, (k, c), they are those of the outputs listed in the row of each point.
         """
-        parts, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
-        values, jacobian = np.stack(parts, axis=1), np.stack(slopes, axis=1)
-        if columns is None and self.components is not None:
-            values = values @ self.components
-            jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
-        elif columns is not None:
-            of_outputs = np.eye(values.shape[1]) if self.components is None else self.components
-            loadings = of_outputs.T[columns]  # (k, c, components)
-            values = (loadings @ values[:, :, None])[:, :, 0]
-            jacobian = loadings @ jacobian
         place: Any = slice(None) if columns is None else columns
+        if columns is not None and self.components is None:
+            values = np.empty(columns.shape)
+            jacobian = np.empty((*columns.shape, z.shape[1]))
+            for k in np.unique(columns):
+                rows, slots = np.nonzero(columns == k)
+                of_output = self.surfaces[k](z[rows])
+                values[rows, slots] = of_output[0]
+                jacobian[rows, slots] = of_output[1]
+        else:
+            parts, slopes = zip(*(surface(z) for surface in self.surfaces), strict=True)
+            values = np.stack(parts, axis=1)
+            jacobian = np.stack(slopes, axis=1)
+            if self.components is not None and columns is None:
+                values = values @ self.components
+                jacobian = np.einsum("kcd,cm->kmd", jacobian, self.components, optimize=True)
+            elif self.components is not None:
+                loadings = self.components.T[columns]  # (k, c, components)
+                values = (loadings @ values[:, :, None])[:, :, 0]
+                jacobian = loadings @ jacobian
         center, unit = self.center[place], self.unit[place]
         return center + unit * values, unit[..., None] * jacobian
 
-    def values(self, z: Floats) -> Floats:
-        """Return values at points, (k, d) -> (k, m)."""
+    def values(self, z: Floats, columns: Indices | None = None) -> Floats:
+        """Return values at points, (k, d) -> (k, m); or (k, c) of the outputs in ``columns``."""
+        if columns is not None:
+            if self.components is None:
+                return self(z, columns)[0]
+            return np.take_along_axis(self.values(z), columns, axis=1)
         values = np.stack([surface.values(z) for surface in self.surfaces], axis=1)
         if self.components is not None:
             values = values @ self.components
@@ -90,6 +103,7 @@ def fit_emulator(
     tried: Sequence[Surface] = CANDIDATES,
     start: Emulator | None = None,
     seed: int = 0,
+    of_point: int | None = None,
 ) -> Emulator:
     """Fit the surfaces of outputs with the smallest left-out errors.
 
@@ -107,6 +121,9 @@ def fit_emulator(
         An emulator through earlier runs, whose lengths are a start of the search.
     seed : int
         Of the parts that are left out of surfaces without a formula for their left-out errors.
+    of_point : int, optional
+        Largest number of outputs that are evaluated at a point; all by default. If it is less than
+        a quarter of the number of principal components, each output has a surface.
 
     Raises
     ------
@@ -130,9 +147,14 @@ def fit_emulator(
     scaled = np.where(is_constant, 0.0, (y - center) / unit)
     components, scores = None, scaled.T
     if y.shape[1] > 6:
-        u, sizes, components = np.linalg.svd(scaled, full_matrices=False)
-        # Scores and components are scaled, so that scores have unit spread, as scaled outputs have.
-        scores, components = np.sqrt(n) * u.T, (sizes / np.sqrt(n))[:, None] * components
+        u, sizes, directions = np.linalg.svd(scaled, full_matrices=False)
+        n_components = (sizes > 1e-3 * sizes[0]).sum()
+        if of_point is None or 4 * of_point >= n_components:
+            # Scores have unit spread, as scaled outputs have.
+            scores = np.sqrt(n) * u.T
+            components = (sizes / np.sqrt(n))[:, None] * directions
+    if start is not None and (start.components is None) != (components is None):
+        start = None
     surfaces: list[FittedSurface] = []
     left_out, rest = np.zeros_like(y), scaled
     for k, output in enumerate(scores):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from prbayes._finding import Finding, Findings, report
+from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import AT_ONCE, IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
@@ -315,7 +315,9 @@ class CheckedRuns:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         measurements = likelihood.measurements
-        inputs = likelihood.coordinates.inputs(z)
+        coordinates = likelihood.coordinates
+        reached = coordinates.within(z)
+        inputs = coordinates.inputs(reached)
         parts = []
         for m in measurements:
             with m.responses.kept_runs():
@@ -386,8 +388,7 @@ def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
         known,
         populations.prior_specimens(),
         populations.posterior,
-        coordinates.bounds,
-        coordinates.ends,
+        coordinates,
         populations.order(),
         scales=_error_scales(likelihood),
         gross_errors=likelihood.measurements[0].gross_errors is not False,
@@ -499,11 +500,13 @@ def _end_findings(
     if at_end[worst]:
         refuse_at_end(data, worst)
     label = worst if data.labels is None else data.labels[worst]
+    remedy = "pass metric=prb.LogLikelihood(error=...) with the error of the readings"
+    if all(m.metric.error is not None for m in likelihood.measurements):
+        remedy = any_of("narrow the priors", data.remedies()[0])
     text = (
         f"{likelihood.name}: the input of specimen {label} is so near an end of its range that the "
         f"emulator's error is {shares[worst]:.0%} of the distance: posterior means may be off by "
-        f"{tilts[worst]:.1g} standard deviations or more; pass "
-        "metric=prb.LogLikelihood(error=...) with the error of the readings."
+        f"{tilts[worst]:.1g} standard deviations or more; {remedy}."
     )
     return [Finding("emulator-error", text, "likelihood_findings.md#emulator-error")]
 

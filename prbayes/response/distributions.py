@@ -11,6 +11,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
+from pymc.distributions.transforms import _default_transform
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors
@@ -138,6 +139,27 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
                 "matrix; pm.LKJCorr is no correlation matrix but its Cholesky factor L: "
                 "pass chol=sds[:, None] * L instead of cov="
             )
+
+
+def fixed_ends(dist: TensorVariable) -> tuple[Floats, Floats, bool]:
+    """Return ends of the support of each element, and whether the density is finite there.
+
+    Ends that hyperparameters move, and those of unbounded elements, are infinite.
+    """
+    transform = _default_transform(dist.owner.op, dist)
+    kind = "" if transform is None else transform.name
+    ends: tuple[Any, ...] = (None, None)
+    if kind == "interval":
+        ends = transform.args_fn(*dist.owner.inputs)
+    elif kind in ("log", "logodds"):
+        ends = pt.constant(0.0), pt.constant(1.0) if kind == "logodds" else None
+    shape = event_shape(dist)
+    low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
+    if isinstance(ends[0], pt.TensorConstant):
+        low[...] = ends[0].data
+    if isinstance(ends[1], pt.TensorConstant):
+        high[...] = ends[1].data
+    return low, high, kind == "interval"
 
 
 def _scalar_if_infinite(end: TensorVariable) -> Any:

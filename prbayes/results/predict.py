@@ -327,9 +327,12 @@ def covariate_values(
     unknown = [name for name in names if name not in stated]
     numbers = {} if at is None else at
     if not isinstance(numbers, Mapping) or set(numbers) != set(unknown):
+        remedy = "leave at= out"
+        if unknown:
+            remedy = f"pass at={{{unknown[0]!r}: value}}"
         raise ValueError(
             f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, "
-            f"{unknown}; pass at={{'hardness': 250.0}}, for example"
+            f"{unknown}; {remedy}"
         )
     values = {}
     for covariate, name in zip(inputs.covariates, names, strict=True):

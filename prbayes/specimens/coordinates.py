@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from prbayes._validate import AT_ONCE, Bools, Floats, Indices, Shape
-from prbayes.response.distributions import PopulationSampler, PriorSampler
+from prbayes.response.distributions import PopulationSampler, PriorSampler, fixed_ends
 from prbayes.response.inputs import Inputs
 
 
@@ -31,6 +31,11 @@ class Coordinates:
     # infinite numbers for other inputs.
     ends: Floats
     is_condition: Bools  # (d,): whether the value is known for each specimen
+    # (2, d): ends of the inputs that are the same for all populations; infinite without
+    support: Floats | None = None
+    # (2, d): ends of the inputs at which the response may be run: those of the support, or where
+    # the density may be infinite there, the bounds
+    reach: Floats | None = None
 
     @classmethod
     def of_prior(
@@ -83,7 +88,26 @@ class Coordinates:
         bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
         ends = np.where(is_infinite & ~is_condition, range_, [[-np.inf], [np.inf]])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition)
+        shapes = inputs.event_shapes
+        free = cls(shapes, is_log, center, half_width, bounds, ends, is_condition)
+        return free.with_ends(inputs)
+
+    def with_ends(self, inputs: Inputs) -> Coordinates:
+        """Return the coordinates with the ends that are the same for all populations."""
+        low, high, closed = [], [], []
+        for dist in inputs.aleatory:
+            lower, upper, is_closed = fixed_ends(dist)
+            low.append(lower.ravel())
+            high.append(upper.ravel())
+            closed.append(np.full(lower.size, is_closed))
+        flat = np.stack([np.concatenate(low), np.concatenate(high)])
+        support = (_logs(flat, self.is_log) - self.center) / self.half_width
+        support[:, self.is_condition] = [[-np.inf], [np.inf]]
+        is_end = np.concatenate(closed) | np.isinf(support)
+        # Rounding of the map to inputs does not lead beyond an end.
+        inside = np.array([[1e-9], [-1e-9]])
+        reach = np.where(is_end, support, self.bounds) + inside
+        return replace(self, support=support, reach=reach)
 
     @property
     def size(self) -> int:
@@ -106,6 +130,10 @@ class Coordinates:
             arrays.append(part.reshape(*z.shape[:-1], *shape))
             first = last
         return arrays
+
+    def within(self, z: Floats) -> Floats:
+        """Return coordinates (..., d) that are moved to where the response may be run."""
+        return z if self.reach is None else np.clip(z, *self.reach)
 
     def of(self, inputs: Sequence[Floats], batch_ndim: int) -> Floats:
         """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""

@@ -294,7 +294,9 @@ def extended(
     rest = count - n_explored - n_possible
     n_sampled = max(data.options.sampled, rest // 2)
     sampled, specimens = likely.sample(n_sampled, rng)
+    sampled = data.within(sampled)
     possible = likely.possible(data, n_possible, rng)
+    possible = data.within(possible)
     scale = likely.scale(data)
     # Candidates for runs far from all others are inputs beside the likely ones, and specimens of
     # the whole population, because the emulator predicts both.
@@ -302,9 +304,11 @@ def extended(
     of_population = near.repeat(4, axis=0)
     noise = rng.standard_normal((len(near), len(data.free)))
     near[:, data.free] += 0.4 * scale[data.free] * noise
+    near = data.within(near)
     noise = 2.0 * rng.standard_normal((len(of_population), len(data.free)))
     population = likely.population
     of_population[:, data.free] = population.mean + noise @ population.root.T
+    of_population = data.within(of_population)
     of_inner = rng.permutation(len(data.inner))[:1024]
     prior = data.inner[of_inner].copy()
     is_condition = ~np.isnan(data.known[0])
@@ -457,7 +461,7 @@ def _with_bias_at_ends(data: SpecimenData, emulation: Emulation, likely: Likely)
     A density may be infinite at the end, so that the error of an input is compared with its
     distance from the end. The bias is too large above a share of .1.
     """
-    if data.ends is None or np.isinf(data.ends).all():
+    if data.coordinates is None or np.isinf(data.coordinates.ends).all():
         return emulation
     z = likely.best()
     share = shares_of_distance(data, emulation.error, z, emulation(z)[1])
@@ -489,7 +493,10 @@ def shares_of_distance(
     # Errors of readings smooth the density near the end, so that the emulator's error is compared
     # with them as well as with the distance.
     by_readings = np.sqrt(np.maximum(by_all**2 - by_emulator**2, 0.0))
-    low, high = (-np.inf, np.inf) if data.ends is None else data.ends
+    low: Floats | float = -np.inf
+    high: Floats | float = np.inf
+    if data.coordinates is not None:
+        low, high = data.coordinates.ends
     # The distance is reduced by three standard deviations, because the input is not known exactly.
     distance = np.minimum(z - low, high - z)[:, data.free] - 3 * by_emulator
     distance = np.minimum(distance, np.broadcast_to(scale, z.shape)[:, data.free])
@@ -563,6 +570,7 @@ def audited(
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
     z = np.concatenate([sampled, candidates[rows], possible])
+    z = data.within(z)
     grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
     at_audited, at_possible = np.split(misfit, [len(specimens)])
     stratum = np.repeat([0.75, 0.25], len(sampled))
@@ -623,6 +631,7 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
             return uncorrected
         rows = best_rows(modes.specimen, modes.misfit + 0.05 * (modes.a**2).sum(axis=1))
         z = residuals.coordinates(modes.specimen[rows], modes.a[rows])
+        z = data.within(z)
         outputs = run(z)
         misfit = outputs - emulation.surface.values(z) - offsets[modes.specimen[rows]]
         offsets[modes.specimen[rows]] += np.nan_to_num(misfit)
@@ -639,7 +648,9 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
 
 def refuse_at_end(data: SpecimenData, specimen: int) -> None:
-    """Raise for a specimen whose input is nearer to an end of its range than it is known."""
+    """Raise if a specimen with exact readings has an input nearer to an end than it is known."""
+    if (data.readings.error[specimen] > 0).any():
+        return
     label = specimen if data.labels is None else data.labels[specimen]
     raise DesignError(
         f"{data.name}: got an exact reading of specimen {label} whose input is at an end of the "

@@ -26,7 +26,7 @@ class Surface(Protocol):
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""
 
-    def values(self, z: Floats) -> Floats:
+    def values(self, z: Floats, columns: Columns = None) -> Floats:
         """Return the values alone."""
 
     def variance(self, z: Floats) -> Floats:
@@ -64,9 +64,10 @@ class CompressedSurface:
         slopes = self.unit[place] * np.cosh(np.clip(u, -100, 100))
         return self.expanded(u, place), slopes[:, :, None] * jacobian
 
-    def values(self, z: Floats) -> Floats:
+    def values(self, z: Floats, columns: Columns = None) -> Floats:
         """Return the values alone."""
-        return self.expanded(self.surface.values(z))
+        place: Any = slice(None) if columns is None else columns
+        return self.expanded(self.surface.values(z, columns), place)
 
     def variance(self, z: Floats) -> Floats:
         """Return predictive variances, (k, m)."""
@@ -78,7 +79,7 @@ class CompressedSurface:
 class DifferencedResponse:
     """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
 
-    values: ArrayFunction  # coordinates (k, d) -> outputs (k, m)
+    response: ArrayFunction  # coordinates (k, d) -> outputs (k, m)
     step: float = 1e-5  # step of the differences, in units of the coordinates
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
@@ -87,19 +88,22 @@ class DifferencedResponse:
         axes = np.eye(d)
         shifts = self.step * np.concatenate([np.zeros((1, d)), axes, -axes])
         points = (z + shifts[:, None]).reshape(-1, d)
-        values = self.values(points).reshape(2 * d + 1, k, -1)
+        values = self.response(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
         outputs, jacobian = values[0], np.moveaxis(slopes, 0, -1)
         if columns is None:
             return outputs, jacobian
         rows = np.arange(k)[:, None]
-        outputs = outputs[rows, columns]
-        jacobian = jacobian[rows, columns]
-        return outputs, jacobian
+        return outputs[rows, columns], jacobian[rows, columns]
+
+    def values(self, z: Floats, columns: Columns = None) -> Floats:
+        """Return the values alone."""
+        values = self.response(z)
+        return values if columns is None else np.take_along_axis(values, columns, axis=1)
 
     def variance(self, z: Floats) -> Floats:
         """Return zeros: the response has no error."""
-        return np.zeros_like(self.values(z))
+        return np.zeros_like(self.response(z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +142,13 @@ class Emulation:
         values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
 
-    def values(self, z: Floats) -> Floats:
+    def values(self, z: Floats, columns: Columns = None) -> Floats:
         """Return the values alone."""
-        blocks = np.array_split(z, 1 + len(z) // IN_CACHE)
-        values = np.concatenate([self.surface.values(block) for block in blocks])
+        parts = []
+        for rows in np.array_split(np.arange(len(z)), 1 + len(z) // IN_CACHE):
+            of_rows = None if columns is None else columns[rows]
+            parts.append(self.surface.values(z[rows], of_rows))
+        values = np.concatenate(parts)
         values[self.fails(z)] = np.nan
         return values
 
@@ -250,7 +257,8 @@ def fit_surface(
     unit = np.where(largest <= 100 * spread, 1e6 * np.maximum(largest, spread), 10 * spread)
     compressed = np.arcsinh((yg - center) / unit)
     start = previous.surface if isinstance(previous, CompressedSurface) else None
-    emulator = fit_emulator(zg, compressed, inside, start=start)
+    of_point = int(readings.is_measured.sum(axis=1).max())
+    emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
     ends = np.stack([zg[inside].min(axis=0), zg[inside].max(axis=0)])
     surface = CompressedSurface(emulator, center, unit, ends)
     errors = yg - surface.expanded(compressed - surface.surface.left_out)

@@ -24,6 +24,7 @@ from prbayes.metrics.readings import Readings, scaled_errors
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
+from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.emulation import Emulation, half_difference
 from prbayes.specimens.proposals import (
     Modes,
@@ -188,9 +189,7 @@ class SpecimenData:
     known: Floats  # (N, d): coordinates that are known for a specimen; NaN of the others
     prior: Floats  # (n, d): specimens of the prior predictive population
     posterior: Posterior  # function of points, log_a and a smoothing that returns posterior draws
-    bounds: Floats | None = None  # (2, d): ends of data sets of the prior
-    # (2, d): ends of the range of inputs, at which a density may be infinite
-    ends: Floats | None = None
+    coordinates: Coordinates | None = None  # the map to inputs; None if they have no ends
     # (free,): columns of unknown coordinates, the narrowest possible populations first
     order: Indices | None = None
     scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
@@ -212,6 +211,10 @@ class SpecimenData:
     def free(self) -> Indices:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
+
+    def within(self, z: Floats) -> Floats:
+        """Return coordinates (..., d) that are moved to where the response may be run."""
+        return z if self.coordinates is None else self.coordinates.within(z)
 
     def scale(self, sd: Floats) -> Floats:
         """Return units of all coordinates, (d,), from those of the unknown coordinates, (free,)."""
@@ -242,10 +245,11 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         target = target - emulation.offsets
     of_emulator = np.broadcast_to(emulation.error, target.shape)
     box = None
-    if data.bounds is not None:
+    if data.coordinates is not None:
         # The range of the prior's data sets, and a quarter beyond it.
-        margin = 0.25 * (data.bounds[1] - data.bounds[0])
-        box = np.stack([data.bounds[0] - margin, data.bounds[1] + margin])
+        low, high = data.coordinates.bounds
+        margin = 0.25 * (high - low)
+        box = np.stack([low - margin, high + margin])
     columns, count = None, max(int(is_read.sum(axis=1).max()), 1)
     if 2 * count <= is_read.shape[1]:
         columns = np.argsort(~is_read, axis=1, kind="stable")[:, :count]
@@ -380,14 +384,22 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
     emulation = proposals.residuals.response
     z, log_proposal, mode = proposals.draw(count, seed)
     n, k, d = z.shape
+    if data.coordinates is not None and data.coordinates.support is not None:
+        low, high = data.coordinates.support
+        is_beyond = (z < low) | (z > high)
+        log_proposal = np.where(is_beyond.any(axis=2), np.inf, log_proposal)
     parts = []
     for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
-        values = emulation.values(z[rows].reshape(-1, d))
-        values = values.reshape(len(rows), k, -1)
-        if emulation.offsets is not None:
-            values = values + emulation.offsets[rows, None]
+        columns, offsets = None, emulation.offsets
         if data.columns is not None:
-            values = np.take_along_axis(values, data.columns[rows, None], axis=2)
+            columns = data.columns[rows].repeat(k, axis=0)
+        values = emulation.values(z[rows].reshape(-1, d), columns)
+        values = values.reshape(len(rows), k, -1)
+        if offsets is not None:
+            of_rows = offsets[rows]
+            if data.columns is not None:
+                of_rows = np.take_along_axis(of_rows, data.columns[rows], axis=1)
+            values = values + of_rows[:, None]
         parts.append(values)
     outputs = np.concatenate(parts)
     log_a = reading_log_density(data, data.readings, outputs, emulation.error) - log_proposal

@@ -153,10 +153,11 @@ class ScatterSurface:
     noise: Noise
     runs: RandomRuns
 
-    def values(self, z: Floats) -> Floats:
-        """Return outputs (k, m) at coordinates (k, d)."""
+    def values(self, z: Floats, columns: Any = None) -> Floats:
+        """Return outputs (k, m) at coordinates (k, d); those in ``columns``, (k, c)."""
         inputs = z[:, : len(self.scatter.region.center)]
-        return self.scatter.outputs(inputs, self.noise.of(z))
+        values = self.scatter.outputs(inputs, self.noise.of(z))
+        return values if columns is None else np.take_along_axis(values, columns, axis=1)
 
     def __call__(self, z: Floats, columns: Any = None) -> tuple[Floats, Floats]:
         """Return values and Jacobian; of the outputs in ``columns``, (k, c), of each point."""

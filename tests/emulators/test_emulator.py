@@ -297,3 +297,28 @@ def test_outputs_of_each_point_alone(size: int) -> None:
     rows = np.arange(20)[:, None]
     np.testing.assert_allclose(own_values, values[rows, columns], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(own_jacobian, jacobian[rows, columns], rtol=1e-9, atol=1e-12)
+
+
+def test_outputs_of_single_points_have_surfaces_of_their_own_if_components_are_many() -> None:
+    z, elsewhere = design(24, 2), design(9, 2, seed=5)
+    angles = np.linspace(0, np.pi, 8)
+    phases = np.random.default_rng(1).uniform(0, 6, 8)
+
+    def waves(z: Floats) -> Floats:
+        return np.sin(1.2 * (z @ np.stack([np.cos(angles), np.sin(angles)])) + phases)
+
+    tried = [GaussianProcess(degree=1)]
+    joint = fit_emulator(z, waves(z), tried=tried, of_point=2)
+    # An emulator of components is no start for surfaces of outputs.
+    separate = fit_emulator(z, waves(z), tried=tried, of_point=1, start=joint)
+    assert joint.components is not None
+    assert separate.components is None
+    columns = np.random.default_rng(0).integers(0, 8, (9, 2))
+    rows = np.arange(9)[:, None]
+    for emulator in (joint, separate):
+        values, jacobian = emulator(elsewhere)
+        own, slopes = emulator(elsewhere, columns)
+        np.testing.assert_allclose(own, values[rows, columns], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(slopes, jacobian[rows, columns], rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(emulator.values(elsewhere, columns), own, rtol=1e-9, atol=1e-11)
+    assert np.abs(separate.values(elsewhere) - waves(elsewhere)).max() < 0.02

@@ -14,7 +14,7 @@ from scipy.stats import halfnorm, norm, truncnorm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.specimen_preparation import SpecimenPopulations
+from prbayes.model.specimen_preparation import SpecimenPopulations, prepared
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)
@@ -161,3 +161,34 @@ def test_a_mirror_population_that_the_prior_excludes(number: int) -> None:
     for name, x in (("mu1", a), ("mu2", b)):
         off = float(posterior[name].mean()) - x.mean()
         assert abs(off) < 0.5 * float(posterior[name].std())
+
+
+@pytest.mark.parametrize("propagation", [None, prb.Resimulated()])
+def test_no_run_is_beyond_the_ends_of_truncated_inputs(propagation: Any) -> None:
+    rng = np.random.default_rng(1)
+    x = truncnorm(-1.5, 1.0).rvs(20, random_state=rng) * 2 + 3
+
+    def response(x: Floats) -> Floats:
+        if (x < 0).any() or (x > 5).any():
+            raise ValueError("beyond the ends")
+        return np.sqrt(x) + x
+
+    settings = {} if propagation is None else {"propagation": propagation}
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 3, 1)
+        x_dist = pm.TruncatedNormal.dist(mu, 2.0, lower=0.0, upper=5.0)
+        metric = prb.LogLikelihood(error=0.3)
+        observed = response(x) + 0.3 * rng.standard_normal(20)
+        prb.Simulator("y", response, x_dist, observed=observed, metric=metric, **settings)
+    (likelihood,) = specimen_likelihoods(model).values()
+    mus = np.linspace(1.0, 5.0, 9)
+    populations = SpecimenPopulations(likelihood)
+    points = prepared(likelihood).points
+    logs = populations.log_likelihoods(mus[:, None], points.z, points.log_a)
+    nodes = np.linspace(0, 5, 4001)
+    densities = truncnorm(-mus[:, None] / 2, (5 - mus[:, None]) / 2, mus[:, None], 2).pdf(nodes)
+    of_readings = norm(response(nodes), 0.3).pdf(observed[:, None])
+    exact = np.log(densities @ of_readings.T * (nodes[1] - nodes[0]))
+    assert np.abs((logs - exact).sum(axis=1)).max() < 0.15
+    z = points.z[np.isfinite(points.log_a)]
+    assert (likelihood.coordinates.within(z) == z).all()

@@ -17,6 +17,7 @@ from prbayes.response.distributions import (
     PriorPoints,
     PriorSampler,
     compiled_log_density,
+    fixed_ends,
     quantiles,
     refuse_lopsided,
     refuse_without_density,
@@ -288,3 +289,22 @@ def test_prior_draws_of_a_child_vary_with_its_parent() -> None:
     (draws,) = PriorSampler([child])(4000, 1)
     # Five standard errors; .1 if all draws had one parent.
     assert np.std(draws) == pytest.approx(np.sqrt(1.01), rel=5 / np.sqrt(2 * 4000))
+
+
+def test_ends_of_supports_are_those_that_no_hyperparameter_moves() -> None:
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)
+        ends = {
+            pm.TruncatedNormal.dist(mu, sigma, lower=0.1, upper=40): (0.1, 40, True),
+            pm.TruncatedNormal.dist(mu, sigma, lower=0.1): (0.1, np.inf, True),
+            pm.TruncatedNormal.dist(2, sigma, lower=mu, upper=40): (-np.inf, 40, True),
+            pm.Truncated.dist(pm.LogNormal.dist(mu, sigma), upper=3.0): (-np.inf, 3, True),
+            pm.Uniform.dist(0, sigma): (0, np.inf, True),
+            pm.Beta.dist(sigma, 2): (0, 1, False),
+            pm.Gamma.dist(sigma, 2): (0, np.inf, False),
+            pm.Normal.dist(mu, sigma): (-np.inf, np.inf, False),
+        }
+        for dist, (low, high, is_closed) in ends.items():
+            assert fixed_ends(dist) == (low, high, is_closed), dist.owner.op
+        of_vector = pm.TruncatedNormal.dist([1.0, 2.0], sigma, lower=np.array([0.0, 1.0]))
+        np.testing.assert_array_equal(fixed_ends(of_vector)[0], [0, 1])

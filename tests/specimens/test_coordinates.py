@@ -116,3 +116,30 @@ def test_shares_keep_both_ends() -> None:
     of_range = x.inputs(x.ends[:, :1] * np.array([[1.0, 0.0, 0.0]]))[0]
     assert np.allclose(of_range, [0.0, 1.0], atol=1e-12)
     assert np.isinf(x.ends[:, 1:]).all()
+
+
+def test_runs_stay_within_ends_that_are_the_same_for_all_populations() -> None:
+    def write(factor: Any) -> list[Any]:
+        return [
+            pm.TruncatedNormal.dist(3 * factor, 1.0, lower=1.0, upper=5.0),
+            pm.TruncatedNormal.dist(10 * factor, 20.0, lower=0.1, upper=40.0),
+            pm.Beta.dist(2 * factor, 3.0),
+            pm.Uniform.dist(0.0, factor),
+            pm.Normal.dist(factor, 1.0),
+        ]
+
+    ended = coordinates(write)
+    assert ended.is_log.tolist() == [False, True, False, False, False]
+    far = np.array([[-50.0] * 5, [50.0] * 5])
+    low, high = np.transpose(ended.inputs(ended.within(far)))
+    np.testing.assert_allclose([low[:2], high[:2]], [[1.0, 0.1], [5.0, 40.0]], rtol=1e-7)
+    assert low[0] > 1.0
+    assert high[1] < 40.0
+    # At the end of a Beta variable the density may be infinite, and the response too.
+    assert 0 < low[2] < 0.01
+    assert 0.9 < high[2] < 1
+    assert low[3] == pytest.approx(0.0, abs=1e-7)
+    assert high[3] > 10
+    assert low[4] < -20
+    inner = np.full((3, 5), 0.2)
+    np.testing.assert_array_equal(ended.within(inner), inner)

@@ -16,6 +16,7 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.specimens import design
+from prbayes.specimens.coordinates import Coordinates
 from prbayes.specimens.design import (
     audited,
     corrected,
@@ -292,8 +293,11 @@ def test_an_emulator_of_some_specimens_is_audited_at_all(is_wavy: bool) -> None:
 
     def data_of(x: Floats) -> SpecimenData:
         readings, known = Readings.exact(response(x)), np.full(x.shape, np.nan)
+        bounds, nothing = np.array([[-1.5], [1.5]]), np.zeros(1, dtype=bool)
+        ends = np.inf * bounds
+        unit = Coordinates(((),), nothing, np.zeros(1), np.ones(1), bounds, ends, nothing)
         return SpecimenData(
-            readings, known, prior, NormalDraws.posterior, np.array([[-1.5], [1.5]]),
+            readings, known, prior, NormalDraws.posterior, unit,
             draws=lambda thetas: NormalDraws(*np.split(thetas.mean(axis=0), 2), len(x)),
         )  # fmt: skip
 
