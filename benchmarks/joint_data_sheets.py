@@ -75,7 +75,7 @@ def row(cell: str, seed: int) -> dict[str, float]:
     thetas = estimates + errors * z
     log_proposal = -3 * np.log1p(z**2 / 5).sum(axis=1)
     log_prior = -0.5 * ((thetas / PRIOR_SD) ** 2).sum(axis=1)
-    figures = {}
+    figures: dict[str, Any] = {}
     for form, log_l in log_likelihoods(x, OUTPUTS[kind], thetas).items():
         log_w = log_l + log_prior - log_proposal
         w = np.exp(log_w - log_w.max())

@@ -69,7 +69,8 @@ class Condition:
     """
 
     def __init__(self, response: Function, *inputs: Any, metric: Metric | None = None) -> None:
-        refuse_uncallable("prb.decision.Condition", response)
+        caller = "prb.decision.Condition"
+        refuse_uncallable(caller, response, order="Condition(response, *inputs)")
         if metric is not None and not isinstance(metric, Metric):
             raise TypeError(
                 f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "

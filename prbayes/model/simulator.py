@@ -111,7 +111,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
-    units: Labels | None = None,
+    units: Labels | str | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed variable that compares simulated and measured responses to the model.
@@ -171,8 +171,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         Names of the observed dimensions.
     propagation : Propagation, optional
         How populations become responses; with a metric ``Reweighted(1024)`` by default.
-    units : mapping, optional
-        Units for tables, pictures and the report: of aleatory inputs, by the name of the
+    units : mapping or str, optional
+        Units for tables, pictures and the report; a text is that of a response of one output. A
+        mapping has those of aleatory inputs, by the name of the
         ``.dist()`` or of the response's argument (``"x[0]"`` is an element of a vector), and of
         the response, by the name of the simulator or of an output. Those of the response are
         ``observed.attrs["units"]`` by default.
@@ -339,7 +340,7 @@ def _read_inputs(name: str, response: Function, inputs: Sequence[Any], model: pm
 
 def _with_units(
     name: str,
-    units: Labels | None,
+    units: Labels | str | None,
     inputs: Inputs,
     response: Function,
     outputs: Outputs,
@@ -347,6 +348,13 @@ def _with_units(
     """Store the units of the inputs with them, and return the outputs with their units."""
     if units is None:
         return outputs
+    if isinstance(units, str):
+        if len(outputs.names) > 1:
+            raise TypeError(
+                f"{name}: units: got {units!r:.60} for {len(outputs.names)} outputs, expected a "
+                f'mapping of names to units, such as {{"{outputs.names[0]}": {units!r:.60}}}'
+            )
+        units = {name: units}
     texts(units, f"{name}: units")
     labels = outputs.names or (name,)
     names = [*set_units(inputs, response, units), name, *outputs.names]
