@@ -399,6 +399,8 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     if not design.has_runs:
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
+    if metric is None and node.metric.exact_likelihood:  # new specimens are known themselves
+        return fisher_information(sample)
     # The ideal sample has specimens at equal steps of probability, at least 50 of them because
     # smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)

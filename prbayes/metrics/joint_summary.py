@@ -222,9 +222,7 @@ class JointSummaryDiscrepancy(Discrepancy):
         log_l = log_l + self._log_copula(products, scores, within, xp)
         return -log_l / self.members[0].summary.n
 
-    def _log_copula(
-        self, products: Any, scores: list[Any], within: Bools, xp: Any
-    ) -> Any:
+    def _log_copula(self, products: Any, scores: list[Any], within: Bools, xp: Any) -> Any:
         """Return the logarithm of the copula's density, log N(z; 0, R) - log N(z; 0, I) of (1).
 
         ``within`` marks the pairs of influences of the same output.

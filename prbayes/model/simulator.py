@@ -34,8 +34,8 @@ from prbayes._validate import (
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
-from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.joint_summary import has_data_sheets, read_sheets
+from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
