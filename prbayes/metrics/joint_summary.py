@@ -43,10 +43,11 @@ def read_sheets(name: str, observed: Any) -> tuple[Metric, Any]:
     """Return the metric and the values of a data sheet, or of a mapping of them by output."""
     if isinstance(observed, Summary):
         return SummaryLikelihood(observed), observed.values
-    others = [key for key, sheet in observed.items() if not isinstance(sheet, Summary)]
-    if others:
+    specimens = [key for key, sheet in observed.items() if not isinstance(sheet, Summary)]
+    if specimens:
+        key = specimens[0]
         raise TypeError(
-            f"{name}: observed[{others[0]!r:.60}]: got {called(observed[others[0]])} beside a "
+            f"{name}: observed[{key!r:.60}]: got {called(observed[key])} beside a "
             "prb.Summary, expected a Summary of each output; write a simulator for the outputs "
             "whose specimens are known"
         )
@@ -63,8 +64,7 @@ def read_sheets(name: str, observed: Any) -> tuple[Metric, Any]:
 
 def values_of_sheets(sheets: tuple[Summary, ...]) -> Floats:
     """Return the values of several sheets, (statistics, m), with NaN after those of short ones."""
-    columns = [sheet.values for sheet in sheets]
-    return _padded(columns)
+    return _padded([sheet.values for sheet in sheets])
 
 
 def _padded(columns: list[Floats]) -> Floats:
@@ -169,9 +169,11 @@ class JointSummaryDiscrepancy(Discrepancy):
         is_known = has_response(simulated, xp).all(axis=-1)
         columns, influences = [], [xp.where(is_known, 1.0, 0.0)]
         for k, member in enumerate(self.members):
-            y = xp.where(is_known, simulated[..., k], np.nan)
+            output = simulated[..., k]
+            y = xp.where(is_known, output, np.nan)
             columns += member.columns(y, xp)
-            influences += [xp.where(is_known, x, 0.0) for x in member.influences(y, xp)]
+            terms = member.influences(y, xp)
+            influences += [xp.where(is_known, term, 0.0) for term in terms]
         return columns + [a * b for a, b in combinations_with_replacement(influences, 2)]
 
     @cached_property
@@ -216,7 +218,9 @@ class JointSummaryDiscrepancy(Discrepancy):
             start += size
         products = sums[..., start:]
         total = xp.maximum(products[..., 0], 1e-300)
-        products = (1 - 1e-9) * products / total[..., None] + 1e-9 * self._reference[start:]
+        shares = products / total[..., None]
+        reference = self._reference[start:]
+        products = (1 - 1e-9) * shares + 1e-9 * reference
         output = np.repeat(np.arange(len(counts)), counts)
         within = output[:, None] == output
         log_l = log_l + self._log_copula(products, scores, within, xp)
@@ -229,16 +233,21 @@ class JointSummaryDiscrepancy(Discrepancy):
         """
         second = products[..., _symmetric(within.shape[0] + 1)]
         mean = second[..., 0, 1:]
-        covariance = second[..., 1:, 1:] - mean[..., :, None] * mean[..., None, :]
-        deviation = xp.sqrt(xp.maximum(_diagonal(covariance, xp), 1e-12))
-        correlation = covariance / (deviation[..., :, None] * deviation[..., None, :])
+        covariance = second[..., 1:, 1:] - _outer(mean)
+        variance = xp.maximum(_diagonal(covariance, xp), 1e-12)
+        deviation = xp.sqrt(variance)
+        correlation = covariance / _outer(deviation)
         correlation = correlation + 1e-6 * np.eye(len(within))
-        factor = _cholesky(correlation * within, xp)
-        joint = _cholesky(correlation * np.where(within, 1.0, 1.0 - self.rounding), xp)
+        shrinkage = np.where(within, 1.0, 1.0 - self.rounding)
+        factor = _triangular(correlation * within, xp)
+        joint = _triangular(correlation * shrinkage, xp)
         z = xp.stack(scores, axis=-1)
-        residuals = _solved(joint, (factor * z[..., None, :]).sum(axis=-1), xp)
-        log_ratio = xp.log(_diagonal(joint, xp) / _diagonal(factor, xp))
-        return (0.5 * (z**2 - residuals**2) - log_ratio).sum(axis=-1)
+        correlated = (factor * z[..., None, :]).sum(axis=-1)
+        residuals = _solved(joint, correlated, xp)
+        ratio = _diagonal(joint, xp) / _diagonal(factor, xp)
+        gain = 0.5 * (z**2 - residuals**2)
+        log_c = gain - xp.log(ratio)
+        return log_c.sum(axis=-1)
 
 
 def _symmetric(size: int) -> Indices:
@@ -249,12 +258,19 @@ def _symmetric(size: int) -> Indices:
     return result
 
 
+def _outer(x: Any) -> Any:
+    """Return products of the elements of vectors, (..., q) -> (..., q, q)."""
+    rows = x[..., :, None]
+    columns = x[..., None, :]
+    return rows * columns
+
+
 def _diagonal(matrix: Any, xp: Any) -> Any:
     """Return the diagonals of matrices, (..., q)."""
     return xp.diagonal(matrix, axis1=-2, axis2=-1)
 
 
-def _cholesky(matrix: Any, xp: Any) -> Any:
+def _triangular(matrix: Any, xp: Any) -> Any:
     """Return the lower triangular factors of matrices, (..., q, q).
 
     In NumPy one matrix that rounding makes indefinite does not concern the others.
@@ -264,11 +280,12 @@ def _cholesky(matrix: Any, xp: Any) -> Any:
     size = matrix.shape[-1]
     factor = np.zeros_like(matrix)
     for i in range(size):
-        pivot = np.sqrt(np.maximum(matrix[..., i, i], 1e-9))
-        factor[..., i:, i] = matrix[..., i:, i] / pivot[..., None]
+        positive = np.maximum(matrix[..., i, i], 1e-9)
+        pivot = np.sqrt(positive)
+        column = matrix[..., i:, i] / pivot[..., None]
+        factor[..., i:, i] = column
         factor[..., i, i] = pivot
-        column = factor[..., i]
-        matrix = matrix - column[..., :, None] * column[..., None, :]
+        matrix = matrix - _outer(factor[..., i])
     return factor
 
 

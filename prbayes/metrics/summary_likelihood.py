@@ -126,7 +126,7 @@ class SummaryDiscrepancy(Discrepancy):
         """
         is_known = has_response(simulated, xp)
         z = self._standardised(simulated, xp)
-        width = self._width
+        width = _smoothing_width(self.summary.n)
         steps = [(knot - z) / width for knot in self.knots]
         below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
         shares = [high - low for low, high in pairwise(below)]
@@ -140,31 +140,24 @@ class SummaryDiscrepancy(Discrepancy):
         It is one for an order statistic below the response, the response, and its square.
         """
         z = self._standardised(simulated, xp)
-        terms = [1.0 - _normal_cdf((knot - z) / self._width, xp) for knot in self.knots]
+        width = _smoothing_width(self.summary.n)
+        below = [_normal_cdf((knot - z) / width, xp) for knot in self.knots]
+        terms = [1.0 - share for share in below]
         if self._powers > 1 and self.counts.any():
-            terms += [z] if self.summary.mean is not None else []
-            terms += [z**2] if self.summary.sd is not None and not self._sd_follows else []
+            summary = self.summary
+            if summary.mean is not None:
+                terms.append(z)
+            if summary.sd is not None and not _sd_follows(summary, self.counts):
+                terms.append(z**2)
         return terms
 
     def _standardised(self, simulated: Any, xp: Any) -> Any:
         """Return standardised responses; zero is the one of a point without response."""
         center = self.summary.center
-        z = (xp.where(has_response(simulated, xp), simulated, center) - center) / self._unit
+        is_known = has_response(simulated, xp)
+        present = xp.where(is_known, simulated, center)
+        z = (present - center) / self._unit
         return xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
-
-    @property
-    def _width(self) -> float:
-        """Width of the kernel in standard deviations.
-
-        It is half of that in `LogLikelihood`, because the scale of a tail may be a fraction of the
-        standard deviation.
-        """
-        return float(0.175 * self.summary.n**-0.25)
-
-    @property
-    def _sd_follows(self) -> bool:
-        """Whether the standard deviation follows from the mean: with at most one other specimen."""
-        return self.summary.mean is not None and bool(self.counts.sum() <= 1)
 
     @cached_property
     def _unit(self) -> float:
@@ -211,7 +204,7 @@ class SummaryDiscrepancy(Discrepancy):
         for count, share in zip(self.counts, mass, strict=True):
             if count:
                 log_l = log_l + count * xp.log(share)
-        scores = self._order_scores(mass)
+        scores = _order_scores(self.counts, mass)
         if self._powers > 1 and self.counts.any():
             moments = [
                 [shares[..., size * power + j] / mass[j] for power in range(self._powers)]
@@ -221,22 +214,6 @@ class SummaryDiscrepancy(Discrepancy):
             log_l = log_l + log_sums
             scores += more
         return log_l, scores
-
-    def _order_scores(self, mass: list[Any]) -> list[Any]:
-        """Return normal scores of order statistics, of which each has a beta distribution.
-
-        Given those below, the population's share below an order statistic is beta (a, b). The
-        score is that of Paulson (1942, Ann. Math. Stat. 13, 233-235).
-        """
-        scores = []
-        for i in range(self.knots.size):
-            above = self.counts[i + 1 :]
-            a, b = self.counts[i] + 1.0, float(above.sum() + above.size)
-            share_above = sum(mass[i + 1 :])
-            root = (mass[i] * b / (a * share_above)) ** (1 / 3)
-            center = (1 - 1 / (9 * b)) * root - (1 - 1 / (9 * a))
-            scores.append(center / (root**2 / (9 * b) + 1 / (9 * a)) ** 0.5)
-        return scores
 
     def _log_sums(self, moments: list[list[Any]], xp: Any) -> tuple[Any, list[Any]]:
         """Return the log-density of mean and standard deviation, and their normal scores.
@@ -254,7 +231,7 @@ class SummaryDiscrepancy(Discrepancy):
             sum_score = (observed_sum - expected_sum) / xp.sqrt(variance)
             log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
             scores = [sum_score]
-        if summary.sd is None or self._sd_follows:
+        if summary.sd is None or _sd_follows(self.summary, self.counts):
             return log_l, scores
         expected, w_variance, covariance = self._sum_of_squares(strata, expected_sum, variance, xp)
         center, scatter = _cube_root(w_variance / expected**2, n, xp)
@@ -298,6 +275,44 @@ class SummaryDiscrepancy(Discrepancy):
 def has_response(simulated: Any, xp: Any) -> Any:
     """Return whether there is a response; +inf is one above all other values, NaN is none."""
     return xp.isfinite(simulated) | (simulated > 0)
+
+
+def _smoothing_width(n: int) -> float:
+    """Return the width of the kernel in standard deviations.
+
+    It is half of that in `LogLikelihood`, because the scale of a tail may be a fraction of the
+    standard deviation.
+    """
+    return float(0.175 * n**-0.25)
+
+
+def _sd_follows(summary: Summary, counts: Floats) -> bool:
+    """Return whether the standard deviation follows from the mean and at most one specimen."""
+    if summary.mean is None:
+        return False
+    return bool(counts.sum() <= 1)
+
+
+def _order_scores(counts: Floats, mass: list[Any]) -> list[Any]:
+    """Return normal scores of order statistics, of which each has a beta distribution.
+
+    Given those below, the population's share below an order statistic is beta (a, b). The score is
+    that of Paulson (1942, Ann. Math. Stat. 13, 233-235).
+    """
+    scores = []
+    for i in range(len(counts) - 1):
+        above = counts[i + 1 :]
+        a = counts[i] + 1.0
+        b = float(above.sum() + above.size)
+        share_above = sum(mass[i + 1 :])
+        ratio = mass[i] * b / (a * share_above)
+        root = ratio ** (1 / 3)
+        upper = 1 / (9 * b)
+        lower = 1 / (9 * a)
+        center = (1 - upper) * root - (1 - lower)
+        variance = upper * root**2 + lower
+        scores.append(center / variance**0.5)
+    return scores
 
 
 def _cube_root(relative_variance: Any, n: int, xp: Any) -> tuple[Any, Any]:
