@@ -24,6 +24,7 @@ from prbayes._validate import (
     Function,
     Seed,
     StrPath,
+    finite_number,
     positive_integer,
     seed_number,
     share,
@@ -52,7 +53,7 @@ from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.discrepancy import findings_of
-from prbayes.response.response import Responses
+from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings
 
 
@@ -186,6 +187,7 @@ def exceedance(
     >>> bool(rarely.error < 0.15 * rarely.probability), rarely.attrs["responses"]
     (True, 1000)
     """
+    _refuse_order(response, limit)
     quantity = Exceedance(response, *inputs, limit=limit, below=below, output=output)
     prob = share(prob, "prob")
     if requirement is not None:
@@ -245,6 +247,16 @@ def exceedance(
             interval_values(inputs, places[estimates.index(estimate)]) for estimate in bounds
         ]
     return table
+
+
+def _refuse_order(response: object, limit: object) -> None:
+    """Raise if response or limit are no function or no number, as in another order."""
+    order = "exceedance(result, response, limit, *inputs)"
+    refuse_uncallable("prb.exceedance", response, order=order)
+    try:
+        finite_number(limit, "prb.exceedance: limit")
+    except TypeError as error:
+        raise TypeError(f"{error}; the order is {order}") from None
 
 
 class ExceedanceTable(Table):

@@ -122,7 +122,7 @@ def p_box(
     True
     """
     caller = "prb.decision.p_box"
-    refuse_uncallable(caller, response)
+    refuse_uncallable(caller, response, order="p_box(result, response, *inputs)")
     prob = share(prob, "prob")
     positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(steps, "steps", minimum=2)

@@ -70,7 +70,8 @@ class Condition:
     """
 
     def __init__(self, response: Function, *inputs: Any, metric: Metric | None = None) -> None:
-        refuse_uncallable("prb.decision.Condition", response)
+        caller = "prb.decision.Condition"
+        refuse_uncallable(caller, response, order="Condition(response, *inputs)")
         if metric is not None and not isinstance(metric, Metric):
             raise TypeError(
                 f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "
@@ -400,6 +401,8 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     if not design.has_runs:
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
+    if metric is None and node.metric.exact_likelihood:  # new specimens are known themselves
+        return fisher_information(sample)
     # The ideal sample has specimens at equal steps of probability, at least 50 of them because
     # smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)

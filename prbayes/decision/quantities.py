@@ -51,7 +51,9 @@ class Quantity(ABC):
     of_inputs = "the response"
 
     def __init__(self, response: Function, *inputs: Any, output: Any = None) -> None:
-        refuse_uncallable(f"prb.decision.{type(self).__name__}", response)
+        name = type(self).__name__
+        order = f"{name}(response, *inputs, ...)"
+        refuse_uncallable(f"prb.decision.{name}", response, order=order)
         self.response = response
         self.inputs = inputs
         self.output = output

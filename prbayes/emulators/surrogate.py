@@ -712,7 +712,7 @@ def _coarse_at(name: str, coarse: Function, domain: Ranges, columns: Floats) -> 
 
 def _first_coarse(name: str, coarse: Function, domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at the design; raise if it cannot be computed from the inputs."""
-    refuse_uncallable(name, coarse, "coarse")
+    refuse_uncallable(name, coarse, "coarse", "fit(response, inputs, n, coarse=...)")
     values = _coarse_at(name, coarse, domain, columns)
     if not np.isfinite(values).any():
         raise ResponseError(
@@ -739,7 +739,7 @@ def _unit_points(
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
     """Raise if an argument of `Surrogate.fit` has a wrong type."""
-    refuse_uncallable(name, response)
+    refuse_uncallable(name, response, order="fit(response, inputs, n)")
     refuse_wrong_surface(name, model, outside)
     designs = ("even", "predictive")
     if points not in designs:

@@ -400,6 +400,8 @@ class Metric(ABC):
     exact_likelihood : bool
         Whether N times the discrepancy is minus the log-likelihood of statistics of unknown
         specimens, as of a `Summary`: there are no specimens to resample.
+    data_sheet : str
+        These statistics as text; empty if specimens are compared.
     """
 
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
@@ -412,6 +414,11 @@ class Metric(ABC):
     takes_weights: ClassVar[bool] = True
     takes_outputs: ClassVar[bool] = False
     by_specimen: ClassVar[bool] = False
+
+    @property
+    def data_sheet(self) -> str:
+        """The statistics of unknown specimens that are compared; none by default."""
+        return ""
 
     @property
     def additive(self) -> bool:

@@ -49,6 +49,11 @@ class SummaryLikelihood(Metric):
         if self.summary.order_statistics.size:  # densities at them have a kernel, too
             object.__setattr__(self, "tail_responses", LogLikelihood.tail_responses)
 
+    @property
+    def data_sheet(self) -> str:
+        """The statistics as text."""
+        return statistics_text(self.summary)
+
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         summary = self.summary
         if not np.array_equal(observed, summary.values):
@@ -63,11 +68,9 @@ class SummaryLikelihood(Metric):
         return SummaryDiscrepancy(self, observed, weights, summary, knots, counts)
 
 
-def data_sheet(metric: Metric) -> str:
-    """Return the statistics that a metric compares as text; empty if it compares specimens."""
-    if not isinstance(metric, SummaryLikelihood):
-        return ""
-    statistics = vars(metric.summary).items()
+def statistics_text(summary: Summary) -> str:
+    """Return the statistics of a data sheet as text."""
+    statistics = vars(summary).items()
     return ", ".join(f"{name} = {x!r}" for name, x in statistics if x is not None)
 
 
@@ -115,24 +118,46 @@ class SummaryDiscrepancy(Discrepancy):
         """The number of moments of each stratum that the statistics need, from order zero."""
         return 5 if self.summary.sd is not None else 3 if self.summary.mean is not None else 1
 
-    def _columns(self, simulated: Any, xp: Any) -> list[Any]:
+    def columns(self, simulated: Any, xp: Any) -> list[Any]:
         """Return the features of single responses, (..., n) each.
 
         For each power the terms of the strata, then densities at the knots. The kernel of the
         densities also smooths the ends of the strata.
         """
-        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is above all other values
-        z = (xp.where(is_known, simulated, self.summary.center) - self.summary.center) / self._unit
-        z = xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
-        # Width of the kernel in standard deviations. It is half of that in `LogLikelihood`, because
-        # the scale of a tail may be a fraction of the standard deviation.
-        width = 0.175 * self.summary.n**-0.25
+        is_known = has_response(simulated, xp)
+        z = self._standardised(simulated, xp)
+        width = _smoothing_width(self.summary.n)
         steps = [(knot - z) / width for knot in self.knots]
         below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
         shares = [high - low for low, high in pairwise(below)]
         columns = [share * z**power for power in range(self._powers) for share in shares]
         columns += [xp.exp(-0.5 * step**2) / (width * np.sqrt(2 * np.pi)) for step in steps]
         return [xp.where(is_known, column, 0.0) for column in columns]
+
+    def influences(self, simulated: Any, xp: Any) -> list[Any]:
+        """Return what a specimen adds to each statistic, (..., n) each, in the order of scores.
+
+        It is one for an order statistic below the response, the response, and its square.
+        """
+        z = self._standardised(simulated, xp)
+        width = _smoothing_width(self.summary.n)
+        below = [_normal_cdf((knot - z) / width, xp) for knot in self.knots]
+        terms = [1.0 - share for share in below]
+        if self._powers > 1 and self.counts.any():
+            summary = self.summary
+            if summary.mean is not None:
+                terms.append(z)
+            if summary.sd is not None and not _sd_follows(summary, self.counts):
+                terms.append(z**2)
+        return terms
+
+    def _standardised(self, simulated: Any, xp: Any) -> Any:
+        """Return standardised responses; zero is the one of a point without response."""
+        center = self.summary.center
+        is_known = has_response(simulated, xp)
+        present = xp.where(is_known, simulated, center)
+        z = (present - center) / self._unit
+        return xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
 
     @cached_property
     def _unit(self) -> float:
@@ -143,22 +168,29 @@ class SummaryDiscrepancy(Discrepancy):
     def _reference(self) -> Floats:
         """The features of a normal population with center and unit of the sample."""
         score = ndtri((np.arange(1001) + 0.5) / 1001)
-        columns = self._columns(self.summary.center + self._unit * score, np)
+        columns = self.columns(self.summary.center + self._unit * score, np)
         return np.array([np.mean(column) for column in columns])
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the features, (..., m)."""
-        sums = [(weights * column).sum(axis=-1) for column in self._columns(simulated, xp)]
+        sums = [(weights * column).sum(axis=-1) for column in self.columns(simulated, xp)]
         return (xp.stack(sums, axis=-1),)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the matrix of the features of the responses, (n, m)."""
-        return DenseBasis((np.stack(self._columns(simulated, np), axis=-1),))
+        return DenseBasis((np.stack(self.columns(simulated, np), axis=-1),))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return minus the log-likelihood over n."""
-        (sums,) = features
-        n = self.summary.n
+        log_l, _ = self.log_density(features[0], xp)
+        return -log_l / self.summary.n
+
+    def log_density(self, sums: Any, xp: Any) -> tuple[Any, list[Any]]:
+        """Return the log-density of the statistics, and their normal scores.
+
+        The score of a statistic is that of its distribution given those before it: order
+        statistics, mean, standard deviation.
+        """
         size = self.counts.size
         total = xp.maximum(
             sums[..., :size].sum(axis=-1), 1e-300
@@ -172,43 +204,48 @@ class SummaryDiscrepancy(Discrepancy):
         for count, share in zip(self.counts, mass, strict=True):
             if count:
                 log_l = log_l + count * xp.log(share)
+        scores = _order_scores(self.counts, mass)
         if self._powers > 1 and self.counts.any():
             moments = [
                 [shares[..., size * power + j] / mass[j] for power in range(self._powers)]
                 for j in range(size)
             ]
-            log_l = log_l + self._log_sums(moments, xp)
-        return -log_l / n
+            log_sums, more = self._log_sums(moments, xp)
+            log_l = log_l + log_sums
+            scores += more
+        return log_l, scores
 
-    def _log_sums(self, moments: list[list[Any]], xp: Any) -> Any:
-        """Return the log-density of mean and standard deviation, given the moments of strata."""
+    def _log_sums(self, moments: list[list[Any]], xp: Any) -> tuple[Any, list[Any]]:
+        """Return the log-density of mean and standard deviation, and their normal scores.
+
+        Both are given the order statistics, and follow from the moments of the strata.
+        """
         summary = self.summary
         n = self.summary.n
         strata = [(c, m) for c, m in zip(self.counts, moments, strict=True) if c]
         expected_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
         variance = xp.maximum(sum(c * (m[2] - m[1] ** 2) for c, m in strata), 1e-12)
-        log_l, sum_score = 0.0, 0.0
+        log_l, scores = 0.0, []
         if summary.mean is not None:
             observed_sum = n * (summary.mean - summary.center) / self._unit
             sum_score = (observed_sum - expected_sum) / xp.sqrt(variance)
             log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
-        # With at most one other specimen the standard deviation follows from the mean.
-        follows_from_mean = summary.mean is not None and self.counts.sum() <= 1
-        if summary.sd is None or follows_from_mean:
-            return log_l
+            scores = [sum_score]
+        if summary.sd is None or _sd_follows(self.summary, self.counts):
+            return log_l, scores
         expected, w_variance, covariance = self._sum_of_squares(strata, expected_sum, variance, xp)
         center, scatter = _cube_root(w_variance / expected**2, n, xp)
         sum_of_squares = (n - 1) * (summary.sd / self._unit) ** 2
         ratio = sum_of_squares / expected
         square_score = (ratio ** (1 / 3) - center) / xp.sqrt(scatter)
         log_l = log_l - 0.5 * xp.log(scatter) - xp.log(expected) / 3
-        if summary.mean is None:
-            return log_l - 0.5 * square_score**2
-        # The standard deviation given the mean: two normal scores with a correlation.
-        correlation = covariance / xp.sqrt(variance * w_variance)
-        rest = xp.maximum(1 - correlation**2, 1e-6)
-        residual = (square_score - correlation * sum_score) ** 2 / rest
-        return log_l - 0.5 * residual - 0.5 * xp.log(rest)
+        if scores:
+            # The standard deviation given the mean: two normal scores with a correlation.
+            correlation = covariance / xp.sqrt(variance * w_variance)
+            rest = xp.maximum(1 - correlation**2, 1e-6)
+            square_score = (square_score - correlation * scores[0]) / xp.sqrt(rest)
+            log_l = log_l - 0.5 * xp.log(rest)
+        return log_l - 0.5 * square_score**2, [*scores, square_score]
 
     def _sum_of_squares(
         self, strata: list[tuple[float, list[Any]]], expected_sum: Any, variance: Any, xp: Any
@@ -233,6 +270,49 @@ class SummaryDiscrepancy(Discrepancy):
             w_variance = (n - 1) / n * w_variance + 2 * (variance / n) ** 2
         w_variance, covariance = ((n - 1) / n * moment for moment in (w_variance, covariance))
         return expected, xp.maximum(w_variance, 1e-12), covariance
+
+
+def has_response(simulated: Any, xp: Any) -> Any:
+    """Return whether there is a response; +inf is one above all other values, NaN is none."""
+    return xp.isfinite(simulated) | (simulated > 0)
+
+
+def _smoothing_width(n: int) -> float:
+    """Return the width of the kernel in standard deviations.
+
+    It is half of that in `LogLikelihood`, because the scale of a tail may be a fraction of the
+    standard deviation.
+    """
+    return float(0.175 * n**-0.25)
+
+
+def _sd_follows(summary: Summary, counts: Floats) -> bool:
+    """Return whether the standard deviation follows from the mean and at most one specimen."""
+    if summary.mean is None:
+        return False
+    return bool(counts.sum() <= 1)
+
+
+def _order_scores(counts: Floats, mass: list[Any]) -> list[Any]:
+    """Return normal scores of order statistics, of which each has a beta distribution.
+
+    Given those below, the population's share below an order statistic is beta (a, b). The score is
+    that of Paulson (1942, Ann. Math. Stat. 13, 233-235).
+    """
+    scores = []
+    for i in range(len(counts) - 1):
+        above = counts[i + 1 :]
+        a = counts[i] + 1.0
+        b = float(above.sum() + above.size)
+        share_above = sum(mass[i + 1 :])
+        ratio = mass[i] * b / (a * share_above)
+        root = ratio ** (1 / 3)
+        upper = 1 / (9 * b)
+        lower = 1 / (9 * a)
+        center = (1 - upper) * root - (1 - lower)
+        variance = upper * root**2 + lower
+        scores.append(center / variance**0.5)
+    return scores
 
 
 def _cube_root(relative_variance: Any, n: int, xp: Any) -> tuple[Any, Any]:

@@ -18,7 +18,6 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
@@ -293,7 +292,7 @@ def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     observed = {simulator.name: simulator.observed for simulator in with_data(evaluator)}
     data = labelled_responses(evaluator, observed)
     for simulator in with_data(evaluator):
-        if sheet := data_sheet(simulator.metric):
+        if sheet := simulator.metric.data_sheet:
             data[simulator.name].attrs["data_sheet"] = sheet
     return data
 

@@ -457,7 +457,7 @@ class SimulatorRV(ObservedRV):
             parents = [param[index] for param in params]
             drawn = bound.draw(rng, n_specimens, parents)
             if target.metric.exact_likelihood:
-                drawn = target.replicate(drawn.reshape(-1, target.n_drawn))
+                drawn = target.replicate(drawn.reshape(-1, target.n_drawn, *event))
             values[places] = drawn.reshape(shape)
         return values
 

@@ -34,9 +34,8 @@ from prbayes._validate import (
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
+from prbayes.metrics.joint_summary import has_data_sheets, read_sheets
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.summary import Summary
-from prbayes.metrics.summary_likelihood import SummaryLikelihood
 from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.conditions import stacked_values
 from prbayes.model.data_checks import duplicate_findings, outlier_findings
@@ -112,7 +111,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
-    units: Labels | None = None,
+    units: Labels | str | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed variable that compares simulated and measured responses to the model.
@@ -145,7 +144,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         log-likelihood by specimen, for a deterministic response of continuous inputs: it needs
         about a hundred runs, and no epsilon.
     observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping, pymc.Data or Summary
-        Measured responses, of at least two specimens, or a `Summary` of those of one output.
+        Measured responses, of at least two specimens, or a `Summary` of them. A mapping of
+        `Summary` has one for each output of the same specimens.
         Several outputs of a specimen, (N, m), need a metric that compares them together, such as
         `Joint`: an array, a DataFrame whose columns are outputs, a DataArray with specimens first,
         or a mapping of arrays. NaN is an output that was not measured, +inf a specimen that failed.
@@ -171,8 +171,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         Names of the observed dimensions.
     propagation : Propagation, optional
         How populations become responses; with a metric ``Reweighted(1024)`` by default.
-    units : mapping, optional
-        Units for tables, pictures and the report: of aleatory inputs, by the name of the
+    units : mapping or str, optional
+        Units for tables, pictures and the report; a text is that of a response of one output. A
+        mapping has those of aleatory inputs, by the name of the
         ``.dist()`` or of the response's argument (``"x[0]"`` is an element of a vector), and of
         the response, by the name of the simulator or of an output. Those of the response are
         ``observed.attrs["units"]`` by default.
@@ -228,9 +229,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
-    if isinstance(observed, Summary):
+    if has_data_sheets(observed):
         unused = [metric, epsilon, weights, specimens, dims, variables.groups]
-        metric, observed = _read_summary(name, observed, unused, settings)
+        _refuse_beside_sheets(name, unused, settings)
+        metric, observed = read_sheets(name, observed)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     observed, metric, response = observed_by_specimen(name, observed, metric, response, inputs)
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
@@ -299,10 +301,8 @@ def _new_name(name: str, model: pm.Model) -> str:
     return name
 
 
-def _read_summary(
-    name: str, summary: Summary, unused: Sequence[Any], propagation: Propagation
-) -> tuple[Metric, Floats]:
-    """Return metric and values of a data sheet; raise for arguments that need specimens."""
+def _refuse_beside_sheets(name: str, unused: Sequence[Any], propagation: Propagation) -> None:
+    """Raise for arguments beside a data sheet that need specimens."""
     names = ("metric=", "epsilon=", "weights=", "specimens=", "dims=", "groups")
     arguments = [text for text, value in zip(names, unused, strict=True) if value is not None]
     if arguments:
@@ -317,7 +317,6 @@ def _read_summary(
             f"{name}: propagation: got {called(propagation)}, whose likelihood would be random, "
             "expected prb.Reweighted(n) or prb.Resimulated(n) for a prb.Summary"
         )
-    return SummaryLikelihood(summary), summary.values
 
 
 def _read_inputs(name: str, response: Function, inputs: Sequence[Any], model: pm.Model) -> Inputs:
@@ -341,7 +340,7 @@ def _read_inputs(name: str, response: Function, inputs: Sequence[Any], model: pm
 
 def _with_units(
     name: str,
-    units: Labels | None,
+    units: Labels | str | None,
     inputs: Inputs,
     response: Function,
     outputs: Outputs,
@@ -349,6 +348,13 @@ def _with_units(
     """Store the units of the inputs with them, and return the outputs with their units."""
     if units is None:
         return outputs
+    if isinstance(units, str):
+        if len(outputs.names) > 1:
+            raise TypeError(
+                f"{name}: units: got {units!r:.60} for {len(outputs.names)} outputs, expected a "
+                f'mapping of names to units, such as {{"{outputs.names[0]}": {units!r:.60}}}'
+            )
+        units = {name: units}
     texts(units, f"{name}: units")
     labels = outputs.names or (name,)
     names = [*set_units(inputs, response, units), name, *outputs.names]
@@ -770,7 +776,7 @@ def _prepared_metric(
         if np.ndim(observed) != 2:
             least = 1 if metric.exact_likelihood else 2
             observed = observed_sample(observed, minimum=least, failures=metric.counts_failures)
-        elif len(observed) < 2:
+        elif len(observed) < 2 and not metric.exact_likelihood:
             raise ValueError(
                 f"observed: got {counted(len(observed), 'specimen')}, expected at least 2 of "
                 f"them; {NO_POPULATION}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs, label_text
 from prbayes.response.response import Responses
 
+_SHEETS = "data_sheet.md#several-outputs"
 _PAGE = "conditions.md#what-the-labels-change"
 
 
@@ -149,7 +151,26 @@ def unlabelled_specimens(simulators: Mapping[Any, Any]) -> list[Finding]:
                     f"each, expected labels, without which they count as {2 * n} specimens; pass "
                     "specimens= to both, with the same labels if the specimens are the same."
                 )
-    return [Finding("unlabelled-specimens", text, _PAGE) for text in texts]
+    findings = [Finding("unlabelled-specimens", text, _PAGE) for text in texts]
+    return findings + _separate_sheets(list(simulators.values()))
+
+
+def _separate_sheets(simulators: Sequence[Any]) -> list[Finding]:
+    """Report data sheets of as many specimens of the same inputs, which count as separate ones."""
+    findings = []
+    sheets = [s for s in simulators if s.metric.exact_likelihood]
+    for first, second in combinations(sheets, 2):
+        n = second.target.n_effective
+        is_other_size = first.target.n_effective != n
+        if is_other_size or not _have_common_inputs(second.responses.inputs, first):
+            continue
+        text = (
+            f"{first.name} and {second.name}: the data sheets have {n:.0f} specimens of the same "
+            "inputs each, and count as separate samples; if the specimens are the same, write one "
+            "simulator of a response with both outputs, and pass a mapping of prb.Summary."
+        )
+        findings.append(Finding("separate-sheets", text, _SHEETS))
+    return findings
 
 
 def _labels(specimens: NDArray[Any] | None, index: Sequence[str] | None) -> list[str] | None:

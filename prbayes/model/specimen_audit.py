@@ -103,8 +103,9 @@ def audited_likelihood(
             f"at most {likelihood.options.bias}; {advice}"
         )
     grown = emulation.with_runs(fresh, outputs)
+    audited = (*emulation.audited, *range(len(emulation.z), len(grown.z)))
     surface, *_ = fit_surface(grown.z, grown.y, readings, likelihood.name, emulation.surface)
-    extended = replace(grown, surface=surface, bias=np.inf)
+    extended = replace(grown, surface=surface, bias=np.inf, audited=audited)
     result = replace(likelihood, shared_emulation=extended)
     # The first record identifies the problem, because every use of the model has it at first.
     result.cache["first"] = likelihood.cache.get("first", likelihood)

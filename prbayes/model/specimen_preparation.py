@@ -762,9 +762,9 @@ class SpecimenPopulations:
         label = specimen if labels is None else labels[specimen]
         raise ValueError(
             f"{self.likelihood.name}: got no population of the prior that reaches the inputs of "
-            f"specimen {label}, expected one at least; look at the priors, the data's units "
-            "and responses that are NaN, and pass prb.LogLikelihood(error=...) if readings have an "
-            "error"
+            f"specimen {label}, expected one at least: prior and data are in conflict, or units or "
+            "responses are wrong; widen the priors, look at the units and at responses that are "
+            "NaN, and pass prb.LogLikelihood(error=...) if readings have an error"
         )
 
 

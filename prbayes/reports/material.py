@@ -14,7 +14,6 @@ import xarray as xr
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, Labels, called, texts, wrong_type
-from prbayes.metrics.summary_likelihood import data_sheet
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
@@ -384,7 +383,7 @@ def _observed(
             model = model_of_product(result, model)
         for simulator in population_simulators(model):
             observed[simulator.name] = Observed(simulator.observed, simulator.outputs)
-            sheets[simulator.name] = data_sheet(simulator.metric)
+            sheets[simulator.name] = simulator.metric.data_sheet
     else:
         groups = [tree["observed_data"] for tree in results.values() if "observed_data" in tree]
         for key, array in groups[0].data_vars.items() if groups else ():

@@ -55,13 +55,20 @@ from prbayes.response.variables import listed, watched
 _log = logging.getLogger(__name__)
 
 
-def refuse_uncallable(name: str, function: object, argument: str = "response") -> None:
-    """Raise if a response is no function: often the inputs were passed first."""
+_ORDER = "Simulator(name, response, *inputs, metric=..., observed=...)"
+
+
+def refuse_uncallable(
+    name: str, function: object, argument: str = "response", order: str = _ORDER
+) -> None:
+    """Raise if a response is no function: often the inputs were passed first.
+
+    ``order`` is that of the arguments of the function that was called.
+    """
     if not callable(function) or isinstance(function, type):
         raise TypeError(
             f"{name}: {argument}: got {called(function)}, expected a function of the inputs, such "
-            "as lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
-            "observed=...)"
+            f"as lambda x: x**2; the order is {order}"
         )
 
 

@@ -189,7 +189,7 @@ def predict(
     >>> squares.name, squares.shape, squares.attrs["responses"]
     ('square', (1, 1, 500), 1024)
     """
-    refuse_uncallable("prb.predict", response)
+    refuse_uncallable("prb.predict", response, order="predict(result, response, *inputs)")
     positive_integer(n_samples, "n_samples", minimum=2)
     positive_integer(n_draws, "n_draws")
     flag(stored, "stored")

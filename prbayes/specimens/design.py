@@ -397,6 +397,8 @@ def _refitted(
 ) -> tuple[Emulation, Floats]:
     """Return the emulation with a surface through all of its runs, and left-out errors, (n, m)."""
     z, y, rows = emulation.z, emulation.y, _near_population(data, emulation.z, population)
+    # Without these runs the emulator would have the same spurious inputs again.
+    rows[list(emulation.audited)] = True
     surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
     return replace(emulation, surface=surface, offsets=None), left_out
 

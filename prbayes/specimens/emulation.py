@@ -123,6 +123,8 @@ class Emulation:
     ends: Floats | None = None
     # (N, m): output of the response less that of the surface, at the likely inputs of each specimen
     offsets: Floats | None = None
+    # Indices of runs of audits, which exclude inputs that the emulator took for likely.
+    audited: tuple[int, ...] = ()
 
     @cached_property
     def box(self) -> Floats:

@@ -500,7 +500,7 @@ class JointNull(Null):
                 f"{names}; or pass responses={{{name!r}: (response, *inputs)}}"
             )
         response, *inputs = tested
-        refuse_uncallable(condition.name, response)
+        refuse_uncallable(condition.name, response, order="(response, *inputs)")
         read = read_inputs_of_copy(condition.name, inputs, self.optimum.model, function=response)
         responses = Responses(
             condition.name,

@@ -51,6 +51,23 @@ def exact(of_mu: tuple[float, float], of_sigma: float, x: Any) -> tuple[Any, Any
     return mean, np.sqrt(square - mean**2)
 
 
+@pytest.mark.parametrize(
+    ("response", "inverse"), [(lambda k: 3 / k, lambda y: 3 / y), (lambda k: k**3, np.cbrt)]
+)
+def test_a_prior_far_from_the_data_is_no_rough_response(response: Any, inverse: Any) -> None:
+    """Fifteen prior standard deviations off, populations are wide, and reach beyond the runs."""
+    logs = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(20)
+    with pm.Model() as model:
+        k = pm.LogNormal.dist(pm.Normal("mu", 0.2, 0.05), pm.HalfNormal("sigma", 0.3))
+        prb.Simulator("y", response, k, observed=response(np.exp(logs)))
+    result = prb.sample(500, model=model, random_seed=1, progressbar=False)
+    mean, sd = exact((0.2, 0.05), 0.3, np.log(inverse(response(np.exp(logs)))))
+    draws = np.stack([result.posterior[name].values.ravel() for name in ("mu", "sigma")])
+    np.testing.assert_allclose((draws.mean(axis=1) - mean) / sd, 0, atol=0.15)
+    conflict = [f for f in prb.diagnose(result, model=model).findings if "conflict" in f.code]
+    assert len(conflict) >= 1
+
+
 def findings_of(result: Any) -> tuple[Finding, ...]:
     return from_json(result["posterior"].attrs["findings"])
 
