@@ -49,7 +49,7 @@ from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
-from prbayes.specimens.coordinates import Coordinates
+from prbayes.results.products import shared_runs
 from prbayes.validation.area_test import excluded_failures
 from prbayes.validation.nulls import PosteriorNull
 from prbayes.validation.pit import read_case
@@ -156,7 +156,9 @@ def calibrate_each(
     settings = SamplingSettings(draws=draws, random_seed=seed)
     fleet = Fleet(evaluator, observed, further, settings, alpha)
     if evaluator.likelihoods:
-        likelihood = _common_likelihood(evaluator, observed)
+        (likelihood,) = shared_runs(model, observed).evaluator.likelihoods
+        (of_model,) = evaluator.likelihoods
+        of_model.cache["emulation of a fleet"] = prepared(likelihood).emulation
         fleet = SpecimenFleet(**vars(fleet), likelihood=likelihood)
     jobs = [names[first : first + 100] for first in range(0, len(names), 100)]
     with shown(progressbar), progress("products", len(names)) as advance:
@@ -456,33 +458,6 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
 
     fleet: Fleet = cloudpickle.loads(pickled)
     return fleet.calibrated(names)
-
-
-def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
-    """Return the likelihood of the specimens of all products, with their points.
-
-    The limits of the errors of emulator and points are those for one product, which has fewer
-    specimens and a narrower population.
-    """
-    (likelihood,) = evaluator.likelihoods
-    (measurement,) = likelihood.measurements
-    stacked = np.concatenate(list(observed.values()))
-    sizes = [len(values) for values in observed.values()]
-    within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
-    narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
-    sampler = likelihood.density.sampler
-    coordinates = Coordinates.of_prior(likelihood.inputs, max(sizes), sampler=sampler)
-    fewer = np.sqrt(len(stacked) / np.median(sizes))
-    options = replace(
-        likelihood.options,
-        bias=likelihood.options.bias * fewer * narrower,
-        half_difference=likelihood.options.half_difference * fewer,
-    )
-    result = likelihood.observing({measurement.name: stacked})
-    result = replace(result, options=options, shared_emulation=None)
-    vars(result).update(density=likelihood.density, coordinates=coordinates)
-    prepared(result)
-    return result
 
 
 def _misfits(
