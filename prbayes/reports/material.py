@@ -34,6 +34,7 @@ from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.results.products import model_of_product, one_posterior
 from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.fleet import tests_of_products
 from prbayes.validation.pit import Comparable, comparables, u_values
 
 
@@ -203,6 +204,8 @@ def gather(
         for label, result in _by_label(posterior, "posterior").items()
     }
     tests = _by_label(validity, "validity")
+    if validity is None:
+        tests = {k: t for r in posteriors.values() for k, t in tests_of_products(r).items()}
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
     validations = _validations(validation)

@@ -36,7 +36,7 @@ from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
-from prbayes.model.fingerprint import as_attributes, identity_of
+from prbayes.model.fingerprint import as_attributes, identity_from_attributes, identity_of
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
@@ -49,10 +49,9 @@ from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
-from prbayes.results.products import shared_runs
-from prbayes.validation.area_test import excluded_failures
+from prbayes.results.products import product_names, shared_runs
+from prbayes.validation.area_test import ValidityTest, area_test
 from prbayes.validation.nulls import PosteriorNull
-from prbayes.validation.pit import read_case
 
 
 @locked
@@ -243,6 +242,11 @@ def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArra
                 f"least {counted(minimum, 'specimen')}, in the form of the simulator's "
                 "observed values"
             )
+        if str(product) in arrays:
+            raise ValueError(
+                f"{name}: got two products with the name {str(product)!r}, expected different "
+                "names; write texts in place of numbers"
+            )
         arrays[str(product)] = array
     return arrays
 
@@ -253,8 +257,7 @@ class Calibration:
 
     values: Mapping[str, Floats]  # hyperparameters, (draws, *shape); empty after a failure
     pareto_k: float = np.nan
-    # Statistic, critical value and p-value of the validity test.
-    test: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    test: ValidityTest | None = None
     finding: str = ""  # reason of a failure, or a warning
 
 
@@ -307,11 +310,11 @@ class Fleet:
         result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
         if name not in self.further:
             return result
-        case = read_case(self.further[name], drawn.predicted)
-        report(*excluded_failures(case))
-        statistic = float(case.statistic(case.u_values()))
-        judgement = PosteriorNull(999).judge(case, statistic, self.alpha)
-        return replace(result, test=(statistic, judgement.critical_value, judgement.p_value))
+        null = PosteriorNull(999)
+        test = area_test(
+            self.further[name], drawn.predicted, alpha=self.alpha, null=null, progressbar=False
+        )
+        return replace(result, test=test)
 
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
@@ -502,16 +505,68 @@ def _tree(
         "pareto_k": [row.pareto_k for row in rows],
         "finding": [row.finding for row in rows],
     }
-    tests = np.array([row.test for row in rows])
-    if np.isfinite(tests).any():
-        for key, column in zip(("statistic", "critical_value", "p_value"), tests.T, strict=True):
-            columns[key] = column
-        columns["rejected"] = tests[:, 2] <= attrs["alpha"]
-    products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
     attrs = {**attrs, **versions()}
-    return Products.from_dict(
-        {"posterior": posterior.assign_attrs(attrs), "products": products.assign_attrs(attrs)}
-    )
+    groups = {"posterior": posterior.assign_attrs(attrs)}
+    tests = {name: row.test for name, row in zip(names, rows, strict=True) if row.test is not None}
+    if tests:
+        groups["validity"] = _validity(names, tests)
+        for key in ("statistic", "critical_value", "p_value"):
+            values = {name: getattr(test, key) for name, test in tests.items()}
+            columns[key] = [values.get(name, np.nan) for name in names]
+        columns["rejected"] = [name in tests and tests[name].rejected for name in names]
+    products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
+    groups["products"] = products.assign_attrs(attrs)
+    return Products.from_dict(groups)
+
+
+def _validity(names: Sequence[str], tests: Mapping[str, ValidityTest]) -> xr.Dataset:
+    """Return the u-values of the tests of products, filled up after the last one of each."""
+    size = max(test.u_values.size for test in tests.values())
+    columns: dict[str, list[Any]] = {}
+    for name in names:
+        test = tests.get(name)
+        n = 0 if test is None else test.u_values.size
+        numbers, texts = np.full((3, size), np.nan), np.full((2, size), "", dtype=object)
+        if test is not None:
+            numbers[:, :n] = test.u_values, *test.envelope
+            texts[:, :n] = test.conditions, test.specimens
+        for key, values in zip(_OF_TEST, [*numbers, *texts.astype(str)], strict=True):
+            columns.setdefault(key, []).append(values)
+    first = next(iter(tests.values()))
+    variables = {key: (("product", "value"), np.stack(rows)) for key, rows in columns.items()}
+    return xr.Dataset(variables, {"product": list(names)}, {"null": first.null})
+
+
+# Variables of the group ``validity``: of each u-value, and of each rank the envelope
+_OF_TEST = ("u", "lower", "upper", "condition", "specimen")
+
+
+def tests_of_products(result: Any) -> dict[str, ValidityTest]:
+    """Return the validity tests of the products of a fleet, or of a product; none without any."""
+    if not product_names(result) or "validity" not in result.children:
+        return {}
+    values, products = result["validity"].to_dataset(), result["products"].to_dataset()
+    if "product" not in values.dims:
+        values, products = values.expand_dims("product"), products.expand_dims("product")
+    arrays = {key: values[key].transpose("product", "value").values for key in _OF_TEST}
+    identity = identity_from_attributes(products.attrs)
+    tests = {}
+    for row, name in enumerate(product_names(result)):
+        n = int(np.isfinite(arrays["u"][row]).sum())
+        if n:
+            of_test = {key: array[row, :n] for key, array in arrays.items()}
+            tests[name] = ValidityTest(
+                *(float(products[key][row]) for key in ("statistic", "critical_value", "p_value")),
+                alpha=float(products.attrs["alpha"]),
+                null=str(values.attrs["null"]),
+                folded=False,
+                u_values=of_test["u"],
+                envelope=np.stack([of_test["lower"], of_test["upper"]]),
+                conditions=of_test["condition"],
+                specimens=of_test["specimen"],
+                identity=identity,
+            )
+    return tests
 
 
 class Products(Tree):
