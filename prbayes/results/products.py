@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +14,13 @@ import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
 from pymc.model.fgraph import clone_model
+from scipy.special import ndtri
 
 from prbayes._finding import Finding, Findings, as_json, counted, from_json, report, unreported
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, NamedArrays
+from prbayes.metrics.summary import Summary
+from prbayes.model.data_sheet import model_with_sheet
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.measurement import SpecimenLikelihood
@@ -79,7 +83,7 @@ def each_product[**P, T: OfProducts](function: Callable[P, T]) -> Callable[P, T]
         _refuse_predictions(caller, others)
         call: Any = function
         names, results, errors = product_names(fleet), {}, {}
-        failures = failed_products(fleet)
+        failures, sheets = failed_products(fleet), data_sheets(fleet)
         model = model_on_context(keywords.get("model"), caller)
         require_of_model(fleet, model, caller, Level.POPULATIONS)
         evaluator_of_products(fleet, model)  # Products share their runs.
@@ -96,6 +100,10 @@ def each_product[**P, T: OfProducts](function: Callable[P, T]) -> Callable[P, T]
                         else:
                             results[name] = call(**{**keywords, "result": product})
                 except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+                    errors[name] = error
+                except TypeError as error:  # The argument is wrong, or specimens are needed.
+                    if name not in sheets:
+                        raise
                     errors[name] = error
         if not results and errors:
             raise next(iter(errors.values()))
@@ -189,7 +197,7 @@ def failed_products(fleet: Any) -> dict[str, str]:
     is_missing = np.atleast_1d(first.isnull().all(other).values)
     reasons = np.atleast_1d(fleet["products"]["finding"].values).tolist()
     rows = zip(product_names(fleet), reasons, is_missing, strict=True)
-    return {name: str(reason) for name, reason, is_failed in rows if is_failed}
+    return {name: str(reason).removeprefix(f"{name}: ") for name, reason, is_failed in rows if is_failed}
 
 
 def validity_verdicts(fleet: Any) -> list[str]:
@@ -263,6 +271,16 @@ def model_of_product(result: Any, model: pm.Model) -> pm.Model:
     """Return the model with the data of a product; the model itself for other results."""
     if not product_names(result) or "observed_data" not in result.children:
         return model
+    sheets = data_sheets(result)
+    if sheets:
+        ((name, sheet),) = sheets.items()
+        emulated = evaluator_of_products(result, model).emulated
+        if emulated:
+            return model_with_sheet(model, emulated[0], sheet)
+        raise ValueError(
+            f"{name}: got a product with a data sheet and a metric of distributions, expected the "
+            "log-likelihood by specimen; or a model with observed=prb.Summary(...)"
+        )
     data = {str(name): x.values for name, x in result["observed_data"].data_vars.items()}
     return _observing(model, data)
 
@@ -277,6 +295,39 @@ def _observing(model: pm.Model, data: Mapping[str, Any]) -> pm.Model:
         copy.rvs_to_values[variable] = observed
         copy.values_to_rvs[observed] = variable
     return copy
+
+
+# Data sheets.
+
+
+def data_sheets(result: Any) -> dict[str, Summary]:
+    """Return the data sheets of products that have one in place of specimens."""
+    if not product_names(result) or "data_sheet" not in result["products"]:
+        return {}
+    texts = np.atleast_1d(result["products"]["data_sheet"].values).tolist()
+    pairs = zip(product_names(result), texts, strict=True)
+    return {name: summary_from(text) for name, text in pairs if text}
+
+
+def summary_as_text(summary: Summary) -> str:
+    """Return the statistics of a data sheet as JSON."""
+    return json.dumps({name: x for name, x in vars(summary).items() if x is not None})
+
+
+def summary_from(text: str) -> Summary:
+    """Return a data sheet from `summary_as_text`."""
+    statistics = json.loads(text)
+    quantiles = statistics.get("quantiles")
+    if quantiles is not None:
+        statistics["quantiles"] = {float(level): value for level, value in quantiles.items()}
+    return Summary(**statistics)
+
+
+def representative_specimens(summary: Summary, most: int = 32) -> Floats:
+    """Return specimens that a data sheet may have, which show where runs are needed."""
+    n = min(summary.n, most)
+    normal = summary.center + summary.unit * ndtri((np.arange(n) + 0.5) / n)
+    return np.concatenate([normal, summary.order_statistics[:, 1]])
 
 
 # Runs that products share.
@@ -330,6 +381,7 @@ def evaluator_of_products(result: Any, model: pm.Model) -> Evaluator:
     data = data if "product" in data.dims else data.expand_dims("product")
     values = zip(product_names(result), data.transpose("product", ...).values, strict=True)
     observed = {name: y[~np.isnan(y.reshape(len(y), -1)).all(axis=1)] for name, y in values}
+    observed |= {name: representative_specimens(x) for name, x in data_sheets(result).items()}
     return shared_runs(model, observed).evaluator
 
 
@@ -345,7 +397,9 @@ def _common_likelihood(
     stacked = np.concatenate(observed)
     sizes = [len(values) for values in observed]
     within = np.median([np.nanstd(values, axis=0) for values in observed], axis=0)
-    narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
+    spread = np.nanstd(stacked, axis=0)
+    has_spread = (within > 0) & (spread > 0)
+    narrower = float(np.min((within / spread)[has_spread], initial=1.0))
     sampler = likelihood.density.sampler
     coordinates = Coordinates.of_prior(likelihood.inputs, max(sizes), sampler=sampler)
     fewer = np.sqrt(len(stacked) / np.median(sizes))

@@ -33,6 +33,10 @@ from prbayes._validate import (
     share,
 )
 from prbayes.inference.checks.population import refuse_lost_specimens
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.summary import Summary
+from prbayes.metrics.summary_likelihood import SummaryLikelihood
+from prbayes.model.data_sheet import model_with_sheet
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
@@ -40,6 +44,7 @@ from prbayes.model.fingerprint import as_attributes, identity_from_attributes, i
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
+from prbayes.model.random_variable import shared_epsilon
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.posterior.batch import ProductPosteriors
@@ -49,14 +54,19 @@ from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
-from prbayes.results.products import product_names, shared_runs
+from prbayes.results.products import (
+    product_names,
+    representative_specimens,
+    shared_runs,
+    summary_as_text,
+)
 from prbayes.validation.area_test import ValidityTest, area_test
 from prbayes.validation.nulls import PosteriorNull
 
 
 @locked
 def calibrate_each(
-    data_sets: Mapping[str, ArrayLike],
+    data_sets: Mapping[str, ArrayLike | Summary],
     *,
     model: pm.Model | None = None,
     validation: Mapping[str, ArrayLike] | None = None,
@@ -74,9 +84,9 @@ def calibrate_each(
 
     Parameters
     ----------
-    data_sets : mapping of array_like, shape (N,) or (N, m)
+    data_sets : mapping of array_like, shape (N,) or (N, m), or of Summary
         Measured responses of each product by its name, in the form of ``observed`` of the
-        simulator; products may have different numbers of specimens.
+        simulator; products may have different numbers of specimens. A data sheet is a `Summary`.
     model : pymc.Model, optional
         A model with one `Simulator`, by default that on the context. Its own observed values matter
         by their form only.
@@ -101,7 +111,7 @@ def calibrate_each(
         both of one product, for all functions that take a result. Group ``products``, by product:
         ``pareto_k`` of importance sampling (NaN for another sampler), ``finding`` (why it failed,
         which specimens no inputs reproduce, populations without a response, or modes of the
-        posterior; else an empty text), and with ``validation`` the ``statistic``,
+        posterior; else an empty text), ``data_sheet`` as JSON if there is one, and with ``validation`` the ``statistic``,
         ``critical_value``, ``p_value`` and
         ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
 
@@ -143,6 +153,7 @@ def calibrate_each(
         )
     _refuse_specimens_of_the_model(caller, simulator)
     event = np.shape(simulator.observed)[1:]
+    sheets = _read_sheets(caller, data_sets, simulator)
     observed = _read_data(data_sets, "data_sets", 2, event)
     further = {} if validation is None else _read_data(validation, "validation", 1, event)
     unknown = sorted(set(further) - set(observed))
@@ -153,7 +164,7 @@ def calibrate_each(
         )
     names = list(observed)
     settings = SamplingSettings(draws=draws, random_seed=seed)
-    fleet = Fleet(evaluator, observed, further, settings, alpha)
+    fleet = Fleet(evaluator, observed, further, settings, alpha, sheets)
     if evaluator.likelihoods:
         (likelihood,) = shared_runs(model, observed).evaluator.likelihoods
         (of_model,) = evaluator.likelihoods
@@ -187,7 +198,11 @@ def calibrate_each(
         )
     attrs = {"random_seed": str(seed), "alpha": alpha, **as_attributes(identity_of(model))}
     tree = _tree(evaluator, names, rows, draws, attrs)
-    tree["observed_data"] = _padded(simulator.name, observed, simulator.outputs)
+    measured = {name: y[:0] if name in sheets else y for name, y in observed.items()}
+    tree["observed_data"] = _padded(simulator.name, measured, simulator.outputs)
+    if sheets:
+        texts = [summary_as_text(sheets[name]) if name in sheets else "" for name in names]
+        tree["products"]["data_sheet"] = xr.DataArray(texts, dims="product")
     return tree
 
 
@@ -226,6 +241,24 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         )
 
 
+def _read_sheets(caller: str, data: object, simulator: Any) -> dict[str, Summary]:
+    """Return the data sheets of products, or raise if the simulator has none."""
+    pairs = data.items() if isinstance(data, Mapping) else ()
+    sheets = {str(name): x for name, x in pairs if isinstance(x, Summary)}
+    obstacle = ""
+    if np.ndim(simulator.observed) > 1:
+        obstacle = "several outputs"
+    elif simulator.metric.by_specimen and simulator.metric != LogLikelihood():
+        obstacle = f"metric={simulator.metric!r:.60}"
+    for name in sheets if obstacle else ():
+        raise TypeError(
+            f"{caller}: data_sets: {name}: got a prb.Summary for a simulator with {obstacle}, "
+            "expected specimens: the statistics of a data sheet are those of one output, without "
+            "an error or limits of the readings; write a model for this product"
+        )
+    return sheets
+
+
 def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArrays:
     """Return the measured responses of each product, or raise."""
     if not isinstance(data, Mapping) or not data:
@@ -235,6 +268,8 @@ def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArra
         )
     arrays = {}
     for product, values in data.items():
+        if isinstance(values, Summary) and name == "data_sets":
+            values = representative_specimens(values)
         array = real_array(values, f"{name}: {product}").astype(float)
         if array.ndim != 1 + len(event) or array.shape[1:] != event or len(array) < minimum:
             raise ValueError(
@@ -280,12 +315,15 @@ class Fleet:
     further: Mapping[str, Floats]  # measured responses for validity tests, by product
     settings: SamplingSettings
     alpha: float
+    # Data sheets by product; ``observed`` has specimens that they may have.
+    sheets: Mapping[str, Summary]
 
     def part(self, names: Sequence[str]) -> Self:
         """Return the fleet of some products."""
         observed = {name: self.observed[name] for name in names}
         further = {name: self.further[name] for name in names if name in self.further}
-        return replace(self, observed=observed, further=further)
+        sheets = {name: self.sheets[name] for name in names if name in self.sheets}
+        return replace(self, observed=observed, further=further, sheets=sheets)
 
     def calibrated(
         self, names: Sequence[str], advance: Callable[[], Any] = lambda: None
@@ -323,7 +361,15 @@ class Fleet:
     def _singly(self, name: str) -> Drawn:
         """Return the posterior of a product."""
         (node,) = self.evaluator.nodes
-        evaluator = self.evaluator.observing({node.name: self.observed[name]})
+        sheet = self.sheets.get(name)
+        if sheet is None:
+            evaluator = self.evaluator.observing({node.name: self.observed[name]})
+        else:
+            metric = SummaryLikelihood(sheet)
+            evaluator = self.evaluator.observing({node.name: sheet.values}, metric)
+            epsilon = shared_epsilon(node.name, 1 / sheet.n)
+            of_sheet = replace(evaluator.nodes[0], epsilon=epsilon)
+            evaluator = replace(evaluator, nodes=(of_sheet,), has_graph=False)
         with designs_restored(evaluator.reweighted.values()):
             values, pareto_k, finding = self._samples(evaluator)
             draw, predicted = partial(draw_responses, evaluator), None
@@ -386,6 +432,16 @@ class SpecimenFleet(Fleet):
         parts = np.split(np.arange(ends[-1]), ends[:-1])
         return dict(zip(self.observed, parts, strict=True))
 
+    @cached_property
+    def _of_sheets(self) -> Fleet:
+        """The products with a data sheet, by the emulator of all products."""
+        (measurement,) = self.likelihood.measurements
+        simulator = EmulatedSimulator(self.likelihood, measurement)
+        sheet = next(iter(self.sheets.values()))
+        evaluator = Evaluator.of(model_with_sheet(self.evaluator.model, simulator, sheet))
+        fields = vars(super().part(list(self.sheets))) | {"evaluator": evaluator}
+        return Fleet(**{name: fields[name] for name in Fleet.__dataclass_fields__})
+
     def _likelihood(self, names: Sequence[str]) -> SpecimenLikelihood:
         """Return the likelihood of the specimens of some products, with their points."""
         rows = np.concatenate([self._rows[name] for name in names])
@@ -395,6 +451,9 @@ class SpecimenFleet(Fleet):
 
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
+        names = [name for name in names if name not in self.sheets]
+        if not names:
+            return {}
         likelihood = self._likelihood(names)
         sizes = [len(self.observed[name]) for name in names]
         posteriors = ProductPosteriors.of(self.evaluator, likelihood, sizes)
@@ -425,10 +484,11 @@ class SpecimenFleet(Fleet):
 
     def _singly(self, name: str) -> Drawn:
         """Return the posterior of a product."""
+        if name in self.sheets:
+            return self._of_sheets._singly(name)
         likelihood = self._likelihood([name])
         emulated = (EmulatedSimulator(likelihood, likelihood.measurements[0]),)
         evaluator = replace(self.evaluator, emulated=emulated, has_graph=False)
-        # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
         modes = modes_of(target.log_posterior, target.starts, target.scale)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
@@ -590,7 +650,7 @@ class Products(Tree):
             {name: ("product", values) for name, values in columns.items()},
             {"product": posterior["product"]},
         )
-        return table.merge(products.drop_vars("finding")).to_dataframe()
+        return table.merge(products.drop_vars(["finding", "data_sheet"], errors="ignore")).to_dataframe()
 
     def _tables(self) -> list[xr.Dataset]:
         """Return posteriors and products with dimensions that a selection has lost."""
@@ -610,8 +670,8 @@ class Products(Tree):
             for name in columns:
                 sd = f" ± {row[f'sd of {name}']:.2g}" if f"sd of {name}" in table else ""
                 number = row[name]
-                is_flag = isinstance(number, bool | np.bool_)
-                cells.append(str(bool(number)) if is_flag else f"{number:.4g}{sd}")
+                is_text = isinstance(number, bool | np.bool_ | str)
+                cells.append(str(number) if is_text else f"{number:.4g}{sd}")
             rows.append([str(product), *cells])
         pairs = zip(products["product"].values, products["finding"].values, strict=True)
         sentences = [f"{product}: {finding}" for product, finding in pairs if finding]
