@@ -310,7 +310,9 @@ class ExceedanceTable(Table):
         """Titles of columns with a verdict on each product, by coordinate."""
         titles = {"verdict": "requirement", "validity": "validity"}
         is_tested = (self["validity"] != "not tested").any()
-        return {k: t for k, t in titles.items() if k in self.coords and (k != "validity" or is_tested)}
+        return {
+            k: t for k, t in titles.items() if k in self.coords and (k != "validity" or is_tested)
+        }
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._finding import counted
-from prbayes._validate import Floats, Indices, Labels, called, plain_text, wrong_type
+from prbayes._validate import Floats, Indices, Labels, plain_text, wrong_type
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -23,9 +23,9 @@ from prbayes.plots.canvas import (
     panels,
     refuse_labels,
     round_ticks,
+    with_label,
 )
 from prbayes.plots.selection import Coords, FilterVars, VarNames, select_variables, subset
-from prbayes.response.outputs import with_unit
 from prbayes.validation.area_test import ValidityTest
 
 if TYPE_CHECKING:
@@ -121,7 +121,8 @@ def plot_products(
             )
         _label_rows(axis, texts, verdicts)
         unit = str(panel["unit"].values) if "unit" in panel.coords else ""
-        axis.set_xlabel(named(name, labels) if labels else with_unit(name, unit))
+        interval = f"{percentage(table.attrs['prob'])} interval"
+        axis.set_xlabel(f"{with_label(name, unit, labels or {})}\n{quantities[0]}, {interval}")
         axis.set_xticks(*round_ticks(*axis.get_xlim()))
         axis.grid(visible=True, axis="x", color=PALE, alpha=0.3, linewidth=0.6)
     return finish(figure)
@@ -155,7 +156,8 @@ def _checked(table: Any) -> xr.Dataset:
         raise wrong_type(
             table, "plot_products", "the table of prb.population or prb.exceedance of a fleet"
         )
-    return table
+    checked: xr.Dataset = table
+    return checked
 
 
 def _by_product(table: xr.Dataset) -> xr.Dataset:
@@ -198,15 +200,16 @@ def _draw_quantity(axis: Axes, panel: xr.Dataset, quantity: str, verdicts: Any) 
     lower, upper, estimate = (of_quantity[key].values for key in ("lower", "upper", "estimate"))
     rows = _rows(estimate)
     width = 2.5 if len(rows) <= _NAMED else 1.0
-    text = f"{quantity} with {percentage(panel.attrs.get('prob', 0.89))} interval"
     is_tested = bool((verdicts != "not tested").any())
     for verdict, color in _COLORS.items():
         mask = (verdicts == verdict) & np.isfinite(estimate)
         if mask.any():
-            label = f"{text}, {verdict}" if is_tested else text
+            label = verdict if is_tested else None
             ends = rows[mask], lower[mask], upper[mask]
             axis.hlines(*ends, color=color, linewidth=width, gid="interval")
-            axis.scatter(estimate[mask], rows[mask], 6 * width, color=color, label=label, gid=verdict)
+            axis.scatter(
+                estimate[mask], rows[mask], 6 * width, color=color, label=label, gid=verdict
+            )
     if "requirement" in panel.attrs and quantity == "probability":
         required = float(panel.attrs["requirement"])
         axis.axvline(required, color=PALE, linestyle="--", label="requirement", gid="requirement")
@@ -227,4 +230,3 @@ def _label_rows(axis: Axes, texts: Sequence[str], verdicts: Any) -> None:
         axis.set_ylabel(f"{counted(len(texts), 'product')}, the worst on top")
     axis.set_yticks(rows[shown], [texts[row] for row in shown])
     axis.set_ylim(-0.7, len(texts) - 0.3)
-

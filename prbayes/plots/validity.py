@@ -81,7 +81,7 @@ def plot_validity(
         if is_fleet(tests):
             return plot_tests(of_products, pc_kwargs)
         tests = of_products
-    by_name = dict(tests) if isinstance(tests, Mapping) else {"": tests}
+    by_name: dict[str, Any] = dict(tests) if isinstance(tests, Mapping) else {"": tests}
     if not by_name or not all(isinstance(test, ValidityTest) for test in by_name.values()):
         kinds = {type(test).__name__ for test in by_name.values()}
         got = ", ".join(sorted(kinds)) or "nothing"

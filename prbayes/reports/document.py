@@ -156,17 +156,16 @@ class Report:
                 f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
             )
         contents = tuple(sections)
-        if not contents and is_fleet(posterior):
+        fleet: Any = posterior
+        if not contents and is_fleet(fleet):
             others = {
                 "optimum": optimum,
                 "validity": validity,
                 "comparison": comparison,
                 "validation": validation,
             }
-            contents = fleet_sections(
-                posterior, model, others, decision, labels, pictures=pictures
-            )
-            attrs = posterior["posterior"].attrs
+            contents = fleet_sections(fleet, model, others, decision, labels, pictures=pictures)
+            attrs = fleet["posterior"].attrs
             date = str(attrs.get("created_at", ""))[:10] if date is None else date
             note = _note(attrs, INTERVAL) if note is None else note
         elif not contents:

@@ -118,7 +118,7 @@ def _verdict(fleet: xr.DataTree) -> Section:
             f"Of valid products about {alpha * n_tested:.2g} would be rejected at the level of "
             f"{percentage(alpha)}. Do not use the predictions of rejected products."
         )
-    findings = np.atleast_1d(fleet["products"]["finding"].values).tolist()
+    findings = fleet["products"].to_dataset()["finding"].values.tolist()
     n_found = sum(bool(text) for text in findings) - counts["failed"]
     reported = {
         "not tested": counts["not tested"],
@@ -152,7 +152,7 @@ def _rows(
         row["finding"] = "yes" if findings[k] else ""
         rows.append(row)
     for question, risk in decisions.items():
-        for k, row in enumerate(rows):
+        for row in rows:
             of_product = risk.sel(product=row["product"])
             row |= _risk(question, of_product)
     keys = np.zeros(len(names))
@@ -176,7 +176,9 @@ def _sizes(fleet: xr.DataTree) -> list[int]:
     """Return the number of specimens of each product."""
     (data,) = fleet["observed_data"].data_vars.values()
     measured = data.transpose("product", ...).notnull().values
-    return [int(of_product.reshape(len(of_product), -1).any(axis=1).sum()) for of_product in measured]
+    return [
+        int(of_product.reshape(len(of_product), -1).any(axis=1).sum()) for of_product in measured
+    ]
 
 
 def _risk(question: str, table: xr.Dataset) -> dict[str, str]:
@@ -204,7 +206,7 @@ def _about(rows: Sequence[Mapping[str, Any]], table: xr.Dataset | None) -> str:
 
 def _findings(fleet: xr.DataTree, decisions: Mapping[str, xr.Dataset], most: int = 40) -> list[str]:
     """Return the findings of the products, at most a page."""
-    texts = np.atleast_1d(fleet["products"]["finding"].values).tolist()
+    texts = fleet["products"].to_dataset()["finding"].values.tolist()
     pairs = zip(product_names(fleet), texts, strict=True)
     lines = [f"{name}: {text.removeprefix(f'{name}: ')}" for name, text in pairs if text]
     for question, table in decisions.items():

@@ -127,7 +127,10 @@ class Diagnosis:
             xr.Dataset(),
             findings_together(remarks),
             tuple(dict.fromkeys(text for part in results.values() for text in part.untested)),
-            {name: replace(results.get(name, none), findings=findings[name]) for name in parts.names},
+            {
+                name: replace(results.get(name, none), findings=findings[name])
+                for name in parts.names
+            },
         )
 
     @property

@@ -179,12 +179,12 @@ class Individuals(Tree):
             )
             for name in parts.first.children
         }
-        dims = {name: ("product", *x.dims[3:]) for name, x in parts.first["posterior"].items()}
-        shrinkage = {
-            name: (dims[name], [t["posterior"][name].attrs["shrinkage"] for t in parts.results.values()])
-            for name, x in parts.first["posterior"].data_vars.items()
-            if "shrinkage" in x.attrs
-        }
+        shrinkage = {}
+        for key, x in parts.first["posterior"].data_vars.items():
+            if "shrinkage" in x.attrs:
+                dims = ("product", *(str(dim) for dim in x.dims[3:]))
+                trees = [tree["posterior"].to_dataset() for tree in parts.results.values()]
+                shrinkage[str(key)] = (dims, [tree[key].attrs["shrinkage"] for tree in trees])
         datasets["shrinkage"] = xr.Dataset(shrinkage, {"product": products})
         return cls.from_dict(datasets)
 

@@ -75,51 +75,53 @@ def each_product[**P, T: OfProducts](function: Callable[P, T]) -> Callable[P, T]
 
     @wraps(function)
     def mapped(*arguments: P.args, **keywords: P.kwargs) -> T:
-        fleet = arguments[0] if arguments else keywords.get("result")
+        fleet: Any = arguments[0] if arguments else keywords.get("result")
         if not is_fleet(fleet):
             return function(*arguments, **keywords)
-        others = [*arguments[1:], *(v for key, v in keywords.items() if key != "result")]
-        caller = f"prb.{function.__name__}"
-        _refuse_predictions(caller, others)
         call: Any = function
-        names, results, errors = product_names(fleet), {}, {}
-        failures, sheets = failed_products(fleet), data_sheets(fleet)
-        model = model_on_context(keywords.get("model"), caller)
+        caller = f"prb.{function.__name__}"
+        further = {key: value for key, value in keywords.items() if key != "result"}
+        _refuse_predictions(caller, [*arguments[1:], *further.values()])
+        model = model_on_context(further.get("model"), caller)
         require_of_model(fleet, model, caller, Level.POPULATIONS)
         evaluator_of_products(fleet, model)  # Products share their runs.
-        with progress("products", len(names)) as advance:
-            for name in names:
-                advance(1, "")
-                if name in failures:
-                    continue
-                product = fleet.sel(product=name)
-                try:
-                    with unreported(), shown(False):
-                        if arguments:
-                            results[name] = call(product, *arguments[1:], **keywords)
-                        else:
-                            results[name] = call(**{**keywords, "result": product})
-                except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
-                    errors[name] = error
-                except TypeError as error:  # The argument is wrong, or specimens are needed.
-                    if name not in sheets:
-                        raise
-                    errors[name] = error
-        if not results and errors:
-            raise next(iter(errors.values()))
-        if not results:
-            raise ValueError(
-                f"{caller}: got a fleet whose {len(names)} products all failed, "
-                "expected some with a posterior; the column finding of fleet['products'] has the "
-                "reasons"
-            )
-        failures |= {name: str(error) for name, error in errors.items()}
-        validity = validity_verdicts(fleet)
-        return type(next(iter(results.values()))).of_products(
-            ProductResults(names, results, failures, validity)
+        parts: ProductResults[T] = _results_of(
+            fleet, lambda product: call(product, *arguments[1:], **further), caller
         )
+        return type(parts.first).of_products(parts)
 
     return mapped
+
+
+def _results_of(fleet: Any, call: Callable[[Any], Any], caller: str) -> ProductResults[Any]:
+    """Return the results of a function for the products of a fleet; raise if there is none."""
+    names, sheets = product_names(fleet), data_sheets(fleet)
+    results: dict[str, Any] = {}
+    errors: dict[str, Exception] = {}
+    failures = failed_products(fleet)
+    with progress("products", len(names)) as advance:
+        for name in names:
+            advance(1, "")
+            if name in failures:
+                continue
+            try:
+                with unreported(), shown(False):
+                    results[name] = call(fleet.sel(product=name))
+            except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+                errors[name] = error
+            except TypeError as error:  # The argument is wrong, or specimens are needed.
+                if name not in sheets:
+                    raise
+                errors[name] = error
+    if not results and errors:
+        raise next(iter(errors.values()))
+    if not results:
+        raise ValueError(
+            f"{caller}: got a fleet whose {len(names)} products all failed, expected some with a "
+            "posterior; the column finding of fleet['products'] has the reasons"
+        )
+    failures |= {name: str(error) for name, error in errors.items()}
+    return ProductResults(names, results, failures, validity_verdicts(fleet))
 
 
 def _refuse_predictions(caller: str, arguments: Sequence[Any]) -> None:
@@ -158,9 +160,9 @@ def joined_table(parts: ProductResults[Any], by_product: Sequence[str] = ()) -> 
         values = {name: part.attrs[key] for name, part in parts.results.items()}
         coords[key] = [values.get(name, empty) for name in parts.names]
     together = report(*findings_together(findings))
-    return table.assign_coords({key: ("product", values) for key, values in coords.items()}).assign_attrs(
-        attrs | {"findings": as_json(together)}
-    )
+    return table.assign_coords(
+        {key: ("product", values) for key, values in coords.items()}
+    ).assign_attrs(attrs | {"findings": as_json(together)})
 
 
 def findings_together(findings: Mapping[str, Sequence[Finding]], most: int = 3) -> Findings:
@@ -197,7 +199,9 @@ def failed_products(fleet: Any) -> dict[str, str]:
     is_missing = np.atleast_1d(first.isnull().all(other).values)
     reasons = np.atleast_1d(fleet["products"]["finding"].values).tolist()
     rows = zip(product_names(fleet), reasons, is_missing, strict=True)
-    return {name: str(reason).removeprefix(f"{name}: ") for name, reason, is_failed in rows if is_failed}
+    return {
+        name: str(reason).removeprefix(f"{name}: ") for name, reason, is_failed in rows if is_failed
+    }
 
 
 def validity_verdicts(fleet: Any) -> list[str]:

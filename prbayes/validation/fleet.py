@@ -111,9 +111,9 @@ def calibrate_each(
         both of one product, for all functions that take a result. Group ``products``, by product:
         ``pareto_k`` of importance sampling (NaN for another sampler), ``finding`` (why it failed,
         which specimens no inputs reproduce, populations without a response, or modes of the
-        posterior; else an empty text), ``data_sheet`` as JSON if there is one, and with ``validation`` the ``statistic``,
-        ``critical_value``, ``p_value`` and
-        ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
+        posterior; else an empty text), ``data_sheet`` as JSON, and with ``validation`` the
+        ``statistic``, ``critical_value``, ``p_value`` and ``rejected`` of its validity test. Of
+        many valid products the share alpha is rejected. Group ``validity``: the u-values.
 
     Raises
     ------
@@ -346,7 +346,7 @@ class Fleet:
     def _tested(self, name: str, drawn: Drawn) -> Calibration:
         """Return the posterior of a product with its validity test."""
         result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
-        if name not in self.further:
+        if name not in self.further or drawn.predicted is None:
             return result
         null = PosteriorNull(999)
         test = area_test(
@@ -616,7 +616,9 @@ def tests_of_products(result: Any) -> dict[str, ValidityTest]:
         if n:
             of_test = {key: array[row, :n] for key, array in arrays.items()}
             tests[name] = ValidityTest(
-                *(float(products[key][row]) for key in ("statistic", "critical_value", "p_value")),
+                statistic=float(products["statistic"][row]),
+                critical_value=float(products["critical_value"][row]),
+                p_value=float(products["p_value"][row]),
                 alpha=float(products.attrs["alpha"]),
                 null=str(values.attrs["null"]),
                 folded=False,
@@ -650,7 +652,9 @@ class Products(Tree):
             {name: ("product", values) for name, values in columns.items()},
             {"product": posterior["product"]},
         )
-        return table.merge(products.drop_vars(["finding", "data_sheet"], errors="ignore")).to_dataframe()
+        return table.merge(
+            products.drop_vars(["finding", "data_sheet"], errors="ignore")
+        ).to_dataframe()
 
     def _tables(self) -> list[xr.Dataset]:
         """Return posteriors and products with dimensions that a selection has lost."""
