@@ -672,6 +672,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "plots.plot_responses": Row(before=(*BEFORE, {"mu": "a"})),
     "plots.plot_stages": Row(posterior=BY_NAME["result"]),
     "plots.plot_comparison": Row(comparison=(xr.Dataset(), optimum, posterior)),
+    "plots.plot_products": Row(table=(xr.Dataset(), optimum, comparison)),
     "plots.plot_validity": Row(tests=({}, {"a": 3}, comparison)),
 }
 

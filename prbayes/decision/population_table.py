@@ -348,9 +348,9 @@ class PopulationTable(Table):
             rows.append([with_unit(name, unit), *shown])
         header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
         if "validity" in self.coords and (self["validity"] != "not tested").any():
-            others = [dim for dim in self["estimate"].dims if dim != "quantity"]
+            more = [dim for dim in self["estimate"].dims if dim not in ("name", "quantity")]
             verdicts, _ = xr.broadcast(self["validity"], self["estimate"].isel(quantity=0))
-            column = verdicts.transpose(*others).values.ravel().tolist()
+            column = verdicts.transpose("name", *more).values.ravel().tolist()
             header.append("validity")
             rows = [[*row, verdict] for row, verdict in zip(rows, column, strict=True)]
         sentences = sentences_of(self.attrs)

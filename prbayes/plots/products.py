@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 # Colour of a product by the verdict of its validity test
 _COLORS = {"rejected": VERMILION, "not rejected": BLUE, "not tested": GREY}
-# Number of products that have room for their names
-_NAMED = 45
 
 
 def plot_products(
@@ -96,7 +94,7 @@ def plot_products(
     ['B', 'A']
     """
     check_options(labels, pc_kwargs)
-    table = _by_product(subset(_checked(table), coords))
+    table = _by_quantity(subset(_table_of_fleet(table), coords))
     names = select_variables(table["name"].values.tolist(), var_names, filter_vars)
     products = [str(name) for name in table["product"].values]
     refuse_labels(labels, [*names, *products])
@@ -110,16 +108,22 @@ def plot_products(
     order = np.argsort(np.where(np.isnan(keys), np.inf, sign * keys), kind="stable")
     verdicts = np.asarray(table["validity"].values)[order]
     texts = [named(products[row], labels) for row in order]
-    figure, axes = panels(names, size=(5.2, _height(len(order))), pc_kwargs=pc_kwargs)
+    figure, axes = panels(names, size=(5.2, _height_of(len(order))), pc_kwargs=pc_kwargs)
     for name, axis in axes.items():
         panel = table.sel(name=name).isel(product=order)
-        _draw_quantity(axis, panel, quantities[0], verdicts)
+        _draw_products(axis, panel, quantities[0], verdicts)
         if "B-basis" in quantities and quantities[0] != "B-basis":
             values = panel["estimate"].sel(quantity="B-basis").values
             axis.scatter(
-                values, _rows(values), 30, color=ink(), marker="|", label="B-basis", gid="basis"
+                values,
+                _row_heights(values),
+                30,
+                color=ink(),
+                marker="|",
+                label="B-basis",
+                gid="basis",
             )
-        _label_rows(axis, texts, verdicts)
+        _label_products(axis, texts, verdicts)
         unit = str(panel["unit"].values) if "unit" in panel.coords else ""
         interval = f"{percentage(table.attrs['prob'])} interval"
         axis.set_xlabel(f"{with_label(name, unit, labels or {})}\n{quantities[0]}, {interval}")
@@ -132,7 +136,7 @@ def plot_tests(tests: Mapping[str, ValidityTest], pc_kwargs: Mapping[str, Any]) 
     """Draw the u-values of each test in a row, the smallest p-value on top."""
     order = sorted(tests, key=lambda name: tests[name].p_value)
     verdicts = np.array(["rejected" if tests[name].rejected else "not rejected" for name in order])
-    figure, axes = panels(["u"], size=(5.6, _height(len(order))), pc_kwargs=pc_kwargs)
+    figure, axes = panels(["u"], size=(5.6, _height_of(len(order))), pc_kwargs=pc_kwargs)
     axis = axes["u"]
     rows = np.arange(len(order) - 1.0, -1.0, -1.0)
     for verdict, color in _COLORS.items():
@@ -144,12 +148,12 @@ def plot_tests(tests: Mapping[str, ValidityTest], pc_kwargs: Mapping[str, Any]) 
                 np.concatenate(values), heights, 12, color=color, alpha=0.7, label=verdict, gid="u"
             )
     texts = [f"{name}, p = {tests[name].p_value:.2g}" for name in order]
-    _label_rows(axis, texts, verdicts)
+    _label_products(axis, texts, verdicts)
     axis.set(xlabel="u-values of the specimens of the test", xlim=(-0.02, 1.02))
     return finish(figure)
 
 
-def _checked(table: Any) -> xr.Dataset:
+def _table_of_fleet(table: Any) -> xr.Dataset:
     """Return the table of a fleet, or raise."""
     is_table = isinstance(table, xr.Dataset) and "product" in table.dims
     if not is_table or not {"estimate", "probability"} & set(table.data_vars):
@@ -160,7 +164,7 @@ def _checked(table: Any) -> xr.Dataset:
     return checked
 
 
-def _by_product(table: xr.Dataset) -> xr.Dataset:
+def _by_quantity(table: xr.Dataset) -> xr.Dataset:
     """Return estimate, lower and upper end, with dims (name, product, quantity)."""
     if "validity" not in table.coords:
         verdicts = np.full(table.sizes["product"], "not tested")
@@ -184,22 +188,22 @@ def _by_product(table: xr.Dataset) -> xr.Dataset:
     return flat.assign_coords(validity=table["validity"]).assign_attrs(table.attrs)
 
 
-def _height(n: int) -> float:
+def _height_of(n: int) -> float:
     """Return the height in inches of a panel with n rows."""
     return float(np.clip(1.4 + 0.19 * n, 2.2, 10.0))
 
 
-def _rows(values: Floats) -> Floats:
+def _row_heights(values: Floats) -> Floats:
     """Return the heights of rows; the first one is on top."""
     return np.arange(len(values) - 1.0, -1.0, -1.0)
 
 
-def _draw_quantity(axis: Axes, panel: xr.Dataset, quantity: str, verdicts: Any) -> None:
+def _draw_products(axis: Axes, panel: xr.Dataset, quantity: str, verdicts: Any) -> None:
     """Draw estimates and intervals, by verdict."""
     of_quantity = panel.sel(quantity=quantity)
     lower, upper, estimate = (of_quantity[key].values for key in ("lower", "upper", "estimate"))
-    rows = _rows(estimate)
-    width = 2.5 if len(rows) <= _NAMED else 1.0
+    rows = _row_heights(estimate)
+    width = 2.5 if len(rows) <= 45 else 1.0
     is_tested = bool((verdicts != "not tested").any())
     for verdict, color in _COLORS.items():
         mask = (verdicts == verdict) & np.isfinite(estimate)
@@ -215,18 +219,18 @@ def _draw_quantity(axis: Axes, panel: xr.Dataset, quantity: str, verdicts: Any) 
         axis.axvline(required, color=PALE, linestyle="--", label="requirement", gid="requirement")
 
 
-def _label_rows(axis: Axes, texts: Sequence[str], verdicts: Any) -> None:
+def _label_products(axis: Axes, texts: Sequence[str], verdicts: Any, most: int = 45) -> None:
     """Name the rows, or of many those that were rejected, as far as there is room."""
     rows = np.arange(len(texts) - 1.0, -1.0, -1.0)
     shown: Indices = np.arange(len(texts))
-    if len(texts) > _NAMED:
+    if len(texts) > most:
         shown = np.flatnonzero(verdicts == "rejected")
-        room = len(texts) / _NAMED
-        kept: list[int] = []
+        room = len(texts) / most
+        spaced: list[int] = []
         for row in shown.tolist():
-            if not kept or row - kept[-1] >= room:
-                kept.append(row)
-        shown = np.array(kept, dtype=np.intp)
+            if not spaced or row - spaced[-1] >= room:
+                spaced.append(row)
+        shown = np.array(spaced, dtype=np.intp)
         axis.set_ylabel(f"{counted(len(texts), 'product')}, the worst on top")
     axis.set_yticks(rows[shown], [texts[row] for row in shown])
     axis.set_ylim(-0.7, len(texts) - 0.3)

@@ -158,13 +158,16 @@ class Report:
         contents = tuple(sections)
         fleet: Any = posterior
         if not contents and is_fleet(fleet):
-            others = {
+            of_product = {
                 "optimum": optimum,
                 "validity": validity,
                 "comparison": comparison,
                 "validation": validation,
             }
-            contents = fleet_sections(fleet, model, others, decision, labels, pictures=pictures)
+            _refuse_beside_fleet(of_product)
+            contents = fleet_sections(
+                fleet, gather(model, labels=labels), decision, pictures=pictures
+            )
             attrs = fleet["posterior"].attrs
             date = str(attrs.get("created_at", ""))[:10] if date is None else date
             note = _note(attrs, INTERVAL) if note is None else note
@@ -269,6 +272,17 @@ class Report:
         text = html.escape(self._html(), quote=True)
         style = "width: 100%; height: 40rem; border: 0"
         return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
+
+
+def _refuse_beside_fleet(results: Mapping[str, Any]) -> None:
+    """Raise if a report of a whole fleet has results, by name, that belong to one product."""
+    for name, result in results.items():
+        if result is not None:
+            raise ValueError(
+                f"Report: {name}: got {called(result)} beside a whole fleet, expected posterior= "
+                "and decision= alone; the report of a product is that of "
+                "posterior=fleet.sel(product=...)"
+            )
 
 
 def _note(versions: Mapping[Any, Any], prob: float) -> str:

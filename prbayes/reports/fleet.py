@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Labels, called
+from prbayes._validate import called
 from prbayes.decision.population_table import population
 from prbayes.model.parameters import element_name
 from prbayes.plots.canvas import with_label
 from prbayes.plots.products import plot_products
 from prbayes.plots.validity import plot_validity
 from prbayes.reports.figures import Illustration, picture_of
-from prbayes.reports.material import Material, gather, kind_of_decision
+from prbayes.reports.material import Material, kind_of_decision
 from prbayes.reports.numbers import NOTHING, in_percent, rows_table
 from prbayes.reports.section import Section
 from prbayes.reports.sections import comparison_of_responses, model
@@ -38,48 +37,33 @@ _TESTS = Illustration(
     caption="The u-values of a right model are spread evenly from 0 to 1.",
 )
 # Verdicts, the worst first
-_ORDER = ("failed", "rejected", "not tested", "not rejected")
-_ON_PAGE_ONE = 25
+_WORST_FIRST = ("failed", "rejected", "not tested", "not rejected")
 
 
 def fleet_sections(
-    fleet: xr.DataTree,
-    model_of_fleet: pm.Model | None,
-    others: Mapping[str, Any],
-    decision: Any,
-    labels: Labels | None,
-    *,
-    pictures: bool,
+    fleet: xr.DataTree, m: Material, decision: Any, *, pictures: bool, most: int = 25
 ) -> tuple[Section, ...]:
-    """Return the sections of a report of a whole fleet.
-
-    ``others`` are further results of a report, which belong to one product.
-    """
-    given = [name for name, value in others.items() if value is not None]
-    if given:
-        raise ValueError(
-            f"Report: {given[0]}: got {called(others[given[0]])} beside a whole fleet, expected "
-            "posterior= and decision= alone; a product has its own report, of "
-            "posterior=fleet.sel(product=...)"
-        )
-    decisions = _decisions(decision)
-    m = gather(model_of_fleet, labels=labels)
+    """Return the sections of a report of a whole fleet, with the material of its model."""
+    decisions = _decisions_on_fleet(decision)
     table = None if m.model is None else population(fleet, model=m.model)
-    rows = _rows(fleet, table, decisions, m)
-    first = rows_table(rows[:_ON_PAGE_ONE])
+    rows = _rows_of_products(fleet, table, decisions, m)
+    first = rows_table(rows[:most])
     title = "Products, the worst first"
-    sections = [_verdict(fleet), Section(title, _about(rows, table), first, level=3)]
-    sections += _drawn(_FOREST, table, pictures and table is not None)
+    sections = [
+        _verdict_on_fleet(fleet),
+        Section(title, _about_products(len(rows), most, table), first, level=3),
+    ]
+    sections += _drawn_of_fleet(_FOREST, table, pictures and table is not None)
     sections += [Section("Test of the products", level=2)] if "validity" in fleet.children else []
-    sections += _drawn(_TESTS, fleet, pictures and "validity" in fleet.children)
+    sections += _drawn_of_fleet(_TESTS, fleet, pictures and "validity" in fleet.children)
     sections += [*model(m), *comparison_of_responses(m)]
-    sections.append(Section("Diagnostics", _findings(fleet, decisions)))
-    if len(rows) > _ON_PAGE_ONE:
+    sections.append(Section("Diagnostics", _findings_of_products(fleet, decisions)))
+    if len(rows) > most:
         sections += [Section("Appendix"), Section("All products", (), rows_table(rows), level=3)]
     return tuple(sections)
 
 
-def _drawn(illustration: Illustration, result: Any, is_requested: bool) -> list[Section]:
+def _drawn_of_fleet(illustration: Illustration, result: Any, is_requested: bool) -> list[Section]:
     """Return a picture, or why it could not be made."""
     if not is_requested:
         return []
@@ -89,7 +73,7 @@ def _drawn(illustration: Illustration, result: Any, is_requested: bool) -> list[
     return [Section(f"{illustration.title}: no picture", picture, level=3)]
 
 
-def _decisions(decision: Any) -> dict[str, xr.Dataset]:
+def _decisions_on_fleet(decision: Any) -> dict[str, xr.Dataset]:
     """Return the tables of exceedances by question, or raise."""
     tables = decision if isinstance(decision, Mapping) else {"decision": decision}
     if isinstance(decision, xr.Dataset):
@@ -103,10 +87,10 @@ def _decisions(decision: Any) -> dict[str, xr.Dataset]:
     return tables
 
 
-def _verdict(fleet: xr.DataTree) -> Section:
+def _verdict_on_fleet(fleet: xr.DataTree) -> Section:
     """Return how many products are rejected, have failed, or have findings."""
     verdicts = validity_verdicts(fleet)
-    counts = {name: verdicts.count(name) for name in _ORDER}
+    counts = {name: verdicts.count(name) for name in _WORST_FIRST}
     n_tested = counts["rejected"] + counts["not rejected"]
     title, mark = "Not tested", "open"
     text = []
@@ -131,7 +115,7 @@ def _verdict(fleet: xr.DataTree) -> Section:
     return Section(title, text, verdict=mark)
 
 
-def _rows(
+def _rows_of_products(
     fleet: xr.DataTree,
     table: xr.Dataset | None,
     decisions: Mapping[str, xr.Dataset],
@@ -142,7 +126,7 @@ def _rows(
     products = fleet["products"].to_dataset()
     findings = np.atleast_1d(products["finding"].values).tolist()
     sheets = data_sheets(fleet)
-    sizes = _sizes(fleet)
+    sizes = _numbers_of_specimens(fleet)
     rows: list[dict[str, Any]] = []
     for k, name in enumerate(names):
         n = f"sheet of {sheets[name].n}" if name in sheets else str(sizes[k])
@@ -154,7 +138,7 @@ def _rows(
     for question, risk in decisions.items():
         for row in rows:
             of_product = risk.sel(product=row["product"])
-            row |= _risk(question, of_product)
+            row |= _risk_of_product(question, of_product)
     keys = np.zeros(len(names))
     if table is not None:
         keys = table["estimate"].sel(quantity="B-basis").isel(name=0).values
@@ -167,21 +151,20 @@ def _rows(
                     value, interval = cells.get((of_row, quantity), (NOTHING, ""))
                     text = f"{value} ({interval})" if interval else value
                     row[f"{label}: {quantity}"] = text
-    ranks = [(_ORDER.index(v), not f) for v, f in zip(verdicts, findings, strict=True)]
+    ranks = [(_WORST_FIRST.index(v), not f) for v, f in zip(verdicts, findings, strict=True)]
     order = sorted(range(len(rows)), key=lambda k: (*ranks[k], np.nan_to_num(keys[k])))
     return [rows[k] for k in order]
 
 
-def _sizes(fleet: xr.DataTree) -> list[int]:
+def _numbers_of_specimens(fleet: xr.DataTree) -> list[int]:
     """Return the number of specimens of each product."""
     (data,) = fleet["observed_data"].data_vars.values()
-    measured = data.transpose("product", ...).notnull().values
-    return [
-        int(of_product.reshape(len(of_product), -1).any(axis=1).sum()) for of_product in measured
-    ]
+    outputs = [dim for dim in data.dims if dim not in ("product", data.dims[1])]
+    is_measured = data.notnull().any(outputs) if outputs else data.notnull()
+    return [int(n) for n in is_measured.sum(data.dims[1]).values.tolist()]
 
 
-def _risk(question: str, table: xr.Dataset) -> dict[str, str]:
+def _risk_of_product(question: str, table: xr.Dataset) -> dict[str, str]:
     """Return probability and verdict of a requirement for a product."""
     values = np.atleast_1d(table["probability"].values)
     if np.isnan(values).any():
@@ -192,10 +175,10 @@ def _risk(question: str, table: xr.Dataset) -> dict[str, str]:
     return {question: text}
 
 
-def _about(rows: Sequence[Mapping[str, Any]], table: xr.Dataset | None) -> str:
+def _about_products(n: int, most: int, table: xr.Dataset | None) -> str:
     """Return what the columns are."""
     prob = percentage(INTERVAL)
-    text = f"{min(len(rows), _ON_PAGE_ONE)} of {counted(len(rows), 'product')}. "
+    text = f"{min(n, most)} of {counted(n, 'product')}. "
     if table is None:
         return text + "Populations need the model, which was not given."
     return text + (
@@ -204,7 +187,9 @@ def _about(rows: Sequence[Mapping[str, Any]], table: xr.Dataset | None) -> str:
     )
 
 
-def _findings(fleet: xr.DataTree, decisions: Mapping[str, xr.Dataset], most: int = 40) -> list[str]:
+def _findings_of_products(
+    fleet: xr.DataTree, decisions: Mapping[str, xr.Dataset], most: int = 40
+) -> list[str]:
     """Return the findings of the products, at most a page."""
     texts = fleet["products"].to_dataset()["finding"].values.tolist()
     pairs = zip(product_names(fleet), texts, strict=True)

@@ -203,9 +203,7 @@ def gather(
         label: one_posterior(result, f"Report: {label}")
         for label, result in _by_label(posterior, "posterior").items()
     }
-    tests = _by_label(validity, "validity")
-    if validity is None:
-        tests = {k: t for r in posteriors.values() for k, t in tests_of_products(r).items()}
+    tests = _by_label(_tests_of(posteriors) if validity is None else validity, "validity")
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
     validations = _validations(validation)
@@ -254,6 +252,14 @@ def gather(
         validation=validations,
         labels=dict(labels or {}),
     )
+
+
+def _tests_of(posteriors: Mapping[str, Any]) -> dict[str, ValidityTest]:
+    """Return the validity tests that posteriors of products have."""
+    tests: dict[str, ValidityTest] = {}
+    for result in posteriors.values():
+        tests |= tests_of_products(result)
+    return tests
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:

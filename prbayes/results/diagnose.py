@@ -62,6 +62,7 @@ from prbayes.results.predict import RESULT, thetas_of, width_of_epsilon
 from prbayes.results.products import (
     ProductResults,
     each_product,
+    findings_of_calibration,
     findings_together,
     model_of_product,
     one_posterior,
@@ -272,6 +273,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     attrs = tree["posterior" if has_draws else "optimum"].attrs
     # The result has the findings of the run that made it.
     findings = from_json(str(attrs.get("findings", "[]")))
+    findings += tuple(f for pair in findings_of_calibration(result).values() for f in pair)
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
         reason = "refits need an optimum; look at prb.diagnose of prb.minimize"

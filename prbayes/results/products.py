@@ -49,6 +49,7 @@ class ProductResults[T]:
     results: Mapping[str, T]  # by product; some may have none
     failures: Mapping[str, str]  # reasons why products have no result
     validity: Sequence[str]  # verdict of the validity test of each product
+    calibration: Mapping[str, Findings]  # findings of the calibration by product
 
     @property
     def first(self) -> T:
@@ -121,7 +122,8 @@ def _results_of(fleet: Any, call: Callable[[Any], Any], caller: str) -> ProductR
             "posterior; the column finding of fleet['products'] has the reasons"
         )
     failures |= {name: str(error) for name, error in errors.items()}
-    return ProductResults(names, results, failures, validity_verdicts(fleet))
+    findings = findings_of_calibration(fleet)
+    return ProductResults(names, results, failures, validity_verdicts(fleet), findings)
 
 
 def _refuse_predictions(caller: str, arguments: Sequence[Any]) -> None:
@@ -152,6 +154,8 @@ def joined_table(parts: ProductResults[Any], by_product: Sequence[str] = ()) -> 
     )
     table = table.reindex(product=list(parts.names))
     findings = parts.findings(lambda part: from_json(part.attrs.get("findings", "[]")))
+    for name in parts.results:
+        findings[name] = (*parts.calibration.get(name, ()), *findings[name])
     texts = [" ".join(map(str, of_product)) for of_product in findings.values()]
     coords: dict[str, Any] = {"validity": parts.validity, "finding": texts}
     attrs = dict(parts.first.attrs)
@@ -169,7 +173,7 @@ def findings_together(findings: Mapping[str, Sequence[Finding]], most: int = 3) 
     """Return findings with the names of their products; one for each code that many have."""
     by_code: dict[str, list[tuple[str, Finding]]] = {}
     for name, of_product in findings.items():
-        for finding in of_product:
+        for finding in dict.fromkeys(of_product):
             by_code.setdefault(finding.code, []).append((name, finding))
     result = []
     for pairs in by_code.values():
@@ -192,11 +196,21 @@ def is_fleet(result: Any) -> bool:
     return bool(product_names(result)) and "product" in result["posterior"].dims
 
 
+def findings_of_calibration(result: Any) -> dict[str, Findings]:
+    """Return the findings of the products of a fleet, or of one, that have a posterior."""
+    if not product_names(result):
+        return {}
+    texts = np.atleast_1d(result["products"]["finding"].values).tolist()
+    pairs = zip(product_names(result), texts, strict=True)
+    page = "fleets.md#products-that-fail"
+    return {name: (Finding("product-finding", text, page),) for name, text in pairs if text}
+
+
 def failed_products(fleet: Any) -> dict[str, str]:
     """Return the reasons why products of a fleet have no draws."""
     first = next(iter(fleet["posterior"].data_vars.values()))
-    other = [dim for dim in first.dims if dim != "product"]
-    is_missing = np.atleast_1d(first.isnull().all(other).values)
+    of_draws = [dim for dim in first.dims if dim != "product"]
+    is_missing = np.atleast_1d(first.isnull().all(of_draws).values)
     reasons = np.atleast_1d(fleet["products"]["finding"].values).tolist()
     rows = zip(product_names(fleet), reasons, is_missing, strict=True)
     return {
@@ -330,7 +344,9 @@ def summary_from(text: str) -> Summary:
 def representative_specimens(summary: Summary, most: int = 32) -> Floats:
     """Return specimens that a data sheet may have, which show where runs are needed."""
     n = min(summary.n, most)
-    normal = summary.center + summary.unit * ndtri((np.arange(n) + 0.5) / n)
+    # A mean alone has no spread; the value only shows where runs are needed.
+    unit = summary.unit or 0.05 * abs(summary.center) or 1.0
+    normal = summary.center + unit * ndtri((np.arange(n) + 0.5) / n)
     return np.concatenate([normal, summary.order_statistics[:, 1]])
 
 
@@ -384,7 +400,10 @@ def evaluator_of_products(result: Any, model: pm.Model) -> Evaluator:
     (data,) = result["observed_data"].data_vars.values()
     data = data if "product" in data.dims else data.expand_dims("product")
     values = zip(product_names(result), data.transpose("product", ...).values, strict=True)
-    observed = {name: y[~np.isnan(y.reshape(len(y), -1)).all(axis=1)] for name, y in values}
+    observed = {}
+    for name, y in values:
+        is_missing = np.isnan(y).all(axis=tuple(range(1, y.ndim)))
+        observed[name] = y[~is_missing]
     observed |= {name: representative_specimens(x) for name, x in data_sheets(result).items()}
     return shared_runs(model, observed).evaluator
 

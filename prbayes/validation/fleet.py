@@ -170,21 +170,7 @@ def calibrate_each(
         (of_model,) = evaluator.likelihoods
         of_model.cache["emulation of a fleet"] = prepared(likelihood).emulation
         fleet = SpecimenFleet(**vars(fleet), likelihood=likelihood)
-    jobs = [names[first : first + 100] for first in range(0, len(names), 100)]
-    with shown(progressbar), progress("products", len(names)) as advance:
-        if executor is None:
-            parts = [fleet.calibrated(job, lambda: advance(1, "")) for job in jobs]
-        else:
-            import cloudpickle
-
-            futures = [
-                executor.submit(_calibrated, cloudpickle.dumps(fleet.part(job)), job)
-                for job in jobs
-            ]
-            for future in as_completed(futures):
-                advance(len(future.result()), "")
-            parts = [future.result() for future in futures]
-    rows = [row for part in parts for row in part]
+    rows = _calibrations(fleet, executor, progressbar)
     failures = [row.finding for row in rows if not row.values]
     if failures:
         text = (
@@ -204,6 +190,26 @@ def calibrate_each(
         texts = [summary_as_text(sheets[name]) if name in sheets else "" for name in names]
         tree["products"]["data_sheet"] = xr.DataArray(texts, dims="product")
     return tree
+
+
+def _calibrations(fleet: Fleet, executor: Executor | None, progressbar: bool) -> list[Calibration]:
+    """Return the calibrations of all products, 100 at a time."""
+    names = list(fleet.observed)
+    jobs = [names[first : first + 100] for first in range(0, len(names), 100)]
+    with shown(progressbar), progress("products", len(names)) as advance:
+        if executor is None:
+            parts = [fleet.calibrated(job, lambda: advance(1, "")) for job in jobs]
+        else:
+            import cloudpickle
+
+            futures = [
+                executor.submit(_calibrated, cloudpickle.dumps(fleet.part(job)), job)
+                for job in jobs
+            ]
+            for future in as_completed(futures):
+                advance(len(future.result()), "")
+            parts = [future.result() for future in futures]
+    return [row for part in parts for row in part]
 
 
 def _padded(name: str, observed: Mapping[str, Floats], outputs: Outputs) -> xr.Dataset:
@@ -245,11 +251,12 @@ def _read_sheets(caller: str, data: object, simulator: Any) -> dict[str, Summary
     """Return the data sheets of products, or raise if the simulator has none."""
     pairs = data.items() if isinstance(data, Mapping) else ()
     sheets = {str(name): x for name, x in pairs if isinstance(x, Summary)}
-    obstacle = ""
+    obstacle, metric = "", simulator.metric
+    has_settings = metric.by_specimen and metric != LogLikelihood()
     if np.ndim(simulator.observed) > 1:
         obstacle = "several outputs"
-    elif simulator.metric.by_specimen and simulator.metric != LogLikelihood():
-        obstacle = f"metric={simulator.metric!r:.60}"
+    elif has_settings:
+        obstacle = f"metric={metric!r:.60}"
     for name in sheets if obstacle else ():
         raise TypeError(
             f"{caller}: data_sets: {name}: got a prb.Summary for a simulator with {obstacle}, "
