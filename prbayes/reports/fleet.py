@@ -159,9 +159,9 @@ def _rows_of_products(
 def _numbers_of_specimens(fleet: xr.DataTree) -> list[int]:
     """Return the number of specimens of each product."""
     (data,) = fleet["observed_data"].data_vars.values()
-    outputs = [dim for dim in data.dims if dim not in ("product", data.dims[1])]
-    is_measured = data.notnull().any(outputs) if outputs else data.notnull()
-    return [int(n) for n in is_measured.sum(data.dims[1]).values.tolist()]
+    measured = data.transpose("product", ...).notnull().values
+    is_specimen = measured.any(axis=tuple(range(2, measured.ndim)))
+    return [int(n) for n in is_specimen.sum(axis=1)]
 
 
 def _risk_of_product(question: str, table: xr.Dataset) -> dict[str, str]:

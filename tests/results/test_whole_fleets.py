@@ -148,7 +148,8 @@ def test_a_data_sheet_has_no_individuals() -> None:
         assert np.isnan(means[x.size :]).all()
     rows = tree.to_dataframe()
     assert len(rows) == sum(x.size for x in X.values())
-    assert "specimen" in rows and "x[" in repr(tree)
+    assert "specimen" in rows
+    assert "x[" in repr(tree)
 
 
 def test_a_diagnosis_of_a_data_sheet_is_by_its_emulator() -> None:
@@ -232,7 +233,8 @@ def test_a_diagnosis_of_a_fleet_names_the_products() -> None:
     assert str(diagnosis.findings[0]) == "b: The family is wrong."
     assert repr(diagnosis).startswith("Diagnosis of 3 products, 2 with problems")
     assert diagnosis.to_dataframe()["product"].tolist() == ["b", "c"]
-    assert diagnosis.products["a"].ok and not diagnosis.ok
+    assert diagnosis.products["a"].ok
+    assert not diagnosis.ok
 
 
 def test_a_product_has_the_test_of_area_test() -> None:
@@ -240,8 +242,10 @@ def test_a_product_has_the_test_of_area_test() -> None:
     assert list(tests) == ["near", "far"]
     product = fleet().sel(product="far")
     (test,) = products_tests(product).values()
-    assert test.rejected and test.u_values.size == 8
-    assert test.u_values.min() >= 0 and test.u_values.max() <= 1
+    assert test.rejected
+    assert test.u_values.size == 8
+    assert test.u_values.min() >= 0
+    assert test.u_values.max() <= 1
     assert (test.envelope[0] <= test.envelope[1]).all()
     assert float(product["products"]["statistic"]) == test.statistic
     figure = prb.plots.plot_validity(product)
@@ -264,7 +268,8 @@ def test_the_report_of_a_fleet_has_the_worst_product_first(tmp_path: Any) -> Non
     assert first.title == "1 of 2 tested products rejected"
     assert first.verdict == "bad"
     rows = products.table.set_index("product")
-    assert rows.index.tolist()[0] == "far" and rows.index.tolist()[-1] == "near"
+    assert rows.index.tolist()[0] == "far"
+    assert rows.index.tolist()[-1] == "near"
     assert rows.loc["sheet", "specimens"] == "sheet of 20"
     assert rows.loc["far", "specimens"] == "9"
     assert rows.loc["far", "above 4"].endswith("not met")
@@ -272,7 +277,7 @@ def test_the_report_of_a_fleet_has_the_worst_product_first(tmp_path: Any) -> Non
     assert rows.loc["wide", "x (mm): B-basis"] == row["B-basis"][0]
     assert sum(section.picture is not None for section in report.sections) == 2
     assert "1 of 2 tested" in report.to_html(tmp_path / "fleet.html").read_text()
-    with pytest.raises(ValueError, match="validity: got ValidityTest.*beside a whole fleet"):
+    with pytest.raises(ValueError, match=r"validity: got ValidityTest.*beside a whole fleet"):
         prb.Report("Springs", validity=products_tests(fleet())["far"], **settings)
     without = prb.Report("Springs", posterior=fleet(), pictures=False)
     assert "Populations need the model" in without.sections[1].text[0]
