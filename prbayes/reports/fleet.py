@@ -131,10 +131,10 @@ def _rows_of_products(
     for k, name in enumerate(names):
         n = f"sheet of {sheets[name].n}" if name in sheets else str(sizes[k])
         p = float(np.atleast_1d(products["p_value"].values)[k]) if "p_value" in products else np.nan
-        row: dict[str, Any] = {"product": name, "validity": verdicts[k], "specimens": n}
-        row["p"] = "" if np.isnan(p) else f"{p:.2g}"
-        row["finding"] = "yes" if findings[k] else ""
-        rows.append(row)
+        validity = verdicts[k] if np.isnan(p) else f"{verdicts[k]}, p = {p:.2g}"
+        if findings[k] and verdicts[k] != "failed":
+            validity += "; finding"
+        rows.append({"product": name, "validity": validity, "specimens": n})
     for question, risk in decisions.items():
         for row in rows:
             of_product = risk.sel(product=row["product"])

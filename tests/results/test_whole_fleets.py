@@ -13,6 +13,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes._finding import Finding
+from prbayes.decision.population_table import PopulationTable
 from prbayes.results.diagnose import Diagnosis
 from prbayes.results.products import ProductResults, findings_together
 from prbayes.validation.fleet import tests_of_products as products_tests
@@ -130,6 +131,7 @@ def test_a_data_sheet_has_the_posterior_that_it_has_alone() -> None:
         assert float(got[name].std()) == pytest.approx(sd, rel=0.2)
 
 
+@pytest.mark.long
 def test_a_data_sheet_with_a_metric_of_distributions() -> None:
     model, _ = built(growth(X["near"]), prb.KullbackLeibler())
     data = {"near": growth(X["near"]), "sheet": SHEET}
@@ -213,6 +215,27 @@ def test_arguments_that_no_product_accepts_raise() -> None:
         prb.population(fleet(), model=other)
 
 
+def test_verdicts_are_in_the_rows_of_their_products() -> None:
+    parts = {}
+    for k, name in enumerate(["a", "b", "c"]):
+        values = (("name", "quantity"), np.array([[k + 1.0], [k + 11.0]]))
+        parts[name] = PopulationTable(
+            dict.fromkeys(("estimate", "lower", "upper"), values),
+            coords={"name": ["x", "z"], "quantity": ["mean"], "unit": ("name", ["mm", ""])},
+            attrs={"prob": 0.89, "interval": "posterior", "bounds": "lower"},
+        )
+    verdicts = ["rejected", "not tested", "not rejected"]
+    results = ProductResults(list(parts), parts, {}, verdicts, {})
+    shown = PopulationTable.of_products(results).to_view()
+    assert [(row[0], row[-1]) for row in shown.rows[:4]] == [
+        ("x[a] (mm)", "rejected"),
+        ("x[b] (mm)", "not tested"),
+        ("x[c] (mm)", "not rejected"),
+        ("z[a]", "rejected"),
+    ]
+    assert [row[1].split()[0] for row in shown.rows] == ["1", "2", "3", "11", "12", "13"]
+
+
 def test_findings_of_many_products_are_one() -> None:
     page = "fleets.md"
     findings = {f"p{i}": (Finding("rough", f"text {i}", page),) for i in range(5)}
@@ -272,6 +295,7 @@ def test_the_report_of_a_fleet_has_the_worst_product_first(tmp_path: Any) -> Non
     assert rows.index.tolist()[-1] == "near"
     assert rows.loc["sheet", "specimens"] == "sheet of 20"
     assert rows.loc["far", "specimens"] == "9"
+    assert rows["validity"].str.contains(", p = ").tolist() == [True, False, False, True]
     assert rows.loc["far", "above 4"].endswith("not met")
     row = next(cells for name, _, cells in table().rows() if name == "x[wide]")
     assert rows.loc["wide", "x (mm): B-basis"] == row["B-basis"][0]
