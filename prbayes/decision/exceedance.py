@@ -90,7 +90,8 @@ def exceedance(
     ----------
     result : Optimum or xarray.DataTree
         From `minimize`, with its sampling distribution; or with a ``posterior`` group, from any
-        sampler.
+        sampler, or from `calibrate_each`: the result then has the dimension product, and
+        ``verdict``, ``validity`` and ``finding`` as coordinates.
     response : callable
         As for `predict`; +inf is a specimen that failed, which is above every limit.
     limit : float

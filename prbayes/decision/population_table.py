@@ -88,9 +88,10 @@ def population(
         dimension. Variables ``estimate`` (at the optimum, or the posterior mean), ``lower`` and
         ``upper``; a coordinate ``unit`` by name. Quantities are the mean, ``sd``, ``cv`` (sd over
         absolute mean, without unit), quantiles, tolerance bounds, and the correlations of elements
-        of a vector. Tolerance bounds are estimates without an interval. Moments that do not exist,
-        as of a Cauchy distribution or of responses with failures (+inf), are NaN. It prints as
-        sentences; a notebook shows a table.
+        of a vector. Tolerance bounds are estimates without an interval. Of a fleet it has the
+        dimension product, with the coordinates ``validity`` and ``finding``. Moments that do not
+        exist, as of a Cauchy distribution or of responses with failures (+inf), are NaN. It prints
+        as sentences; a notebook shows a table.
 
     Raises
     ------

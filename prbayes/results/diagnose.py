@@ -210,7 +210,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     ----------
     result : xarray.DataTree or Optimum
         With a ``posterior`` group that has the model's free variables, from `sample_smc` or any
-        PyMC sampler; or the tree of an optimum.
+        PyMC sampler; a fleet from `calibrate_each`; or the tree of an optimum.
     model : pymc.Model, optional
         The one on the context by default. Results of `sample_smc` and `minimize`, also from a file,
         do not need it.

@@ -54,7 +54,8 @@ def individuals(
     ----------
     result : Optimum or xarray.DataTree
         From `minimize`; or with a ``posterior`` group, from `sample` or any sampler of PyMC. The
-        population of an optimum is taken as known: intervals are those of empirical Bayes.
+        population of an optimum is taken as known: intervals are those of empirical Bayes. Of a
+        fleet from `calibrate_each` the result has the dimension product.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default. Its simulators have the
         log-likelihood by specimen: metrics of distributions keep no record of a specimen.
