@@ -199,7 +199,9 @@ class Individuals(Tree):
             columns = {"mean": draws.mean(over), "sd": draws.std(over)}
             for key, level in (("lower", (1 - INTERVAL) / 2), ("upper", (1 + INTERVAL) / 2)):
                 columns[key] = draws.quantile(level, over, skipna=False).drop_vars("quantile")
-            table = xr.Dataset(columns).to_dataframe().reset_index()
+            numbers = xr.Dataset(columns)
+            dims = sorted(map(str, numbers.sizes), key=lambda dim: dim != "product")
+            table = numbers.to_dataframe(dims).reset_index()
             table.insert(0, "input", str(name))
             tables.append(table)
         table = pd.concat(tables, ignore_index=True)
