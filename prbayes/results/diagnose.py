@@ -271,9 +271,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     elif evaluator is not None and thetas is not None:
         coverage = _computed_coverage(evaluator, thetas)
     attrs = tree["posterior" if has_draws else "optimum"].attrs
-    # The result has the findings of the run that made it.
-    findings = from_json(str(attrs.get("findings", "[]")))
-    findings += tuple(f for pair in findings_of_calibration(result).values() for f in pair)
+    findings = _earlier_findings(result, attrs)
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
         reason = "refits need an optimum; look at prb.diagnose of prb.minimize"
@@ -310,6 +308,13 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
         checked.untested,
     )
+
+
+def _earlier_findings(result: object, attrs: Mapping[Any, Any]) -> Findings:
+    """Return the findings of the run that made a result, or of the calibration of a product."""
+    of_product = findings_of_calibration(result).values()
+    of_run = from_json(str(attrs.get("findings", "[]")))
+    return (*of_run, *(finding for findings in of_product for finding in findings))
 
 
 def _checked_tree(result: object, fewest: int = 2) -> xr.DataTree:

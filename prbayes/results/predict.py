@@ -197,7 +197,6 @@ def predict(
         plain_text(name, "name")
     calling = call_settings(executor, store, version)
     label = name or named_response(response, calling, "pass name=")
-    result = one_posterior(result, "prb.predict")
     model = evaluator_of_products(result, model_of(result, model, "prb.predict")).model
     sources = population_simulators(model)
     if max_lost is None:
@@ -751,7 +750,7 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
     """
     stored: Any = {}
     if isinstance(result, xr.DataTree) and "observed_data" in result:
-        stored = result["observed_data"]
+        stored = one_posterior(result, "prb.predict")["observed_data"]
     is_optimum = isinstance(result, Optimum)
     simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
     labels: dict[str, None] = {}  # labels in their order, each once
