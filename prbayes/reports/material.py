@@ -203,7 +203,7 @@ def gather(
         label: one_posterior(result, f"Report: {label}")
         for label, result in _by_label(posterior, "posterior").items()
     }
-    tests = _by_label(_tests_of(posteriors) if validity is None else validity, "validity")
+    tests = _by_label(validity, "validity") or _tests_of(posteriors)
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
     validations = _validations(validation)

@@ -162,6 +162,9 @@ def joined_table(parts: ProductResults[Any], by_product: Sequence[str] = ()) -> 
     for key in set(by_product) & set(attrs):
         empty = "" if isinstance(attrs.pop(key), str) else np.nan
         values = {name: part.attrs[key] for name, part in parts.results.items()}
+        if isinstance(parts.first.attrs[key], list):  # points of intervals, for each bound
+            empty = ""
+            values = {name: " to ".join(map(str, texts)) for name, texts in values.items()}
         coords[key] = [values.get(name, empty) for name in parts.names]
     together = report(*findings_together(findings))
     return table.assign_coords(

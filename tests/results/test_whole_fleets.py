@@ -89,6 +89,18 @@ def test_tables_have_the_verdicts_of_the_tests() -> None:
     assert "not met" in repr(risk())
 
 
+def test_intervals_have_their_points_by_product() -> None:
+    model, x = template()
+    two, load = fleet().isel(product=[0, 2]), prb.decision.Interval(0.9, 1.1)
+    got = prb.exceedance(
+        two, lambda x, load: load * x, 20.0, x, load, model=model, n_draws=20, steps=2
+    )
+    assert got["at"].values.tolist() == ["0.9 to 1.1", "0.9 to 1.1"]
+    assert got["probability"].sizes == {"product": 2, "bound": 2}
+    assert " to " in got.to_view().rows[0][1]
+    assert len(prb.plots.plot_products(got).axes) == 1
+
+
 def test_the_emulator_is_accurate_far_from_the_observed_values_of_the_model() -> None:
     """The runs of the model itself are near its own observed values."""
     model, x = built(growth(X["far"]))
