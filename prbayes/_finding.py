@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 from prbayes._validate import plain_text
 
 _log = logging.getLogger("prbayes")
+_unreported: ContextVar[bool] = ContextVar("unreported", default=False)
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,19 @@ def any_of(*remedies: str) -> str:
 
 def report(*findings: Finding, level: int = logging.WARNING) -> Findings:
     """Log findings with the logger ``prbayes``, each record with its ``code``; return them."""
-    for finding in findings:
+    for finding in () if _unreported.get() else findings:
         _log.log(level, "%s", finding, extra={"code": finding.code})
     return findings
+
+
+@contextmanager
+def unreported() -> Iterator[None]:
+    """Log no findings, because those of many results are reported together afterwards."""
+    token = _unreported.set(True)
+    try:
+        yield
+    finally:
+        _unreported.reset(token)
 
 
 def as_json(findings: Iterable[Finding]) -> str:

@@ -112,6 +112,14 @@ specimens = Later(lambda: prb.individuals(at_optimum(), n_draws=20))
 residuals = Later(lambda: prb.residuals(at_optimum(), n_draws=20))
 
 
+def populations_of_products() -> xr.Dataset:
+    """Return a table with the dimensions of that of a fleet."""
+    dims = ("product", "name", "quantity")
+    arrays = {key: (dims, np.ones((2, 1, 1))) for key in ("estimate", "lower", "upper")}
+    labels = {"product": ["A", "B"], "name": ["x"], "quantity": ["mean"], "unit": ("name", [""])}
+    return xr.Dataset(arrays, labels, {"prob": 0.89})
+
+
 def at_times() -> xr.DataTree:
     """Return inputs and readings of three specimens at four times."""
     draws, times = ("chain", "draw", "specimen"), {"time": np.arange(4.0)}
@@ -672,6 +680,9 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "plots.plot_responses": Row(before=(*BEFORE, {"mu": "a"})),
     "plots.plot_stages": Row(posterior=BY_NAME["result"]),
     "plots.plot_comparison": Row(comparison=(xr.Dataset(), optimum, posterior)),
+    "plots.plot_products": Row(
+        {"table": Later(populations_of_products)}, table=(xr.Dataset(), optimum, comparison)
+    ),
     "plots.plot_validity": Row(tests=({}, {"a": 3}, comparison)),
 }
 

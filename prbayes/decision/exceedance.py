@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pymc as pm
@@ -55,9 +55,11 @@ from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import call_settings
+from prbayes.results.products import ProductResults, each_product, joined_table
 
 
 @locked
+@each_product
 def exceedance(
     result: Optimum | xr.DataTree,
     response: Function,
@@ -89,7 +91,8 @@ def exceedance(
     ----------
     result : Optimum or xarray.DataTree
         From `minimize`, with its sampling distribution; or with a ``posterior`` group, from any
-        sampler.
+        sampler, or from `calibrate_each`: the result then has the dimension product, and
+        ``verdict``, ``validity`` and ``finding`` as coordinates.
     response : callable
         As for `predict`; +inf is a specimen that failed, which is above every limit.
     limit : float
@@ -266,10 +269,18 @@ class ExceedanceTable(Table):
     _parts = ("probability", "error", "lower", "upper", "draw", "prob", "limit", "response")
     _columns = ("probability", "error", "lower", "upper")
 
+    @classmethod
+    def of_products(cls, parts: ProductResults[Self]) -> Self:
+        """Return the tables of products as one with the dimension ``product``."""
+        table = joined_table(parts, ("verdict", "responses", "at"))
+        return cls(table.data_vars, coords=table.coords, attrs=table.attrs)
+
     def to_view(self) -> View:
         """Return what a reader sees."""
         attrs = self.attrs
         sides = "below" if attrs["below"] else "above"
+        if "product" in self.dims:
+            return self._view_of_products(f"{attrs['response']} is {sides} {attrs['limit']:g}")
         values = [f"{p:.2g}" for p in np.atleast_1d(self["probability"].values)]
         errors = [f"{error:.1g}" for error in np.atleast_1d(self["error"].values)]
         rows = [["standard error of the computation", *errors]]
@@ -287,6 +298,34 @@ class ExceedanceTable(Table):
             f"{float(self['lower']):.2g} to {float(self['upper']):.2g}"
         )
         return View(heading, rows=rows, sentences=sentences)
+
+    def _view_of_products(self, event: str) -> View:
+        """Return a row for each product."""
+        interval = f"{percentage(self.attrs['prob'])} interval"
+        columns = {"probability": self["probability"], "error": self["error"]}
+        rows = []
+        for place, product in enumerate(self["product"].values.tolist()):
+            of_product = {key: x.isel(product=place).values.ravel() for key, x in columns.items()}
+            low, high = (float(self[key][place]) for key in ("lower", "upper"))
+            probability = " to ".join(f"{p:.2g}" for p in of_product["probability"])
+            row = [str(product), probability, f"{low:.2g} to {high:.2g}"]
+            row.append(" to ".join(f"{error:.1g}" for error in of_product["error"]))
+            rows.append([*row, *(str(self[key][place].item()) for key in self._verdicts)])
+        header = ["", "probability", interval, "error", *self._verdicts.values()]
+        heading = f"Probability that {event}, of {len(rows)} products"
+        sentences = sentences_of(self.attrs)
+        if "requirement" in self.attrs:
+            sentences.insert(0, f"At most {self.attrs['requirement']:g} is required.")
+        return View(heading, header, rows, sentences)
+
+    @property
+    def _verdicts(self) -> dict[str, str]:
+        """Titles of columns with a verdict on each product, by coordinate."""
+        titles = {"verdict": "requirement", "validity": "validity"}
+        is_tested = (self["validity"] != "not tested").any()
+        return {
+            k: t for k, t in titles.items() if k in self.coords and (k != "validity" or is_tested)
+        }
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,11 @@ class PopulationReader:
         at = {str(v.name): self.at[v.name] for v in inputs.covariates if v.name in self.at}
         size = len(self._thetas)
         points = self._points | covariate_values(label, inputs, at, {}, size, has_runs=False)
-        moments = InputMoments(label, inputs, list(self.levels.values()))
+        functions, levels = self.populations.evaluator.functions, list(self.levels.values())
+        key = ("moments", dist, *levels)
+        if key not in functions:
+            functions[key] = InputMoments(label, inputs, levels)
+        moments = functions[key]
         arrays = []  # (k, q, elements): numbers of each group
         for group_points in points_by_group(inputs, points):
             arrays.append(moments.numbers([group_points[str(p.name)] for p in inputs.parents]))

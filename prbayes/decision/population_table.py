@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pymc as pm
@@ -23,6 +23,7 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import Groups
 from prbayes.response.outputs import with_unit
 from prbayes.results.predict import call_settings, width_of_epsilon
+from prbayes.results.products import ProductResults, each_product, joined_table
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
@@ -31,6 +32,7 @@ BASES = {"B-basis": 0.10, "A-basis": 0.01}
 
 
 @locked
+@each_product
 def population(
     result: Optimum | xr.DataTree,
     inputs: Any = None,
@@ -54,7 +56,7 @@ def population(
     Parameters
     ----------
     result : Optimum or xarray.DataTree
-        From `minimize`; or with a ``posterior`` group, from any sampler.
+        From `minimize`; or with a ``posterior`` group, from any sampler, or from `calibrate_each`.
     inputs : str, TensorVariable, Condition, xarray.DataArray, or a sequence of such, optional
         The name of an input, which is that of the ``.dist()`` or of the response's argument, of an
         element such as ``"x[0]"``, or a ``.dist()``; all inputs by default. A response is a
@@ -86,9 +88,10 @@ def population(
         dimension. Variables ``estimate`` (at the optimum, or the posterior mean), ``lower`` and
         ``upper``; a coordinate ``unit`` by name. Quantities are the mean, ``sd``, ``cv`` (sd over
         absolute mean, without unit), quantiles, tolerance bounds, and the correlations of elements
-        of a vector. Tolerance bounds are estimates without an interval. Moments that do not exist,
-        as of a Cauchy distribution or of responses with failures (+inf), are NaN. It prints as
-        sentences; a notebook shows a table.
+        of a vector. Tolerance bounds are estimates without an interval. Of a fleet it has the
+        dimension product, with the coordinates ``validity`` and ``finding``. Moments that do not
+        exist, as of a Cauchy distribution or of responses with failures (+inf), are NaN. It prints
+        as sentences; a notebook shows a table.
 
     Raises
     ------
@@ -283,21 +286,27 @@ class PopulationTable(Table):
             table.loc[is_pure, "unit"] = ""
         return table
 
+    @classmethod
+    def of_products(cls, parts: ProductResults[Self]) -> Self:
+        """Return the tables of products as one with the dimension ``product``."""
+        table = joined_table(parts)
+        return cls(table.data_vars, coords=table.coords, attrs=table.attrs)
+
     def rows(self) -> Iterator[tuple[str, str, dict[str, tuple[str, str]]]]:
         """Yield name, unit, and texts of estimate and interval by quantity, of each population."""
-        group_dims = [dim for dim in self["estimate"].dims if dim not in ("name", "quantity")]
-        stacked = self.stack(population=["name", *group_dims])
-        for place in range(stacked.sizes["population"]):
-            row = stacked.isel(population=place)
-            name, *labels = row["population"].item()
+        more = [str(dim) for dim in self["estimate"].dims if dim not in ("name", "quantity")]
+        names, quantities = (self[dim].values.tolist() for dim in ("name", "quantity"))
+        units = self["unit"].values.tolist() if "unit" in self.coords else [""] * len(names)
+        by_name = [self[key].transpose("name", *more, "quantity").values for key in _VARIABLES]
+        numbers = np.stack(by_name, axis=-1)  # (names, ..., quantities, 3)
+        labels = [self[dim].values.tolist() for dim in more]
+        for index in np.ndindex(numbers.shape[:-2]):
             cells = {}
-            for quantity in self["quantity"].values.tolist():
-                cell = row.sel(quantity=quantity)
-                values = [float(cell[key]) for key in _VARIABLES]
+            for quantity, values in zip(quantities, numbers[index].tolist(), strict=True):
                 if np.isfinite(values[0]):
                     cells[quantity] = _texts(values, 100.0 if quantity == "cv" else 1.0)
-            unit = str(self["unit"].sel(name=name).item()) if "unit" in self.coords else ""
-            yield element_name(name, labels), unit, cells
+            of_population = [texts[i] for texts, i in zip(labels, index[1:], strict=True)]
+            yield element_name(names[index[0]], of_population), units[index[0]], cells
 
     def sentences(self) -> list[str]:
         """Return a sentence for each population."""
@@ -326,7 +335,7 @@ class PopulationTable(Table):
 
     def __repr__(self) -> str:
         """Return a sentence for each population, or xarray's text for a selection."""
-        if not self._is_whole:
+        if not self._is_whole or "product" in self.dims:
             return super().__repr__()
         return "\n  ".join([f"{self._heading()}:", *self.sentences(), *sentences_of(self.attrs)])
 
@@ -339,6 +348,12 @@ class PopulationTable(Table):
             shown = [f"{value} ({interval})" if interval else value for value, interval in texts]
             rows.append([with_unit(name, unit), *shown])
         header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
+        if "validity" in self.coords and (self["validity"] != "not tested").any():
+            more = [dim for dim in self["estimate"].dims if dim not in ("name", "quantity")]
+            verdicts, _ = xr.broadcast(self["validity"], self["estimate"].isel(quantity=0))
+            column = verdicts.transpose("name", *more).values.ravel().tolist()
+            header.append("validity")
+            rows = [[*row, verdict] for row, verdict in zip(rows, column, strict=True)]
         sentences = sentences_of(self.attrs)
         return View(self._heading(), header, rows, sentences)
 

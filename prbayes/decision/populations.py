@@ -62,7 +62,7 @@ from prbayes.results.predict import (
     serving,
     thetas_of,
 )
-from prbayes.results.products import product_names
+from prbayes.results.products import evaluator_of_products, product_names
 
 _TAILS = "tails.md#both-families"  # page of the findings on families
 
@@ -101,7 +101,7 @@ class Populations:
             thetas = _sobol_thetas(result, n_draws, caller)
             evaluator = result.evaluator if model is result.model else Evaluator.of(model)
             return cls(result, evaluator, thetas, result.theta, caller, False, calling)
-        evaluator = Evaluator.of(model)
+        evaluator = evaluator_of_products(result, model)
         thetas = thetas_of(result, evaluator, n_draws, caller)
         center = np.median(thetas, axis=0)
         return cls(result, evaluator, thetas, center, caller, True, calling)

@@ -309,7 +309,7 @@ class SpecimenLikelihood:
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference by the model, because weak references have no pickle."""
-        derived = ("hyperparameters", "reading density", "updated")
+        derived = ("hyperparameters", "reading density", "updated", "products")
         cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
         return {**vars(self), "model": model, "cache": cache}
@@ -429,11 +429,13 @@ class SpecimenLikelihood:
         if is_same_model and is_same_data:
             return self
         prepared = self.cache.get("preparation")
+        emulation = prepared.emulation if prepared else self.shared_emulation
         return replace(
             self,
             measurements=changed,
             model=self.model if is_same_model else weakref.ref(model),
-            shared_emulation=prepared.emulation if prepared else self.shared_emulation,
+            # The emulator of a fleet is accurate at the specimens of all of its products.
+            shared_emulation=self.cache.get("emulation of a fleet", emulation),
         )
 
 

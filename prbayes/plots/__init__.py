@@ -9,6 +9,7 @@ from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.predictive_check import plot_predictive_check
+from prbayes.plots.products import plot_products
 from prbayes.plots.residuals import plot_residuals
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
@@ -24,6 +25,7 @@ __all__ = [
     "plot_posterior",
     "plot_prediction",
     "plot_predictive_check",
+    "plot_products",
     "plot_residuals",
     "plot_responses",
     "plot_sensitivity",

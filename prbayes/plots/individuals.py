@@ -123,6 +123,11 @@ def specimen_groups(individuals: object, coords: Coords | None) -> dict[str, xr.
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
+    if "product" in draws.dims:
+        raise ValueError(
+            f"individuals: got the specimens of {draws.sizes['product']} products, expected those "
+            "of one: prb.individuals(fleet.sel(product=...))"
+        )
     dims = {dim for group in groups.values() for dim in group.dims} - {"chain", "draw"}
     return {name: subset(group, coords, dims) for name, group in groups.items()}
 

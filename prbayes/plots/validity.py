@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 
 from prbayes._display import p_digits, percentage
 from prbayes._validate import Bools, Floats
@@ -20,7 +21,10 @@ from prbayes.plots.canvas import (
     panels,
 )
 from prbayes.plots.curves import staircase, with_gaps
+from prbayes.plots.products import plot_tests
+from prbayes.results.products import is_fleet
 from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.fleet import tests_of_products
 from prbayes.validation.pit import DIRECTION
 
 if TYPE_CHECKING:
@@ -28,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def plot_validity(
-    tests: ValidityTest | Mapping[str, ValidityTest],
+    tests: ValidityTest | Mapping[str, ValidityTest] | xr.DataTree,
     **pc_kwargs: Any,
 ) -> Figure:
     """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
@@ -40,8 +44,9 @@ def plot_validity(
 
     Parameters
     ----------
-    tests : ValidityTest or mapping
-        From `area_test`; several by name, one panel each.
+    tests : ValidityTest or mapping, or xarray.DataTree
+        From `area_test`; several by name, one panel each. Of a fleet from `calibrate_each` each
+        product has a row with its u-values, the smallest p-value on top.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, ``col_wrap`` panels in a row, and ``figure_kwargs`` for
         ``matplotlib.pyplot.figure``.
@@ -66,7 +71,12 @@ def plot_validity(
     'u-value'
     """
     check_options(None, pc_kwargs)
-    by_name = dict(tests) if isinstance(tests, Mapping) else {"": tests}
+    if isinstance(tests, xr.DataTree):
+        of_products = _tests_in(tests)
+        if is_fleet(tests):
+            return plot_tests(of_products, pc_kwargs)
+        tests = of_products
+    by_name: dict[str, Any] = dict(tests) if isinstance(tests, Mapping) else {"": tests}
     if not by_name or not all(isinstance(test, ValidityTest) for test in by_name.values()):
         kinds = {type(test).__name__ for test in by_name.values()}
         got = ", ".join(sorted(kinds)) or "nothing"
@@ -110,6 +120,17 @@ def plot_validity(
         title = f"{first}\n{second}: {verdict}"
         axis.set(xlabel="|2u - 1|" if test.folded else x, ylabel=y, title=title)
     return finish(figure)
+
+
+def _tests_in(fleet: xr.DataTree) -> dict[str, ValidityTest]:
+    """Return the tests of the products of a fleet, or raise if there is none."""
+    tests = tests_of_products(fleet)
+    if not tests:
+        raise ValueError(
+            "plot_validity: got a result without validity tests, expected a fleet of "
+            "prb.calibrate_each(..., validation=...)"
+        )
+    return tests
 
 
 def in_directions(test: ValidityTest) -> list[Floats]:

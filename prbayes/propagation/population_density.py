@@ -156,7 +156,8 @@ class ExponentialForm:
         points, or far from them, or invalid.
         """
         is_rounded = ~(np.abs(at_anchors).max(axis=1) < largest)
-        return np.where(is_rounded[:, None], 0.0, at_anchors) @ self.inverse, is_rounded
+        with np.errstate(over="ignore"):  # of populations far narrower than their distance
+            return np.where(is_rounded[:, None], 0.0, at_anchors) @ self.inverse, is_rounded
 
 
 @dataclass(eq=False)

@@ -15,6 +15,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import percentage
+from prbayes._stats import INTERVAL
 from prbayes._validate import (
     Labels,
     StrPath,
@@ -26,11 +27,13 @@ from prbayes._validate import (
     wrong_type,
 )
 from prbayes.optimize.optimum import Optimum
+from prbayes.reports.fleet import fleet_sections
 from prbayes.reports.material import date_of, gather, versions_of
 from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section, is_broad, kind_of
 from prbayes.reports.sections import sections_of
 from prbayes.response.store import replace_files
+from prbayes.results.products import is_fleet
 from prbayes.validation.area_test import ValidityTest
 
 # Markup of Markdown, or of HTML inside it (CommonMark 0.31, 2.4; tables and strikethrough of
@@ -78,7 +81,8 @@ class Report:
     optimum : Optimum or xarray.DataTree, or a mapping of such, optional
         From `minimize`, or its ``to_datatree()``; several by name.
     posterior : xarray.DataTree, or a mapping of such, optional
-        From `sample_smc`, `bootstrap` or a sampler of PyMC; also read from a file.
+        From `sample_smc`, `bootstrap` or a sampler of PyMC; also read from a file. A fleet from
+        `calibrate_each` gives a table of its products; `exceedance` of it goes into ``decision``.
     validity : ValidityTest, or a mapping of such, optional
         From `area_test`; several by name.
     comparison : xarray.Dataset, optional
@@ -152,17 +156,29 @@ class Report:
                 f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
             )
         contents = tuple(sections)
-        if not contents:
+        fleet: Any = posterior
+        if not contents and is_fleet(fleet):
+            of_product = {
+                "optimum": optimum,
+                "validity": validity,
+                "comparison": comparison,
+                "validation": validation,
+            }
+            _refuse_beside_fleet(of_product)
+            contents = fleet_sections(
+                fleet, gather(model, labels=labels), decision, pictures=pictures
+            )
+            attrs = fleet["posterior"].attrs
+            date = str(attrs.get("created_at", ""))[:10] if date is None else date
+            note = _note(attrs, INTERVAL) if note is None else note
+        elif not contents:
             material = gather(
                 model, optimum, posterior, validity, comparison, decision, validation, labels
             )
             contents = sections_of(material, pictures=pictures)
             date = date_of(material) if date is None else date
             if note is None and material.results:
-                names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
-                packages = versions_of(material).items()
-                parts = [f"{names[name]} {version}" for name, version in packages if name in names]
-                note = ", ".join([*parts, f"intervals of {percentage(material.prob)} probability"])
+                note = _note(versions_of(material), material.prob)
         for section in contents:
             if not isinstance(section, Section):
                 raise wrong_type(section, "Report: sections", "prb.reports.Section objects")
@@ -256,6 +272,27 @@ class Report:
         text = html.escape(self._html(), quote=True)
         style = "width: 100%; height: 40rem; border: 0"
         return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
+
+
+def _refuse_beside_fleet(results: Mapping[str, Any]) -> None:
+    """Raise if a report of a whole fleet has results, by name, that belong to one product."""
+    for name, result in results.items():
+        if result is not None:
+            raise ValueError(
+                f"Report: {name}: got {called(result)} beside a whole fleet, expected posterior= "
+                "and decision= alone; the report of a product is that of "
+                "posterior=fleet.sel(product=...)"
+            )
+
+
+def _note(versions: Mapping[Any, Any], prob: float) -> str:
+    """Return versions of packages, by their names, and the probability of intervals."""
+    names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
+    parts = []
+    for key, value in versions.items():
+        name = names.get(str(key).removesuffix("_version"))
+        parts += [f"{name} {value}"] if name else []
+    return ", ".join([*parts, f"intervals of {percentage(prob)} probability"])
 
 
 def _write(path: Path, text: str, pictures: Mapping[Path, bytes]) -> Path:

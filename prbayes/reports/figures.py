@@ -194,7 +194,7 @@ def pictures_of(m: Material) -> dict[str, list[Section]]:
     drawn: dict[str, list[Section]] = {}
     missing = []
     for name, request in requests(m).items():
-        picture = _picture(ILLUSTRATIONS[name], request)
+        picture = picture_of(ILLUSTRATIONS[name], request)
         if isinstance(picture, Section):
             drawn[name] = [picture]
         else:
@@ -211,7 +211,7 @@ def pictures_of(m: Material) -> dict[str, list[Section]]:
     return drawn
 
 
-def _picture(illustration: Illustration, request: Request) -> Section | str:
+def picture_of(illustration: Illustration, request: Request) -> Section | str:
     """Return a picture, or the reason why it is missing."""
     reason = request
     if not isinstance(request, str):

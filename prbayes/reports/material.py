@@ -33,6 +33,7 @@ from prbayes.results.compare import compare, estimates_in
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.results.products import model_of_product, one_posterior
 from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.fleet import tests_of_products
 from prbayes.validation.pit import Comparable, comparables, u_values
 
 
@@ -201,7 +202,7 @@ def gather(
         label: one_posterior(result, f"Report: {label}")
         for label, result in _by_label(posterior, "posterior").items()
     }
-    tests = _by_label(validity, "validity")
+    tests = _by_label(validity, "validity") or _tests_of(posteriors)
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
     validations = _validations(validation)
@@ -250,6 +251,14 @@ def gather(
         validation=validations,
         labels=dict(labels or {}),
     )
+
+
+def _tests_of(posteriors: Mapping[str, Any]) -> dict[str, ValidityTest]:
+    """Return the validity tests that posteriors of products have."""
+    tests: dict[str, ValidityTest] = {}
+    for result in posteriors.values():
+        tests |= tests_of_products(result)
+    return tests
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:

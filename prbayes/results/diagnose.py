@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import view, without_constructor
+from prbayes._display import View, view, without_constructor
 from prbayes._finding import Finding, Findings, counted, from_json
 from prbayes._stats import positive_scale
 from prbayes._validate import Floats, NamedArrays, wrong_type
@@ -59,7 +59,14 @@ from prbayes.results.likelihood_checks import (
     separate_modes,
 )
 from prbayes.results.predict import RESULT, thetas_of, width_of_epsilon
-from prbayes.results.products import model_of_product, one_posterior
+from prbayes.results.products import (
+    ProductResults,
+    each_product,
+    findings_of_calibration,
+    findings_together,
+    model_of_product,
+    one_posterior,
+)
 
 # noise of R-hat: with independent draws it exceeds 1 + _NOISE / (chains x draws) about once in a
 # thousand cases; the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, from 1500 to 4000
@@ -88,6 +95,8 @@ class Diagnosis:
         misfit.
     untested : tuple of str
         Tests of the log-likelihood by specimen that were not run, and why.
+    products : mapping of Diagnosis
+        Of a fleet, by product; its findings then have the names of the products.
 
     Examples
     --------
@@ -105,6 +114,25 @@ class Diagnosis:
     support: xr.Dataset = field(repr=False)
     remarks: Findings = ()
     untested: tuple[str, ...] = ()
+    products: Mapping[str, Diagnosis] = field(default_factory=dict)
+
+    @classmethod
+    def of_products(cls, parts: ProductResults[Diagnosis]) -> Diagnosis:
+        """Return the diagnoses of products as one."""
+        results = parts.results
+        findings = parts.findings(lambda part: part.findings)
+        remarks = {name: part.remarks for name, part in results.items()}
+        none = Diagnosis((), xr.Dataset())
+        return cls(
+            findings_together(findings),
+            xr.Dataset(),
+            findings_together(remarks),
+            tuple(dict.fromkeys(text for part in results.values() for text in part.untested)),
+            {
+                name: replace(results.get(name, none), findings=findings[name])
+                for name in parts.names
+            },
+        )
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -129,12 +157,22 @@ class Diagnosis:
         return "No problem was found."
 
     def __repr__(self) -> str:
-        return "\n".join([*(self.messages or [self.all_clear]), *self.notes, *self.untested])
+        lines = [*(self.messages or [self.all_clear]), *self.notes, *self.untested]
+        if not self.products:
+            return "\n".join(lines)
+        order = sorted(self.products, key=lambda name: -len(self.products[name].findings))
+        rows = [[name, ", ".join(f.code for f in self.products[name].findings)] for name in order]
+        n_bad = sum(not part.ok for part in self.products.values())
+        heading = f"Diagnosis of {counted(len(rows), 'product')}, {n_bad} with problems"
+        return str(View(heading, ["", "problems"], rows, lines))
 
     def to_dataframe(self) -> Any:
         """Return a row for each finding and remark: its code, kind and text."""
         import pandas as pd
 
+        if self.products:
+            parts = {name: part.to_dataframe() for name, part in self.products.items()}
+            return pd.concat(parts, names=["product", None]).reset_index("product")
         rows = [("finding", f.code, f.text) for f in self.findings]
         rows += [("remark", f.code, f.text) for f in self.remarks]
         return pd.DataFrame(rows, columns=["kind", "code", "text"])
@@ -152,6 +190,7 @@ class Diagnosis:
 
 
 @locked
+@each_product
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Report in sentences what is wrong with a result of any sampler or optimiser, and what to do.
 
@@ -171,7 +210,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     ----------
     result : xarray.DataTree or Optimum
         With a ``posterior`` group that has the model's free variables, from `sample_smc` or any
-        PyMC sampler; or the tree of an optimum.
+        PyMC sampler; a fleet from `calibrate_each`; or the tree of an optimum.
     model : pymc.Model, optional
         The one on the context by default. Results of `sample_smc` and `minimize`, also from a file,
         do not need it.
@@ -232,8 +271,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     elif evaluator is not None and thetas is not None:
         coverage = _computed_coverage(evaluator, thetas)
     attrs = tree["posterior" if has_draws else "optimum"].attrs
-    # The result has the findings of the run that made it.
-    findings = from_json(str(attrs.get("findings", "[]")))
+    findings = _earlier_findings(result, attrs)
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
         reason = "refits need an optimum; look at prb.diagnose of prb.minimize"
@@ -270,6 +308,13 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
         checked.untested,
     )
+
+
+def _earlier_findings(result: object, attrs: Mapping[Any, Any]) -> Findings:
+    """Return the findings of the run that made a result, or of the calibration of a product."""
+    of_product = findings_of_calibration(result).values()
+    of_run = from_json(str(attrs.get("findings", "[]")))
+    return (*of_run, *(finding for findings in of_product for finding in findings))
 
 
 def _checked_tree(result: object, fewest: int = 2) -> xr.DataTree:

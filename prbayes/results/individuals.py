@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
 from prbayes._display import Tree, View
+from prbayes._finding import report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, NamedArrays, Seed, positive_integer, seed_number
 from prbayes.model.locking import locked
@@ -20,10 +21,17 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
-from prbayes.results.products import model_of_product, one_posterior
+from prbayes.results.products import (
+    ProductResults,
+    each_product,
+    findings_together,
+    model_of_product,
+    one_posterior,
+)
 
 
 @locked
+@each_product
 def individuals(
     result: Optimum | xr.DataTree,
     *,
@@ -46,7 +54,8 @@ def individuals(
     ----------
     result : Optimum or xarray.DataTree
         From `minimize`; or with a ``posterior`` group, from `sample` or any sampler of PyMC. The
-        population of an optimum is taken as known: intervals are those of empirical Bayes.
+        population of an optimum is taken as known: intervals are those of empirical Bayes. Of a
+        fleet from `calibrate_each` the result has the dimension product.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default. Its simulators have the
         log-likelihood by specimen: metrics of distributions keep no record of a specimen.
@@ -151,6 +160,35 @@ class Individuals(Tree):
     __slots__ = ()
     _parts = ("posterior", "posterior_predictive", "observed_data")
 
+    @classmethod
+    def of_products(cls, parts: ProductResults[Self]) -> Self:
+        """Return the individuals of products as one with the dimension ``product``.
+
+        Specimens that a product lacks are NaN. The group ``shrinkage`` has that of each input.
+        """
+        report(*findings_together(parts.findings(lambda _: ())))
+        products = xr.DataArray(list(parts.results), dims="product", name="product")
+        datasets = {
+            name: xr.concat(
+                [tree[name].to_dataset() for tree in parts.results.values()],
+                products,
+                data_vars="all",
+                coords="minimal",
+                compat="override",
+                join="outer",
+                combine_attrs="drop_conflicts",
+            )
+            for name in parts.first.children
+        }
+        shrinkage = {}
+        for key, x in parts.first["posterior"].data_vars.items():
+            if "shrinkage" in x.attrs:
+                dims = ("product", *(str(dim) for dim in x.dims[3:]))
+                trees = [tree["posterior"].to_dataset() for tree in parts.results.values()]
+                shrinkage[str(key)] = (dims, [tree[key].attrs["shrinkage"] for tree in trees])
+        datasets["shrinkage"] = xr.Dataset(shrinkage, {"product": products})
+        return cls.from_dict(datasets)
+
     def to_dataframe(self) -> Any:
         """Return mean, sd and 89 % interval of each input of each specimen, a row for each."""
         import pandas as pd
@@ -160,11 +198,15 @@ class Individuals(Tree):
             over = ("chain", "draw")
             columns = {"mean": draws.mean(over), "sd": draws.std(over)}
             for key, level in (("lower", (1 - INTERVAL) / 2), ("upper", (1 + INTERVAL) / 2)):
-                columns[key] = draws.quantile(level, over).drop_vars("quantile")
-            table = xr.Dataset(columns).to_dataframe().reset_index()
+                columns[key] = draws.quantile(level, over, skipna=False).drop_vars("quantile")
+            numbers = xr.Dataset(columns)
+            dims = sorted(map(str, numbers.sizes), key=lambda dim: dim != "product")
+            table = numbers.to_dataframe(dims).reset_index()
             table.insert(0, "input", str(name))
             tables.append(table)
-        return pd.concat(tables, ignore_index=True)
+        table = pd.concat(tables, ignore_index=True)
+        # Of a fleet, rows without numbers are specimens that a product lacks.
+        return table.dropna(subset="mean") if "shrinkage" in self.children else table
 
     def to_view(self) -> View:
         """Return what a reader sees."""
@@ -184,6 +226,9 @@ class Individuals(Tree):
             for name, x in self["posterior"].data_vars.items()
             if "shrinkage" in x.attrs
         ]
+        if "shrinkage" in self.children:
+            of_inputs = self["shrinkage"].data_vars.items()
+            sentences = [f"{k}: shrinkage {x.min():.2f} to {x.max():.2f}." for k, x in of_inputs]
         header = ["", "mean", "sd", f"{INTERVAL:.0%} interval"]
         return View("Inputs of the measured specimens", header, rows, sentences)
 

@@ -62,7 +62,7 @@ from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, is_group, model_on_context
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
-from prbayes.results.products import one_posterior
+from prbayes.results.products import evaluator_of_products, one_posterior
 
 # Types that a function of results takes, for its errors.
 RESULT = (
@@ -197,7 +197,7 @@ def predict(
         plain_text(name, "name")
     calling = call_settings(executor, store, version)
     label = name or named_response(response, calling, "pass name=")
-    model = model_of(result, model, "prb.predict")
+    model = evaluator_of_products(result, model_of(result, model, "prb.predict")).model
     sources = population_simulators(model)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
@@ -771,7 +771,7 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
     """
     stored: Any = {}
     if isinstance(result, xr.DataTree) and "observed_data" in result:
-        stored = result["observed_data"]
+        stored = one_posterior(result, "prb.predict")["observed_data"]
     is_optimum = isinstance(result, Optimum)
     simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
     labels: dict[str, None] = {}  # labels in their order, each once

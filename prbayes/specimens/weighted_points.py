@@ -188,7 +188,8 @@ class ProductPoints:
         parameters = np.hstack([natural, np.ones((len(natural), 1))])
         parameters = parameters.reshape(len(products), -1, parameters.shape[1])
         single = self.single[products]
-        result = (parameters @ single[:, :, None])[..., 0]
+        with np.errstate(over="ignore"):  # of populations far narrower than their distance
+            result = (parameters @ single[:, :, None])[..., 0]
         k = self.several.shape[1]
         # Blocks of products and populations whose exponents stay in the cache of the processor.
         width = max(1, k * int(self.count[products].max()))

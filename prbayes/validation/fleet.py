@@ -33,13 +33,18 @@ from prbayes._validate import (
     share,
 )
 from prbayes.inference.checks.population import refuse_lost_specimens
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.summary import Summary
+from prbayes.metrics.summary_likelihood import SummaryLikelihood
+from prbayes.model.data_sheet import model_with_sheet
 from prbayes.model.description import labelled, versions
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator, with_data, with_unchanged_runs
-from prbayes.model.fingerprint import as_attributes, identity_of
+from prbayes.model.fingerprint import as_attributes, identity_from_attributes, identity_of
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
+from prbayes.model.random_variable import shared_epsilon
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.posterior.batch import ProductPosteriors
@@ -49,15 +54,19 @@ from prbayes.posterior.target import modes_of, specimen_target
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
-from prbayes.specimens.coordinates import Coordinates
-from prbayes.validation.area_test import excluded_failures
+from prbayes.results.products import (
+    product_names,
+    representative_specimens,
+    shared_runs,
+    summary_as_text,
+)
+from prbayes.validation.area_test import ValidityTest, area_test
 from prbayes.validation.nulls import PosteriorNull
-from prbayes.validation.pit import read_case
 
 
 @locked
 def calibrate_each(
-    data_sets: Mapping[str, ArrayLike],
+    data_sets: Mapping[str, ArrayLike | Summary],
     *,
     model: pm.Model | None = None,
     validation: Mapping[str, ArrayLike] | None = None,
@@ -75,9 +84,9 @@ def calibrate_each(
 
     Parameters
     ----------
-    data_sets : mapping of array_like, shape (N,) or (N, m)
+    data_sets : mapping of array_like, shape (N,) or (N, m), or of Summary
         Measured responses of each product by its name, in the form of ``observed`` of the
-        simulator; products may have different numbers of specimens.
+        simulator; products may have different numbers of specimens. A data sheet is a `Summary`.
     model : pymc.Model, optional
         A model with one `Simulator`, by default that on the context. Its own observed values matter
         by their form only.
@@ -102,9 +111,9 @@ def calibrate_each(
         both of one product, for all functions that take a result. Group ``products``, by product:
         ``pareto_k`` of importance sampling (NaN for another sampler), ``finding`` (why it failed,
         which specimens no inputs reproduce, populations without a response, or modes of the
-        posterior; else an empty text), and with ``validation`` the ``statistic``,
-        ``critical_value``, ``p_value`` and
-        ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
+        posterior; else an empty text), ``data_sheet`` as JSON, and with ``validation`` the
+        ``statistic``, ``critical_value``, ``p_value`` and ``rejected`` of its validity test. Of
+        many valid products the share alpha is rejected. Group ``validity``: the u-values.
 
     Raises
     ------
@@ -144,6 +153,7 @@ def calibrate_each(
         )
     _refuse_specimens_of_the_model(caller, simulator)
     event = np.shape(simulator.observed)[1:]
+    sheets = _read_sheets(caller, data_sets, simulator)
     observed = _read_data(data_sets, "data_sets", 2, event)
     further = {} if validation is None else _read_data(validation, "validation", 1, event)
     unknown = sorted(set(further) - set(observed))
@@ -154,10 +164,37 @@ def calibrate_each(
         )
     names = list(observed)
     settings = SamplingSettings(draws=draws, random_seed=seed)
-    fleet = Fleet(evaluator, observed, further, settings, alpha)
+    fleet = Fleet(evaluator, observed, further, settings, alpha, sheets)
     if evaluator.likelihoods:
-        likelihood = _common_likelihood(evaluator, observed)
+        (likelihood,) = shared_runs(model, observed).evaluator.likelihoods
+        (of_model,) = evaluator.likelihoods
+        of_model.cache["emulation of a fleet"] = prepared(likelihood).emulation
         fleet = SpecimenFleet(**vars(fleet), likelihood=likelihood)
+    rows = _calibrations(fleet, executor, progressbar)
+    failures = [row.finding for row in rows if not row.values]
+    if failures:
+        text = (
+            f"{len(failures)} of {len(names)} products failed; the column finding of the table has "
+            f"the reasons; the first: {failures[0]}"
+        )
+        report(Finding("failed-products", text, "fleets.md#products-that-fail"))
+    if len(failures) > len(names) / 2:
+        raise RuntimeError(
+            f"{caller}: {len(failures)} of {len(names)} products failed; {failures[0]}"
+        )
+    attrs = {"random_seed": str(seed), "alpha": alpha, **as_attributes(identity_of(model))}
+    tree = _tree(evaluator, names, rows, draws, attrs)
+    measured = {name: y[:0] if name in sheets else y for name, y in observed.items()}
+    tree["observed_data"] = _padded(simulator.name, measured, simulator.outputs)
+    if sheets:
+        texts = [summary_as_text(sheets[name]) if name in sheets else "" for name in names]
+        tree["products"]["data_sheet"] = xr.DataArray(texts, dims="product")
+    return tree
+
+
+def _calibrations(fleet: Fleet, executor: Executor | None, progressbar: bool) -> list[Calibration]:
+    """Return the calibrations of all products, 100 at a time."""
+    names = list(fleet.observed)
     jobs = [names[first : first + 100] for first in range(0, len(names), 100)]
     with shown(progressbar), progress("products", len(names)) as advance:
         if executor is None:
@@ -172,22 +209,7 @@ def calibrate_each(
             for future in as_completed(futures):
                 advance(len(future.result()), "")
             parts = [future.result() for future in futures]
-    rows = [row for part in parts for row in part]
-    failures = [row.finding for row in rows if not row.values]
-    if failures:
-        text = (
-            f"{len(failures)} of {len(names)} products failed; the column finding of the table has "
-            f"the reasons; the first: {failures[0]}"
-        )
-        report(Finding("failed-products", text, "fleets.md#products-that-fail"))
-    if len(failures) > len(names) / 2:
-        raise RuntimeError(
-            f"{caller}: {len(failures)} of {len(names)} products failed; {failures[0]}"
-        )
-    attrs = {"random_seed": str(seed), "alpha": alpha, **as_attributes(identity_of(model))}
-    tree = _tree(evaluator, names, rows, draws, attrs)
-    tree["observed_data"] = _padded(simulator.name, observed, simulator.outputs)
-    return tree
+    return [row for part in parts for row in part]
 
 
 def _padded(name: str, observed: Mapping[str, Floats], outputs: Outputs) -> xr.Dataset:
@@ -225,6 +247,25 @@ def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
         )
 
 
+def _read_sheets(caller: str, data: object, simulator: Any) -> dict[str, Summary]:
+    """Return the data sheets of products, or raise if the simulator has none."""
+    pairs = data.items() if isinstance(data, Mapping) else ()
+    sheets = {str(name): x for name, x in pairs if isinstance(x, Summary)}
+    obstacle, metric = "", simulator.metric
+    has_settings = metric.by_specimen and metric != LogLikelihood()
+    if np.ndim(simulator.observed) > 1:
+        obstacle = "several outputs"
+    elif has_settings:
+        obstacle = f"metric={metric!r:.60}"
+    for name in sheets if obstacle else ():
+        raise TypeError(
+            f"{caller}: data_sets: {name}: got a prb.Summary for a simulator with {obstacle}, "
+            "expected specimens: the statistics of a data sheet are those of one output, without "
+            "an error or limits of the readings; write a model for this product"
+        )
+    return sheets
+
+
 def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArrays:
     """Return the measured responses of each product, or raise."""
     if not isinstance(data, Mapping) or not data:
@@ -234,12 +275,19 @@ def _read_data(data: object, name: str, minimum: int, event: Shape) -> NamedArra
         )
     arrays = {}
     for product, values in data.items():
+        if isinstance(values, Summary) and name == "data_sets":
+            values = representative_specimens(values)
         array = real_array(values, f"{name}: {product}").astype(float)
         if array.ndim != 1 + len(event) or array.shape[1:] != event or len(array) < minimum:
             raise ValueError(
                 f"{name}: {product}: got shape {array.shape}, expected {('N', *event)} with at "
                 f"least {counted(minimum, 'specimen')}, in the form of the simulator's "
                 "observed values"
+            )
+        if str(product) in arrays:
+            raise ValueError(
+                f"{name}: got two products with the name {str(product)!r}, expected different "
+                "names; write texts in place of numbers"
             )
         arrays[str(product)] = array
     return arrays
@@ -251,8 +299,7 @@ class Calibration:
 
     values: Mapping[str, Floats]  # hyperparameters, (draws, *shape); empty after a failure
     pareto_k: float = np.nan
-    # Statistic, critical value and p-value of the validity test.
-    test: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    test: ValidityTest | None = None
     finding: str = ""  # reason of a failure, or a warning
 
 
@@ -275,12 +322,15 @@ class Fleet:
     further: Mapping[str, Floats]  # measured responses for validity tests, by product
     settings: SamplingSettings
     alpha: float
+    # Data sheets by product; ``observed`` has specimens that they may have.
+    sheets: Mapping[str, Summary]
 
     def part(self, names: Sequence[str]) -> Self:
         """Return the fleet of some products."""
         observed = {name: self.observed[name] for name in names}
         further = {name: self.further[name] for name in names if name in self.further}
-        return replace(self, observed=observed, further=further)
+        sheets = {name: self.sheets[name] for name in names if name in self.sheets}
+        return replace(self, observed=observed, further=further, sheets=sheets)
 
     def calibrated(
         self, names: Sequence[str], advance: Callable[[], Any] = lambda: None
@@ -303,13 +353,13 @@ class Fleet:
     def _tested(self, name: str, drawn: Drawn) -> Calibration:
         """Return the posterior of a product with its validity test."""
         result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
-        if name not in self.further:
+        if name not in self.further or drawn.predicted is None:
             return result
-        case = read_case(self.further[name], drawn.predicted)
-        report(*excluded_failures(case))
-        statistic = float(case.statistic(case.u_values()))
-        judgement = PosteriorNull(999).judge(case, statistic, self.alpha)
-        return replace(result, test=(statistic, judgement.critical_value, judgement.p_value))
+        null = PosteriorNull(999)
+        test = area_test(
+            self.further[name], drawn.predicted, alpha=self.alpha, null=null, progressbar=False
+        )
+        return replace(result, test=test)
 
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
@@ -318,7 +368,15 @@ class Fleet:
     def _singly(self, name: str) -> Drawn:
         """Return the posterior of a product."""
         (node,) = self.evaluator.nodes
-        evaluator = self.evaluator.observing({node.name: self.observed[name]})
+        sheet = self.sheets.get(name)
+        if sheet is None:
+            evaluator = self.evaluator.observing({node.name: self.observed[name]})
+        else:
+            metric = SummaryLikelihood(sheet)
+            evaluator = self.evaluator.observing({node.name: sheet.values}, metric)
+            epsilon = shared_epsilon(node.name, 1 / sheet.n)
+            of_sheet = replace(evaluator.nodes[0], epsilon=epsilon)
+            evaluator = replace(evaluator, nodes=(of_sheet,), has_graph=False)
         with designs_restored(evaluator.reweighted.values()):
             values, pareto_k, finding = self._samples(evaluator)
             draw, predicted = partial(draw_responses, evaluator), None
@@ -381,6 +439,16 @@ class SpecimenFleet(Fleet):
         parts = np.split(np.arange(ends[-1]), ends[:-1])
         return dict(zip(self.observed, parts, strict=True))
 
+    @cached_property
+    def _of_sheets(self) -> Fleet:
+        """The products with a data sheet, by the emulator of all products."""
+        (measurement,) = self.likelihood.measurements
+        simulator = EmulatedSimulator(self.likelihood, measurement)
+        sheet = next(iter(self.sheets.values()))
+        evaluator = Evaluator.of(model_with_sheet(self.evaluator.model, simulator, sheet))
+        fields = vars(super().part(list(self.sheets))) | {"evaluator": evaluator}
+        return Fleet(**{name: fields[name] for name in Fleet.__dataclass_fields__})
+
     def _likelihood(self, names: Sequence[str]) -> SpecimenLikelihood:
         """Return the likelihood of the specimens of some products, with their points."""
         rows = np.concatenate([self._rows[name] for name in names])
@@ -390,6 +458,9 @@ class SpecimenFleet(Fleet):
 
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
+        names = [name for name in names if name not in self.sheets]
+        if not names:
+            return {}
         likelihood = self._likelihood(names)
         sizes = [len(self.observed[name]) for name in names]
         posteriors = ProductPosteriors.of(self.evaluator, likelihood, sizes)
@@ -420,10 +491,11 @@ class SpecimenFleet(Fleet):
 
     def _singly(self, name: str) -> Drawn:
         """Return the posterior of a product."""
+        if name in self.sheets:
+            return self._of_sheets._singly(name)
         likelihood = self._likelihood([name])
         emulated = (EmulatedSimulator(likelihood, likelihood.measurements[0]),)
         evaluator = replace(self.evaluator, emulated=emulated, has_graph=False)
-        # Without the groups of ArviZ, which take as long as the draws.
         target = specimen_target(evaluator, None)
         modes = modes_of(target.log_posterior, target.starts, target.scale)
         chains = None if modes is None else importance_chains(target, modes, self.settings)
@@ -456,33 +528,6 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
 
     fleet: Fleet = cloudpickle.loads(pickled)
     return fleet.calibrated(names)
-
-
-def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
-    """Return the likelihood of the specimens of all products, with their points.
-
-    The limits of the errors of emulator and points are those for one product, which has fewer
-    specimens and a narrower population.
-    """
-    (likelihood,) = evaluator.likelihoods
-    (measurement,) = likelihood.measurements
-    stacked = np.concatenate(list(observed.values()))
-    sizes = [len(values) for values in observed.values()]
-    within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
-    narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
-    sampler = likelihood.density.sampler
-    coordinates = Coordinates.of_prior(likelihood.inputs, max(sizes), sampler=sampler)
-    fewer = np.sqrt(len(stacked) / np.median(sizes))
-    options = replace(
-        likelihood.options,
-        bias=likelihood.options.bias * fewer * narrower,
-        half_difference=likelihood.options.half_difference * fewer,
-    )
-    result = likelihood.observing({measurement.name: stacked})
-    result = replace(result, options=options, shared_emulation=None)
-    vars(result).update(density=likelihood.density, coordinates=coordinates)
-    prepared(result)
-    return result
 
 
 def _misfits(
@@ -527,16 +572,70 @@ def _tree(
         "pareto_k": [row.pareto_k for row in rows],
         "finding": [row.finding for row in rows],
     }
-    tests = np.array([row.test for row in rows])
-    if np.isfinite(tests).any():
-        for key, column in zip(("statistic", "critical_value", "p_value"), tests.T, strict=True):
-            columns[key] = column
-        columns["rejected"] = tests[:, 2] <= attrs["alpha"]
-    products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
     attrs = {**attrs, **versions()}
-    return Products.from_dict(
-        {"posterior": posterior.assign_attrs(attrs), "products": products.assign_attrs(attrs)}
-    )
+    groups = {"posterior": posterior.assign_attrs(attrs)}
+    tests = {name: row.test for name, row in zip(names, rows, strict=True) if row.test is not None}
+    if tests:
+        groups["validity"] = _validity(names, tests)
+        for key in ("statistic", "critical_value", "p_value"):
+            values = {name: getattr(test, key) for name, test in tests.items()}
+            columns[key] = [values.get(name, np.nan) for name in names]
+        columns["rejected"] = [name in tests and tests[name].rejected for name in names]
+    products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
+    groups["products"] = products.assign_attrs(attrs)
+    return Products.from_dict(groups)
+
+
+def _validity(names: Sequence[str], tests: Mapping[str, ValidityTest]) -> xr.Dataset:
+    """Return the u-values of the tests of products, filled up after the last one of each."""
+    size = max(test.u_values.size for test in tests.values())
+    columns: dict[str, list[Any]] = {}
+    for name in names:
+        test = tests.get(name)
+        n = 0 if test is None else test.u_values.size
+        numbers, texts = np.full((3, size), np.nan), np.full((2, size), "", dtype=object)
+        if test is not None:
+            numbers[:, :n] = test.u_values, *test.envelope
+            texts[:, :n] = test.conditions, test.specimens
+        for key, values in zip(_OF_TEST, [*numbers, *texts.astype(str)], strict=True):
+            columns.setdefault(key, []).append(values)
+    first = next(iter(tests.values()))
+    variables = {key: (("product", "value"), np.stack(rows)) for key, rows in columns.items()}
+    return xr.Dataset(variables, {"product": list(names)}, {"null": first.null})
+
+
+# Variables of the group ``validity``: of each u-value, and of each rank the envelope
+_OF_TEST = ("u", "lower", "upper", "condition", "specimen")
+
+
+def tests_of_products(result: Any) -> dict[str, ValidityTest]:
+    """Return the validity tests of the products of a fleet, or of a product; none without any."""
+    if not product_names(result) or "validity" not in result.children:
+        return {}
+    values, products = result["validity"].to_dataset(), result["products"].to_dataset()
+    if "product" not in values.dims:
+        values, products = values.expand_dims("product"), products.expand_dims("product")
+    arrays = {key: values[key].transpose("product", "value").values for key in _OF_TEST}
+    identity = identity_from_attributes(products.attrs)
+    tests = {}
+    for row, name in enumerate(product_names(result)):
+        n = int(np.isfinite(arrays["u"][row]).sum())
+        if n:
+            of_test = {key: array[row, :n] for key, array in arrays.items()}
+            tests[name] = ValidityTest(
+                statistic=float(products["statistic"][row]),
+                critical_value=float(products["critical_value"][row]),
+                p_value=float(products["p_value"][row]),
+                alpha=float(products.attrs["alpha"]),
+                null=str(values.attrs["null"]),
+                folded=False,
+                u_values=of_test["u"],
+                envelope=np.stack([of_test["lower"], of_test["upper"]]),
+                conditions=of_test["condition"],
+                specimens=of_test["specimen"],
+                identity=identity,
+            )
+    return tests
 
 
 class Products(Tree):
@@ -560,7 +659,9 @@ class Products(Tree):
             {name: ("product", values) for name, values in columns.items()},
             {"product": posterior["product"]},
         )
-        return table.merge(products.drop_vars("finding")).to_dataframe()
+        return table.merge(
+            products.drop_vars(["finding", "data_sheet"], errors="ignore")
+        ).to_dataframe()
 
     def _tables(self) -> list[xr.Dataset]:
         """Return posteriors and products with dimensions that a selection has lost."""
@@ -580,8 +681,8 @@ class Products(Tree):
             for name in columns:
                 sd = f" ± {row[f'sd of {name}']:.2g}" if f"sd of {name}" in table else ""
                 number = row[name]
-                is_flag = isinstance(number, bool | np.bool_)
-                cells.append(str(bool(number)) if is_flag else f"{number:.4g}{sd}")
+                is_text = isinstance(number, bool | np.bool_ | str)
+                cells.append(str(number) if is_text else f"{number:.4g}{sd}")
             rows.append([str(product), *cells])
         pairs = zip(products["product"].values, products["finding"].values, strict=True)
         sentences = [f"{product}: {finding}" for product, finding in pairs if finding]

@@ -309,10 +309,10 @@ def table(without: int | None = None) -> Any:
 
 
 def product(select: str = "fleet") -> Any:
-    """Return the table of a population from a fleet, or from a product of it."""
+    """Return the table of a comparison from a fleet, or from a product of it."""
     model = model_of(population)
     fleet = prb.calibrate_each({"A": DATA, "B": DATA + 1}, model=model, draws=50, progressbar=False)
-    return prb.population(eval(select, {"fleet": fleet}), model=model, n_draws=50)
+    return prb.compare({"a": eval(select, {"fleet": fleet})}, model=model)
 
 
 def fleet_of(response: Any = LOSSY, **options: Any) -> None:
