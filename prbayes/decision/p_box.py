@@ -18,6 +18,7 @@ from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
     ResponseSample,
+    answers_by_family,
     left_out_findings,
     probability_bounds,
     share_error,
@@ -158,7 +159,7 @@ def p_box(
         high = max(_place(function, y, 0.99) for function in functions)
         return f"{low:.4g} and {high:.4g}"
 
-    findings += samples[0].compared("the 1% and 99% quantiles are", tails)
+    findings += answers_by_family(samples[0], "the 1% and 99% quantiles are", tails)
     data: dict[str, Any] = {
         "lower": (["band", "y"], lowest),
         "upper": (["band", "y"], highest),

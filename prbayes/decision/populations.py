@@ -324,15 +324,6 @@ class ResponseSample:
         """
         return np.concatenate([functional(self.values, w) for w in self.weight_batches(thetas)])
 
-    def compared(self, question: str, answer: Callable[[ResponseSample], str]) -> Findings:
-        """Report the answers to a question under the families that the data do not separate."""
-        nested, findings = NestedPopulations.of(self.populations)
-        if nested is None:
-            return findings
-        simpler = replace(self, populations=nested.populations)
-        answers = f"{answer(self)}, or {answer(simpler)} under the {nested.name} family"
-        return report(nested.finding(f"{question} {answers}"))
-
     @cached_property
     def lost(self) -> float:
         """The share of a population that has no response, the median over populations."""
@@ -637,6 +628,18 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
     return np.asarray(optimum.theta + z @ root.T)
 
 
+def answers_by_family(
+    sample: ResponseSample, question: str, answer: Callable[[ResponseSample], str]
+) -> Findings:
+    """Report the answers to a question under the families that the data do not separate."""
+    nested, findings = NestedPopulations.of(sample.populations)
+    if nested is None:
+        return findings
+    simpler = replace(sample, populations=nested.populations)
+    answers = f"{answer(sample)}, or {answer(simpler)} under the {nested.name} family"
+    return report(nested.finding(f"{question} {answers}"))
+
+
 def quantity_by_family(
     sample: ResponseSample, quantity: Quantity, prob: float = INTERVAL
 ) -> Findings:
@@ -649,7 +652,7 @@ def quantity_by_family(
         interval = f"{percentage(prob)} interval {lower:.4g} to {upper:.4g}"
         return f"{by_draw.mean():.4g} ({interval})"
 
-    return sample.compared("the quantity is", answer)
+    return answers_by_family(sample, "the quantity is", answer)
 
 
 def output_column(responses: Responses, values: Floats, output: Any) -> int | None:

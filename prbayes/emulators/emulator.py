@@ -139,8 +139,7 @@ def fit_emulator(
     (True, True)
     """
     n = len(z)
-    weights = np.ones(n) if near is None else np.asarray(near, dtype=float)
-    weights = weights / weights.sum() if weights.sum() > 0 else np.full(n, 1 / n)
+    weights = _run_weights(near, n)
     center, unit = y.mean(axis=0), y.std(axis=0)
     is_constant = unit <= 1e-14 * np.abs(y).max(axis=0)
     center, unit = np.where(is_constant, y[0], center), np.where(is_constant, 1.0, unit)
@@ -181,6 +180,12 @@ def fit_emulator(
     if components is not None:
         left_out += rest
     return Emulator(z, unit * left_out, center, unit, components, tuple(surfaces))
+
+
+def _run_weights(near: Floats | Bools | None, n: int) -> Floats:
+    """Return the weights of n runs in cross-validation, of sum one."""
+    weights = np.ones(n) if near is None else np.asarray(near, dtype=float)
+    return weights / weights.sum() if weights.sum() > 0 else np.full(n, 1 / n)
 
 
 def with_failures(values: Floats, points: Floats, runs: Floats, outputs: Floats) -> Floats:

@@ -232,7 +232,6 @@ def predict(
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
-    of_populations = (*_beyond_runs(label, drawn.beyond), *width_of_epsilon(result, model))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -242,7 +241,7 @@ def predict(
         "nan": missing,
         "specimens_id": _array_digest(*drawn.specimens),
         "random_seed": str(seed),
-        "findings": as_json((*findings_of(response), *report(*of_populations))),
+        "findings": as_json(_prediction_findings(responses, drawn, result, model)),
         **_calibration_attributes(result, model),
         **provenance(result, model),
     }
@@ -484,16 +483,20 @@ def width_of_epsilon(result: Any, model: pm.Model | None) -> Findings:
     return (Finding("width-of-epsilon", text, "choose.md#epsilon-and-the-width-of-the-posterior"),)
 
 
-def _beyond_runs(label: str, share: float) -> Findings:
-    """Report more than 1 % of specimens whose response beyond the runs is not known."""
-    if share <= 0.01:
-        return ()
-    text = (
-        f"{label}: {share:.1%} of the specimens are beyond the range of the runs, where the "
-        "response is taken as constant, so that far quantiles are too moderate; pass "
-        "stored=False, which calls the response there."
-    )
-    return (Finding("beyond-runs", text, "decision.md#the-population-in-units"),)
+def _prediction_findings(
+    responses: Responses, drawn: _Predicted, result: Any, model: pm.Model
+) -> Findings:
+    """Report extrapolation, and more than 1 % of specimens whose response is not known."""
+    findings = [*width_of_epsilon(result, model)]
+    if drawn.beyond > 0.01:
+        text = (
+            f"{responses.name}: {drawn.beyond:.1%} of the specimens are beyond the range of the "
+            "runs, where the response is taken as constant, so that far quantiles are too "
+            "moderate; pass stored=False, which calls the response there."
+        )
+        page = "decision.md#the-population-in-units"
+        findings.append(Finding("beyond-runs", text, page))
+    return (*findings_of(responses.function), *report(*findings))
 
 
 # -- responses -------------------------------------------------------------------------------------
