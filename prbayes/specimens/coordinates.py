@@ -88,9 +88,10 @@ class Coordinates:
         bounds = np.stack([np.min(extremes, axis=0), np.max(extremes, axis=0)])
         range_ = (np.array([[0.0], [1.0]]) - center) / half_width
         ends = np.where(is_infinite & ~is_condition, range_, [[-np.inf], [np.inf]])
-        shapes = inputs.event_shapes
-        free = cls(shapes, is_log, center, half_width, bounds, ends, is_condition)
-        return free.with_ends(inputs)
+        coordinates = cls(
+            inputs.event_shapes, is_log, center, half_width, bounds, ends, is_condition
+        )
+        return coordinates.with_ends(inputs)
 
     def with_ends(self, inputs: Inputs) -> Coordinates:
         """Return the coordinates with the ends that are the same for all populations."""
