@@ -22,8 +22,7 @@ from prbayes._validate import Floats, Function, StrPath, called, positive_intege
 from prbayes.decision.populations import (
     Populations,
     ResponseSample,
-    checked_quantity,
-    quantity_by_family,
+    checked_by_family,
     standard_deviation,
 )
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -194,8 +193,7 @@ def plan(
     findings: Findings = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-        findings, error = checked_quantity(quantity_sample, quantity)
-        findings += quantity_by_family(quantity_sample, quantity)
+        findings, error = checked_by_family(quantity_sample, quantity)
     unit = populations.evaluator.hyperparameters.prior_sd
     modes = [populations.thetas[rows] for rows in rows_by_mode(populations.thetas / unit)]
     findings += report(*_several_modes(populations, modes))

@@ -640,10 +640,10 @@ def answers_by_family(
     return report(nested.finding(f"{question} {answers}"))
 
 
-def quantity_by_family(
+def checked_by_family(
     sample: ResponseSample, quantity: Quantity, prob: float = INTERVAL
-) -> Findings:
-    """Report a quantity under the families that the data do not separate."""
+) -> tuple[Findings, float]:
+    """Return findings, also of the families that the data do not separate, and the error."""
 
     def answer(sample: ResponseSample) -> str:
         by_draw = sample.evaluate(quantity.of, sample.populations.thetas)
@@ -652,7 +652,8 @@ def quantity_by_family(
         interval = f"{percentage(prob)} interval {lower:.4g} to {upper:.4g}"
         return f"{by_draw.mean():.4g} ({interval})"
 
-    return answers_by_family(sample, "the quantity is", answer)
+    findings, error = checked_quantity(sample, quantity)
+    return findings + answers_by_family(sample, "the quantity is", answer), error
 
 
 def output_column(responses: Responses, values: Floats, output: Any) -> int | None:
@@ -750,8 +751,7 @@ def evaluate(
     calling = call_settings(executor, store, version)
     populations = Populations.of(result, model, n_draws, caller, calling)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings, error = checked_quantity(sample, quantity)
-    findings += quantity_by_family(sample, quantity, prob)
+    findings, error = checked_by_family(sample, quantity, prob)
     by_draw = sample.evaluate(quantity.of, populations.thetas)
     (center,) = sample.evaluate(quantity.of, populations.center[None])
     lower, upper = quantiles_of(by_draw[~np.isnan(by_draw)], tail_levels(prob))

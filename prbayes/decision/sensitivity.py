@@ -24,8 +24,7 @@ from prbayes.decision.populations import (
     InverseTransform,
     Populations,
     ResponseSample,
-    checked_quantity,
-    quantity_by_family,
+    checked_by_family,
     standard_deviation,
 )
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -165,8 +164,7 @@ def sensitivity(
         result, model, 4000, caller, call_settings(executor, store, version)
     )
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings, error = checked_quantity(sample, quantity)
-    findings += quantity_by_family(sample, quantity)
+    findings, error = checked_by_family(sample, quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_points, seed)
     inputs, obstacle = input_indices(sample, quantity, n_points, seed, computed=computed)
     findings += report(*_constant_findings(hyperparameters, quantity))
