@@ -91,7 +91,7 @@ def plot_products(
     >>> fleet = prb.calibrate_each(data, model=model, progressbar=False)
     >>> figure = prb.plots.plot_products(prb.population(fleet, model=model))
     >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    ['B', 'A']
+    ['A', 'B']
     """
     check_options(labels, pc_kwargs)
     table = _by_quantity(subset(_table_of_fleet(table), coords))

@@ -143,7 +143,9 @@ def _rows_of_products(
     if table is not None:
         keys = table["estimate"].sel(quantity="B-basis").isel(name=0).values
         cells = {(x, q): c for x, _, by_quantity in table.rows() for q, c in by_quantity.items()}
-        for x, unit in zip(table["name"].values.tolist()[:3], table["unit"].values, strict=False):
+        columns = table["name"].values.tolist()[:3]
+        units = table["unit"].values
+        for x, unit in zip(columns, units, strict=False):
             label = with_label(x, str(unit), m.labels)
             for row in rows:
                 of_row = element_name(x, [row["product"]])
@@ -151,8 +153,10 @@ def _rows_of_products(
                     value, interval = cells.get((of_row, quantity), (NOTHING, ""))
                     text = f"{value} ({interval})" if interval else value
                     row[f"{label}: {quantity}"] = text
-    ranks = [(_WORST_FIRST.index(v), not f) for v, f in zip(verdicts, findings, strict=True)]
-    order = sorted(range(len(rows)), key=lambda k: (*ranks[k], np.nan_to_num(keys[k])))
+    by_product = zip(verdicts, findings, strict=True)
+    ranks = [(_WORST_FIRST.index(v), not f) for v, f in by_product]
+    finite_keys = np.nan_to_num(keys)
+    order = sorted(range(len(rows)), key=lambda k: (*ranks[k], finite_keys[k]))
     return [rows[k] for k in order]
 
 

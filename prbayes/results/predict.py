@@ -62,7 +62,7 @@ from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, is_group, model_on_context
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
-from prbayes.results.products import evaluator_of_products, one_posterior
+from prbayes.results.products import evaluator_of_products, one_posterior, product_names
 
 # Types that a function of results takes, for its errors.
 RESULT = (
@@ -197,7 +197,9 @@ def predict(
         plain_text(name, "name")
     calling = call_settings(executor, store, version)
     label = name or named_response(response, calling, "pass name=")
-    model = evaluator_of_products(result, model_of(result, model, "prb.predict")).model
+    model = model_of(result, model, "prb.predict")
+    if product_names(result):
+        model = evaluator_of_products(result, model).model
     sources = population_simulators(model)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)

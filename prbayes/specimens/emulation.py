@@ -44,12 +44,6 @@ class CompressedSurface:
     surface: Emulator
     center: Floats  # (m,): mean of the readings of each output
     unit: Floats  # (m,): scale of each output, within which the surface is nearly linear in it
-    ends: Floats  # (2, d): ends of the runs near the data
-
-    def is_far(self, z: Floats) -> Bools:
-        """Return which coordinates, (k, d), are beyond the runs near the data."""
-        is_below, is_above = z < self.ends[0], z > self.ends[1]
-        return np.asarray((is_below | is_above).any(axis=1))
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), from values of the compressed surface."""
@@ -164,24 +158,23 @@ class Emulation:
     def extended(self, z: Floats) -> Floats:
         """Return outputs, (k, m), of the surface or of one through all runs.
 
-        The surface leaves out runs far from the specimens, and may be arbitrary there. Beyond the
-        runs near the data the smaller predictive variance decides, relative to the distance from
-        the data.
+        The surface leaves out runs far from the specimens, and may be arbitrary there. Where both
+        differ by 1 % of the distance from the data, the smaller relative variance decides.
         """
         values, inner, outer = self.surface.values(z), self.surface, self._through_all_runs
-        if outer is None or not isinstance(inner, CompressedSurface):
+        if outer is None:
             return values
-        is_far = inner.is_far(z)
-        if not is_far.any():
+        others = outer.values(z)
+        distance = np.hypot(others - outer.center, outer.unit)
+        differs = (np.abs(values - others) > 0.01 * distance).any(axis=1)
+        if not differs.any():
             return values
-        by_surface, relative = [], []
-        for surface in (inner, outer):
-            outputs = surface.values(z[is_far])
-            squares = (outputs - outer.center) ** 2 + outer.unit**2
-            by_surface.append(outputs)
-            relative.append(surface.variance(z[is_far]) / squares)
+        relative = []
+        for surface, outputs in ((inner, values), (outer, others)):
+            distance = np.hypot(outputs[differs] - outer.center, outer.unit)
+            relative.append(surface.variance(z[differs]) / distance**2)
         is_better = relative[1] < relative[0]
-        values[is_far] = np.where(is_better, by_surface[1], by_surface[0])
+        values[differs] = np.where(is_better, others[differs], values[differs])
         return values
 
     @cached_property
@@ -194,10 +187,11 @@ class Emulation:
         _, first = np.unique(np.round(z, 9), axis=0, return_index=True)
         if len(first) == len(inner.surface.z):
             return None
-        near = y[~inner.is_far(z)]
-        spread = np.maximum(near.std(axis=0), 1e-12 * np.abs(y).max(axis=0))
-        compressed = np.arcsinh((y[first] - inner.center) / np.maximum(spread, 1e-300))
-        return replace(inner, surface=fit_emulator(z[first], compressed), unit=spread)
+        distance = np.abs(y - inner.center)
+        least = 1e-12 * distance.max(axis=0) + 1e-300
+        unit = np.maximum(np.median(distance, axis=0), least)
+        compressed = np.arcsinh((y[first] - inner.center) / unit)
+        return replace(inner, surface=fit_emulator(z[first], compressed), unit=unit)
 
     def fails(self, z: Floats) -> Bools:
         """Return where the nearest run has no finite response."""
@@ -261,8 +255,7 @@ def fit_surface(
     start = previous.surface if isinstance(previous, CompressedSurface) else None
     of_point = int(readings.is_measured.sum(axis=1).max())
     emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
-    ends = np.stack([zg[inside].min(axis=0), zg[inside].max(axis=0)])
-    surface = CompressedSurface(emulator, center, unit, ends)
+    surface = CompressedSurface(emulator, center, unit)
     errors = yg - surface.expanded(compressed - surface.surface.left_out)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = errors[copies.ravel()], inside[copies.ravel()]
