@@ -92,6 +92,7 @@ def standard_errors(sampling: SamplingDistribution, functions: Local) -> dict[st
     return point_and_stderr(sampling.evaluator, sampling.theta, covariance, functions)[1]
 
 
+@pytest.mark.long
 def test_standard_errors_are_those_of_fisher() -> None:
     sds, correlation = exact_errors()
     sampling = sampling_at_truth(ENOUGH)

@@ -92,6 +92,7 @@ def test_groups_and_covariates_go_together() -> None:
     assert np.allclose(graph, logs, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_population_is_truncated_where_it_has_no_response() -> None:
     rows = X > 0.6
     evaluator = Evaluator.of(build(truncated, 2 * X[rows], HARDNESS[rows]))

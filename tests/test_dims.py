@@ -83,6 +83,7 @@ LONG = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("build", [lognormal, vector, *LONG])
 def test_numbers_are_those_of_plain_variables(build: Callable[[Any], Any]) -> None:
     # Sums may have another order, and so another rounding.

@@ -348,6 +348,7 @@ def test_conflict_of_prior_and_data(problem: Problem) -> None:
     assert str(checked.findings[0]).startswith("mu: got prior")
 
 
+@pytest.mark.long
 def test_conflict_is_reported_with_censored_readings_too() -> None:
     readings = np.minimum(np.random.default_rng(1).normal(4, 1, 20), 4.5)
     with pm.Model() as model:

@@ -696,6 +696,7 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     assert np.mean(flagged) <= 0.07
 
 
+@pytest.mark.long
 def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
     x, observed = frame.stiffnesses(20, 0), frame.data(20, 0)
     error = np.array([0.002, 0.002, 0.2])
@@ -768,6 +769,7 @@ def refusal_or_report(model: pm.Model, caplog: pytest.LogCaptureFixture) -> str:
     return "".join(reports)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "end"),
     [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("kumaraswamy", 1.0), ("gamma", 0.0)],
@@ -781,6 +783,7 @@ def test_an_exact_reading_at_an_end_is_refused_or_reported_by_its_row(
     assert posterior.posterior["a"].std() < 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", [0.0, 1e-6])
 def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: float) -> None:
     c = np.random.default_rng(2).normal(0, 0.5, 13)
@@ -806,6 +809,7 @@ def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: floa
         prb.sample(model=model, progressbar=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["truncated", "exponential"])
 def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None:
     posteriors = [
@@ -817,6 +821,7 @@ def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None
         assert means[0] == pytest.approx(means[1], rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("weibull", 1e-7), ("gamma", 1e-7)])
 def test_readings_as_small_as_the_error_of_the_emulator_are_no_secret(
     family: str, end: float, caplog: pytest.LogCaptureFixture
@@ -836,6 +841,7 @@ def test_the_logarithm_of_a_response_resolves_small_readings(end: float) -> None
     assert error - error[0] == pytest.approx(np.zeros(3), abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("population", ["beta", "uniform"])
 def test_readings_with_an_error_beside_the_ends_of_a_range(population: str) -> None:
     # Some readings are beyond the ends, where the emulator's error is small beside theirs.

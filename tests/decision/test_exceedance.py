@@ -208,6 +208,7 @@ def test_a_limit_beyond_the_range_of_the_runs_is_not_decided() -> None:
     assert (np.quantile(by_draw, 0.945) > 0.003, table.attrs["verdict"]) == (True, "not decided")
 
 
+@pytest.mark.long
 def test_quantiles_beyond_the_range_of_the_runs_are_reported() -> None:
     model, x, result = narrow_prior()
     draws = result["posterior"]

@@ -135,6 +135,7 @@ def test_precisions_add_up() -> None:
     np.testing.assert_allclose(sd, populations.thetas.std(axis=0), rtol=0.03)
 
 
+@pytest.mark.long
 def test_errors_of_readings_are_part_of_the_information() -> None:
     """A normal population with standard deviation .3, and normal errors."""
     rng = np.random.default_rng(0)

@@ -50,6 +50,7 @@ def correlated(rho: float, draws: int = 4000, seed: int = 0) -> xr.DataTree:
     return xr.DataTree.from_dict({"posterior": group.assign_coords(chain=[0], draw=range(draws))})
 
 
+@pytest.mark.long
 def test_errors_contain_the_noise_of_points_and_of_draws() -> None:
     model, x = normal()
     quantile = prb.decision.Quantile(same, x, probability=0.9)

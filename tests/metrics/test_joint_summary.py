@@ -255,6 +255,7 @@ def test_separate_sheets_of_the_same_inputs_are_reported(caplog: pytest.LogCaptu
     assert codes == [["separate-sheets"], []]
 
 
+@pytest.mark.long
 def test_a_calibration_from_the_means_of_two_outputs() -> None:
     """Means of the inputs are known as well as from the specimens, whose mean is linear in them."""
     with pm.Model() as model:

@@ -168,6 +168,7 @@ def test_a_sheet_has_no_specimens_to_weight_or_label(settings: dict[str, Any]) -
         with_sheet(**settings)
 
 
+@pytest.mark.long
 def test_a_calibration_from_a_sheet() -> None:
     """Of a normal population: standard errors and posterior are those of its specimens."""
     model = with_sheet()

@@ -144,6 +144,7 @@ def test_records_with_readings_in_different_numbers_have_their_exact_likelihood(
     assert likelihood.cache["preparation"].proposals.linear.is_used.all()
 
 
+@pytest.mark.long
 def test_optimum_prediction_and_individuals() -> None:
     model = model_of_functions()
     optimum = prb.minimize(model)

@@ -195,6 +195,7 @@ def test_specimens_of_one_simulator_may_have_fewer_readings_than_inputs() -> Non
     assert change.sum() == pytest.approx((expected(OTHER) - expected(POINT)).sum(), abs=0.15)
 
 
+@pytest.mark.long
 def test_errors_of_both_simulators_may_be_variables() -> None:
     with pm.Model() as model:
         x = population()
@@ -267,6 +268,7 @@ def test_a_simulator_may_connect_simulators_without_common_specimens() -> None:
     assert np.allclose(values(model, "c"), np.where(middle, both, alone), atol=TOLERANCE)
 
 
+@pytest.mark.long
 def test_other_data_of_the_first_simulator_are_seen_by_the_last() -> None:
     model = fine(two_simulators())
     compiled = model.compile_fn(model.logp(), mode=PLAIN)
@@ -308,6 +310,7 @@ def test_repeated_readings_share_the_inputs_of_their_specimen() -> None:
     assert np.var(drawn[:, rows] - drawn[:, rows[:1]]) < 0.3
 
 
+@pytest.mark.long
 def test_the_error_of_repeated_readings_may_be_estimated() -> None:
     model = fine(repeated(lambda: pm.HalfNormal("e", 0.5)), 128)
     ours = log_density(model, "y")

@@ -240,6 +240,7 @@ def test_what_does_not_apply_is_refused() -> None:
                 prb.Simulator("y", line, x, condition("time", TIMES), observed=got)
 
 
+@pytest.mark.long
 def test_doses_and_times_of_theophylline_have_the_published_likelihood() -> None:
     path = Path(__file__).parents[2] / "examples" / "theophylline.py"
     model = runpy.run_path(str(path))["population"](prb.datasets.theophylline())

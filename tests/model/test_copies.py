@@ -69,6 +69,7 @@ def test_the_first_model_keeps_its_points() -> None:
     np.testing.assert_array_equal(log_likelihood(model, mu=1.0, sigma=0.4), wide)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", METRICS)
 def test_what_follows_a_calibration_takes_the_inputs_of_the_first_model(metric: Any) -> None:
     model, x = original(metric)

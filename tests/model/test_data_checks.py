@@ -457,6 +457,7 @@ def test_a_diagnosis_reports_codes(metric: prb.Metric) -> None:
     assert "outlying-data" in {finding.code for finding in optimum.findings}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", [{}, {"error": 0.1}, {"rounded": 0.1}])
 def test_the_advice_for_an_outlier_keeps_the_other_arguments(given: dict[str, float]) -> None:
     values = np.append(RNG.normal(3, 0.1, 24), 500.0)
@@ -476,6 +477,7 @@ def test_the_advice_for_an_outlier_keeps_the_other_arguments(given: dict[str, fl
     assert selected["outlying-data"].endswith("or keep them as part of the population.")
 
 
+@pytest.mark.long
 def test_a_misfit_of_many_outputs_is_one_number() -> None:
     t = np.linspace(0.1, 1, 200)
     values = RNG.normal(3, 0.1, (12, 1)) * t + RNG.normal(0, 0.1, (12, 200))
@@ -514,6 +516,7 @@ def test_repeated_readings_that_scatter_more_than_their_error_are_reported() -> 
     assert "readings of 1 of 15 specimens" in single.text
 
 
+@pytest.mark.long
 def test_an_impossible_repeated_reading_is_reported_by_the_optimum() -> None:
     rng = np.random.default_rng(2)
     y = np.repeat(rng.normal(1, 0.5, 8), 3) + rng.normal(0, 0.1, 24)

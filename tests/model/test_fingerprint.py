@@ -452,6 +452,7 @@ def test_a_likelihood_of_another_response_is_refused(use: str, slope: float) -> 
             USES[use](result, likelihood_model(times(slope)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("use", USES)
 def test_a_likelihood_of_the_same_response_is_accepted(
     use: str, caplog: pytest.LogCaptureFixture
@@ -493,6 +494,7 @@ def test_a_change_near_the_data_is_found_by_the_stored_runs() -> None:
         prb.population(fitted_likelihood()[1], model=likelihood_model(times(1.0, change=0.1)))
 
 
+@pytest.mark.long
 def test_curves_of_many_outputs_have_an_identity_in_a_file() -> None:
     error = {"metric": prb.LogLikelihood(error=0.5)}
     models = [likelihood_model(times(s, n_outputs=1000), 1000, **error) for s in (1.0, 1.01)]
@@ -502,6 +504,7 @@ def test_curves_of_many_outputs_have_an_identity_in_a_file() -> None:
         prb.compare({"a": result}, model=models[1])
 
 
+@pytest.mark.long
 def test_tables_of_other_runs_are_refused() -> None:
     x = np.linspace(-10.0, 14.0, 80)
     tables = [prb.Runs({"x": x}, slope * x) for slope in (1.0, 1.0, 1.01)]

@@ -33,6 +33,7 @@ def model(metric: Any, observed: Any = MIDDLES, **given: Any) -> pm.Model:
     return built
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: type(metric).__name__)
 def test_a_histogram_is_as_many_specimens_as_it_counts(metric: Any) -> None:
     """The standard error of the mean is sd / sqrt(400) = .1, not that of twenty values."""
@@ -44,6 +45,7 @@ def test_a_histogram_is_as_many_specimens_as_it_counts(metric: Any) -> None:
         assert counted.stderr["mu"] == pytest.approx(SAMPLE.std() / 20, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bins", [6, [3.0, 7.0, 8.0, 9.0, 10.0, 12.0, 17.0]])
 def test_the_likelihood_of_bins_is_exact(bins: Any) -> None:
     """Rounding has the width of each bin: the likelihood is that of the bins' probabilities."""

@@ -72,6 +72,7 @@ def test_graph_and_numbers_agree(calibrated: Any) -> None:
     np.testing.assert_allclose(graph, numbers, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_predictions_have_the_scatter(calibrated: Any) -> None:
     model, x, response, result = calibrated
     arguments: Any = {"model": model, "random_seed": 1, "progressbar": False}
@@ -129,6 +130,7 @@ def test_runs_do_not_depend_on_their_chunk() -> None:
     assert np.unique((parts - 2 * x).round(6)).size == 6  # each run has noise of its own
 
 
+@pytest.mark.long
 def test_runs_are_the_same_with_any_number_of_workers() -> None:
     logs = []
     for workers in (0, 1, 3):

@@ -226,6 +226,7 @@ def test_simulators_of_the_same_specimens_change_their_metric_together() -> None
     assert remedies_of(likelihood)[1] == "use metric=prb.ProbabilityResidual() in y and z"
 
 
+@pytest.mark.long
 def test_a_known_cause_has_no_second_guess() -> None:
     # The response saturates below the readings.
     with pm.Model() as model:
@@ -418,6 +419,7 @@ USED: Mapping[str, tuple[Use, Mapping[str, Any], str, list[dict[str, Any]]]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", USED)
 def test_each_remedy_gets_past_the_refusal_of_a_use(case: str) -> None:
     use, options, advice, remedies = USED[case]

@@ -51,6 +51,7 @@ def exact(of_mu: tuple[float, float], of_sigma: float, x: Any) -> tuple[Any, Any
     return mean, np.sqrt(square - mean**2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("response", "inverse"), [(lambda k: 3 / k, lambda y: 3 / y), (lambda k: k**3, np.cbrt)]
 )
@@ -72,6 +73,7 @@ def findings_of(result: Any) -> tuple[Finding, ...]:
     return from_json(result["posterior"].attrs["findings"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
     response, *priors, x = PROBLEMS[name]
@@ -90,6 +92,7 @@ def test_the_maximum_is_at_inputs_that_exist(name: str) -> None:
     assert optimum.local_optima == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most", [74, 110])
 def test_a_budget_that_ends_in_the_audit_keeps_the_draws(most: int) -> None:
     model = build(*PROBLEMS["pole"])
@@ -104,6 +107,7 @@ def test_a_budget_that_ends_in_the_audit_keeps_the_draws(most: int) -> None:
     np.testing.assert_allclose(again.posterior["mu"].mean(), expected[0], atol=0.1 * sd[0])
 
 
+@pytest.mark.long
 def test_a_budget_that_ends_in_the_audit_keeps_the_optimum() -> None:
     model = build(*PROBLEMS["pole"])
     optimum = prb.minimize(model, max_runs=90)
@@ -114,6 +118,7 @@ def test_a_budget_that_ends_in_the_audit_keeps_the_optimum() -> None:
     assert again.point["mu"] == pytest.approx(PROBLEMS["pole"][3].mean(), rel=1e-3)
 
 
+@pytest.mark.long
 def test_sequential_monte_carlo_is_audited(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"draws": 400, "random_seed": 1, "progressbar": False}
     result = prb.sample_smc(model=build(*PROBLEMS["pole"]), chains=1, **settings)
@@ -183,6 +188,7 @@ def test_gross_errors_need_no_runs() -> None:
     assert abs(float(posterior["mu"].mean()) - x[1:].mean()) < 0.15
 
 
+@pytest.mark.long
 def test_an_audit_makes_no_other_problem() -> None:
     model = build(*PROBLEMS["pole"])
     (first,) = Evaluator.of(model).likelihoods

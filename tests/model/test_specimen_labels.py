@@ -105,6 +105,7 @@ def test_equal_numbers_without_labels_are_reported(make: Any, caplog: Any) -> No
     assert text.startswith("cold and hot: got 25 specimens of the same inputs in each")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make",
     [
@@ -123,6 +124,7 @@ def test_other_specimens_are_not_reported(make: Any) -> None:
     assert "unlabelled-specimens" not in codes
 
 
+@pytest.mark.long
 def test_a_label_twice_in_one_index_is_reported() -> None:
     (text,) = findings(two(series(COLD, ["s0", *NAMES[:-1]]), series(HOT, OTHERS)))
     assert text.startswith("cold: got the label 's0' 2 times in the index of observed")
@@ -138,6 +140,7 @@ def test_specimens_of_other_inputs_may_have_the_same_labels() -> None:
     assert not findings(model)
 
 
+@pytest.mark.long
 def test_names_of_groups_in_an_index_are_no_labels() -> None:
     groups = np.repeat(["A", "B"], [10, 15])
     with pm.Model(coords={"batch": ["A", "B"]}) as model:

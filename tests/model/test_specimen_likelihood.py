@@ -427,6 +427,7 @@ def test_arguments_without_a_meaning_are_refused(given: dict[str, Any], message:
         build(**given)
 
 
+@pytest.mark.long
 def test_readings_may_have_limits_of_their_own() -> None:
     upper = np.where(np.arange(N) % 2, 4.0, 3.0)
     low = np.full(N, -9.0)
@@ -605,6 +606,7 @@ def test_labelled_arrays_in_another_order_than_observed_are_refused() -> None:
         build(of_both, dict(table), **metric(error=same))
 
 
+@pytest.mark.long
 def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
     """Another output, or a condition, is exact; the log-likelihood has an error of some tenths."""
     rng = np.random.default_rng(0)
@@ -645,6 +647,7 @@ def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
             assert got == pytest.approx(expected(*place, limit), abs=0.4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("relative", [False, True])
 def test_densities_between_values_of_an_unknown_error_are_interpolated(relative: bool) -> None:
     with pm.Model() as model:

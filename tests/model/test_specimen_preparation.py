@@ -136,6 +136,7 @@ def test_a_model_that_is_gone() -> None:
         _ = gone.hyperparameters
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [6, 9, 98])
 def test_a_mirror_population_that_the_prior_excludes(number: int) -> None:
     """The second output has a root on both sides of b = 1, and the prior is on one of them."""

@@ -52,6 +52,7 @@ def log_density(model: pm.Model) -> Any:
     return [function(at | {"mu": mu}) for mu in (69.5, 70.5)]
 
 
+@pytest.mark.long
 def test_a_table_gives_the_log_likelihood_of_the_function_without_a_run() -> None:
     of_table = model_of(table(64))
     (responses,) = [m.measurements[0].responses for m in specimen_likelihoods(of_table).values()]
@@ -62,6 +63,7 @@ def test_a_table_gives_the_log_likelihood_of_the_function_without_a_run() -> Non
     assert 0 < emulation_of(of_table).bias < 0.15
 
 
+@pytest.mark.long
 def test_a_table_that_ends_within_the_data_is_refused_with_a_proposal() -> None:
     narrow = table(64, high=(70, 2.6))
     model = model_of(narrow)
@@ -165,6 +167,7 @@ def test_metrics_refuse_a_population_outside_the_table_and_say_what_to_do() -> N
         prb.propose_runs(other)
 
 
+@pytest.mark.long
 def test_predictions_of_a_table_are_nan_outside_and_the_error_is_diagnosed() -> None:
     x = np.linspace(0.0, 6.0, 30)
     runs = prb.Runs({"x": x}, np.exp(x / 2))

@@ -333,6 +333,7 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     assert optima_from_prior(best, 16, 0) == []
 
 
+@pytest.mark.long
 def test_a_poor_fit_of_responses_that_are_simulated_again_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

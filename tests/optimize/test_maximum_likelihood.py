@@ -206,6 +206,7 @@ def test_hyperparameters_that_are_not_identified(codes: list[str]) -> None:
     assert optimum.converged
 
 
+@pytest.mark.long
 def test_standard_errors_that_are_too_small_on_a_curved_ridge(codes: list[str]) -> None:
     rng = np.random.default_rng(4)
     force = 100 * rng.normal(70, 4, 12) * rng.normal(0.2, 0.01, 12)
@@ -268,6 +269,7 @@ def test_the_number_of_evaluations_is_limited() -> None:
     assert len(optimum.search.trace["theta"]) <= optimum.search.n_evaluations
 
 
+@pytest.mark.long
 def test_hyperparameters_that_only_the_prior_links_to_the_data_are_not_reported() -> None:
     who = np.repeat(["a", "b", "c"], 10)
     data = xr.DataArray(
@@ -312,6 +314,7 @@ def exact_log_likelihood(point: Mapping[str, Any]) -> float:
     return float(np.log(np.trapezoid(density, b, axis=1)).sum())
 
 
+@pytest.mark.long
 def test_a_population_between_the_points_is_no_optimum() -> None:
     """Populations of a spread near zero have spurious maxima, several nats high."""
     optimum = fit(two_spreads())
@@ -333,6 +336,7 @@ def test_a_population_between_the_points_is_no_optimum() -> None:
     assert monte_carlo_error(likelihood, values).tolist() == [np.inf, pytest.approx(wide)]
 
 
+@pytest.mark.long
 def test_a_population_between_the_points_is_no_optimum_with_an_unknown_error() -> None:
     times = np.linspace(0, 1, 8)
     rng = np.random.default_rng(0)

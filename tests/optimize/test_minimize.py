@@ -112,6 +112,7 @@ def area(mu: Any, sigma: Any, points: int = 4000) -> Any:
     return np.abs(mu[..., None] + sigma[..., None] * norm.ppf(u) - data).mean(axis=-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "brute"), [("pr", residual), ("area", area)])
 def test_the_optimum_is_that_of_a_brute_force_grid(name: str, brute: Callable[..., Any]) -> None:
     optimum = fitted(name)
@@ -607,6 +608,7 @@ def test_unidentified_directions_are_regularised_and_named() -> None:
     assert abs(optimum.point["ratio"] - np.median(observed)) < error
 
 
+@pytest.mark.long
 def test_a_gradient_that_is_nan_is_differenced() -> None:
     # PyMC's gradient of a normal cut off on one side is NaN at values that are cut off.
     values = np.random.default_rng(0).normal(1.0, 0.7, 400)

@@ -72,6 +72,7 @@ def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -
     assert pickle.loads(pickle.dumps(tree)).identical(tree)
 
 
+@pytest.mark.long
 def test_a_covariance_is_shown_as_standard_deviations_and_correlations() -> None:
     """Not as the elements of a packed factor."""
     response = np.random.default_rng(0).normal(size=(20, 2))

@@ -93,6 +93,7 @@ def test_what_the_table_says_works_does(name: str) -> None:
     assert getattr(az, name)(checked(), **MORE.get(name, {})) is not None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

@@ -54,6 +54,7 @@ def correlated() -> pm.Model:
     return model
 
 
+@pytest.mark.long
 def test_a_multivariate_input_has_its_pairs() -> None:
     draws = xr.Dataset(
         {

@@ -90,6 +90,7 @@ def test_where_specimens_fail_the_refits_are_around_the_optimum(name: str) -> No
     assert sd == pytest.approx(optimum.stderr["mu"], rel=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("parametric", [False, True])
 def test_several_outputs_are_looked_at_as_the_metric_is_prepared_for_them(parametric: bool) -> None:
     optimum = of_two_outputs()

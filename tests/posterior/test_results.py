@@ -86,6 +86,7 @@ def test_the_tree_of_an_optimum() -> None:
     assert versions().items() <= tree["optimum"].attrs.items()
 
 
+@pytest.mark.long
 def test_the_tree_of_a_sampler() -> None:
     tree = idata()
     sampler = {"posterior", "sample_stats", "calibration", "observed_data"}
@@ -263,6 +264,7 @@ def test_many_predictive_draws_are_thinned(monkeypatch: pytest.MonkeyPatch) -> N
     assert responses.coords["draw"].values[:3].tolist() == [0, 4, 8]
 
 
+@pytest.mark.long
 def test_log_likelihoods_of_many_specimens_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     data = np.random.default_rng(1).normal(1.0, 0.5, 20)
     with pm.Model() as model:
@@ -349,6 +351,7 @@ def test_selected_variables_dimensions_and_groups() -> None:
         results.selected(tree, None, {"dims": {"second": []}})
 
 
+@pytest.mark.long
 def test_chains_begin_at_their_start(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     prior = {"mean": rng.normal(1, 1, (20, 2)), "sigma": np.abs(rng.normal(size=20))}

@@ -44,6 +44,7 @@ def by_importance() -> xr.DataTree:
     return prb.sample(2000, chains=2, model=linear_model(), random_seed=1, progressbar=False)
 
 
+@pytest.mark.long
 def test_the_posterior_is_exact() -> None:
     result = by_importance()
     attrs = result.posterior.attrs
@@ -94,6 +95,7 @@ def _unreliable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ImportanceOptions", lambda: options)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_unreliable")
 def test_unreliable_importance_sampling_is_replaced(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", logger="prbayes"):

@@ -184,6 +184,7 @@ def test_the_seed_determines_the_numbers() -> None:
     assert not np.array_equal(other, logs)
 
 
+@pytest.mark.long
 def test_mean_and_standard_deviation() -> None:
     """Both are sufficient: the posterior is that of the full data."""
     y = data(15)
@@ -238,6 +239,7 @@ def test_mirror_modes_have_the_weights_of_their_prior() -> None:
     assert share == pytest.approx(1 / (1 + np.exp(0.5)), abs=0.06)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("metric", "error", "is_uncertain"),
     [(AREA, 0.1, True), (KLD, 0.05, False), (prb.ProbabilityResidual(), 0.05, False)],
@@ -257,6 +259,7 @@ def test_shares_of_mirror_populations(metric: Metric, error: float, is_uncertain
     assert bool(re.search(pattern, text)) is is_uncertain
 
 
+@pytest.mark.long
 def test_simulators_have_the_data_of_their_own_specimens() -> None:
     """In the model the simulator of the second hyperparameter is the first one."""
     observed = {"first": data(12, 0.6), "second": data(20, 1.5, seed=1)}
@@ -282,6 +285,7 @@ def test_specimens_that_simulators_share_count_once() -> None:
     require_normal(posterior(likelihood_of(model))["mu"], Y12.mean(), SD / np.sqrt(12))
 
 
+@pytest.mark.long
 def test_outputs_with_gaps() -> None:
     """Two outputs, one of which was not measured everywhere; the posterior is near the full one."""
     y = np.random.default_rng(4).normal([0.5, 1.5], SD, (20, 2))

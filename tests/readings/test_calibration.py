@@ -32,6 +32,7 @@ LONG = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["gaver", "poisson", "binomial", *LONG])
 def test_log_likelihoods_are_exact(cell: str) -> None:
     case = study.case_of(cell, 0)

@@ -172,6 +172,7 @@ def test_the_answer_has_the_estimates(calibrated: Any, report: prb.Report, secti
     assert "is fitted to 30 measured values of y." in of_answer.text[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grouped", [False, True])
 def test_repeated_readings_are_those_of_their_specimens(grouped: bool) -> None:
     values = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))

@@ -75,6 +75,7 @@ def test_hostile_names_are_text_in_markdown(tmp_path: Path, hostile: prb.Report)
     assert re.search(r"^!\[.*\]\(01-[a-z-]+\.svg\)$", text, re.M)
 
 
+@pytest.mark.long
 def test_the_same_input_gives_the_same_bytes(
     tmp_path: Path, calibrated: Any, report: prb.Report
 ) -> None:

@@ -152,6 +152,7 @@ def test_deterministics_are_compared(calibrated: Any) -> None:
     assert comparison["hyperparameter"].values.tolist() == ["mu", "sigma", "cv"]
 
 
+@pytest.mark.long
 def test_statistics_of_a_data_sheet_are_no_measured_responses() -> None:
     sheet = prb.Summary(n=40, mean=3.1, sd=0.9)
     with pm.Model() as model:

@@ -498,6 +498,7 @@ def test_a_requirement_is_not_answered_before_problems_are_removed() -> None:
     assert decision.text[0].startswith("Solve the problems")
 
 
+@pytest.mark.long
 def test_the_first_chapters_have_no_names_of_functions(calibrated: Any) -> None:
     """Page one, decision, answer and evidence are for a reader who decides."""
     model, best, posterior, test = calibrated

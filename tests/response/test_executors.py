@@ -250,6 +250,7 @@ thread.join()
 """
 
 
+@pytest.mark.long
 def test_what_hangs_elsewhere_ends_its_process() -> None:
     start = time.perf_counter()
     command = [sys.executable, "-c", HANGS]

@@ -275,6 +275,7 @@ KINDS: dict[str, Callable[[], tuple[Any, Callable[[], Any]]]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_change_is_noticed_at_every_use(kind: str) -> None:
     function, change = KINDS[kind]()

@@ -177,6 +177,7 @@ def test_the_remedy_of_the_refusal_works() -> None:
     assert optimum.point["s"] == pytest.approx((x - c).std(), rel=0.02)
 
 
+@pytest.mark.long
 def test_weibull_lives_at_voltages_of_their_own() -> None:
     # Insulating fluid, Nelson (1982), Applied Life Data Analysis.
     kilovolts = np.repeat([26.0, 30.0, 34.0, 38.0], [3, 11, 19, 8])

@@ -55,6 +55,7 @@ def tree_of(**values: Any) -> xr.DataTree:
 # -- estimates
 
 
+@pytest.mark.long
 def test_estimates_of_an_optimum_and_a_posterior() -> None:
     table = prb.compare({"optimum": optimum(), "ABC": idata()}, model=model())
     assert table.attrs["interval"] == 0.89
@@ -215,6 +216,7 @@ def sum_model() -> pm.Model:
     return model
 
 
+@pytest.mark.long
 def test_scores_of_a_model_that_was_built_again_are_those_of_the_first() -> None:
     first, again = sum_model(), sum_model()
     best = prb.minimize(first, starts=0)
@@ -261,6 +263,7 @@ def test_scores_that_compute_responses_have_to_be_requested() -> None:
     assert float(table["AreaMetric"][0]) == pytest.approx(abs(data.mean() - 1.0), abs=0.15)
 
 
+@pytest.mark.long
 def test_a_metric_and_the_likelihood_of_the_same_data_are_compared() -> None:
     def fitted(**given: Any) -> prb.Optimum:
         with pm.Model() as m:

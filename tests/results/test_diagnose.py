@@ -360,6 +360,7 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     assert str([*findings, *harmless][0]).startswith(text)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [AREA, None])
 @pytest.mark.parametrize(("limit", "is_harmless"), [(3.5, True), (2.25, False)])
 def test_a_harmless_failure_is_a_remark(metric: Any, limit: float, is_harmless: bool) -> None:

@@ -105,6 +105,7 @@ def test_the_population_of_data_with_a_gross_error_is_that_of_the_others(
     assert optimum.point["y_gross_errors"] == pytest.approx(1 / 25, rel=0.05)
 
 
+@pytest.mark.long
 def test_an_unknown_error_of_the_readings() -> None:
     """With the error fixed at its estimate, draws are those of the conjugate posterior."""
     rng = np.random.default_rng(3)

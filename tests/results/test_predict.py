@@ -206,6 +206,7 @@ def test_other_distributions_over_the_models_variables() -> None:
         np.testing.assert_allclose(y.std("sample"), sds, rtol=5 / np.sqrt(8000))
 
 
+@pytest.mark.long
 def test_epistemic_variables_and_vectors() -> None:
     with pm.Model() as model:
         mu, factor = pm.Normal("mu", 0, 1, shape=2), pm.HalfNormal("factor")

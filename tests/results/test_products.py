@@ -71,6 +71,7 @@ def test_individuals_are_those_of_the_product(name: str, x: Any) -> None:
     assert figure.axes
 
 
+@pytest.mark.long
 def test_a_diagnosis_is_of_the_data_of_the_product() -> None:
     codes = {
         name: [
@@ -120,6 +121,7 @@ def test_a_fleet_is_refused_with_what_to_pass(name: str) -> None:
         CALLS[name](fleet())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CALLS)
 def test_a_product_is_a_result(name: str) -> None:
     CALLS[name](fleet().sel(product="B"))

@@ -74,6 +74,7 @@ def test_residuals_of_two_outputs_are_whitened_together() -> None:
     np.testing.assert_allclose(tree["y"]["PRED"].values[both], shown, atol=0.04)
 
 
+@pytest.mark.long
 def test_simulators_with_common_specimens_are_whitened_together() -> None:
     y = data()
     metric = prb.LogLikelihood(error=ERROR)
@@ -100,6 +101,7 @@ def test_simulators_with_common_specimens_are_whitened_together() -> None:
     assert set(frame.columns) >= {"DV", "PRED", "IPRED", "IWRES", "CWRES"}
 
 
+@pytest.mark.long
 def test_exact_and_biased_readings() -> None:
     y = data()[:, 0]
     exact = at_truth(build(y, double, error=None), DRAWS)["y"]
@@ -111,6 +113,7 @@ def test_exact_and_biased_readings() -> None:
     np.testing.assert_allclose(biased["CWRES"], expected, atol=0.1)
 
 
+@pytest.mark.long
 def test_logarithms_and_censored_readings() -> None:
     rng = np.random.default_rng(3)
     y = np.exp(rng.normal(0.2, 0.3, 12)) + rng.normal(0, 0.05, 12)
@@ -131,6 +134,7 @@ def test_logarithms_and_censored_readings() -> None:
     assert "DataTree" in repr(tree["y"])
 
 
+@pytest.mark.long
 def test_a_right_model_has_standard_residuals() -> None:
     rng = np.random.default_rng(5)
     n, times = 120, np.array([0.3, 1.0, 3.0])

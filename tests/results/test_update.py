@@ -63,6 +63,7 @@ def first() -> tuple[pm.Model, xr.DataTree]:
     return model, drawn(model)
 
 
+@pytest.mark.long
 def test_updates_are_the_posterior_of_all_specimens(first: tuple[pm.Model, xr.DataTree]) -> None:
     model, result = first
     (likelihood,) = specimen_likelihoods(model).values()
@@ -89,6 +90,7 @@ def test_an_update_in_another_process_finds_the_points_again(
     assert_alike(again, drawn(springs(deflection(STIFFNESS))))
 
 
+@pytest.mark.long
 def test_several_outputs_with_an_unknown_error() -> None:
     model = two_outputs(TWO[:20])
     result = prb.update(drawn(model), observed=TWO[20:], model=model)

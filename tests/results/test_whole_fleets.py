@@ -64,6 +64,7 @@ def risk() -> Any:
     return prb.exceedance(fleet(), growth, 4.0, x, model=model, requirement=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*X, "sheet"])
 def test_a_row_is_the_table_of_the_product(name: str) -> None:
     model, x = template()
@@ -132,6 +133,7 @@ def test_runs_of_a_file_are_those_of_all_products(tmp_path: Any) -> None:
     }
 
 
+@pytest.mark.long
 def test_a_data_sheet_has_the_posterior_that_it_has_alone() -> None:
     model, _ = built(SHEET)
     alone = prb.sample(400, model=model, **QUIET)["posterior"].to_dataset()

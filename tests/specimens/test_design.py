@@ -260,6 +260,7 @@ def test_limits_grow_with_the_inputs() -> None:
     assert [most_runs(d) for d in (1, 2, 4, 8)] == [256, 384, 512, 1920]
 
 
+@pytest.mark.long
 def test_runs_are_those_of_the_seed() -> None:
     x = population([0.2, -0.1], [0.1, 0.15])
     first, second, third = (emulated(frame, x, seed=seed)[0] for seed in (0, 0, 1))

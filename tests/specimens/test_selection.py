@@ -37,6 +37,7 @@ def test_probabilities_of_being_seen() -> None:
     assert limits.is_seen(np.array([[np.nan, 2.0]])).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "error"), [(0.6, 0.0), (0.6, 0.9)])
 def test_log_likelihoods_of_a_selection_are_exact(share: float, error: float) -> None:
     case, limit = study.case_of(share, error, 0)
@@ -71,6 +72,7 @@ def test_log_likelihoods_of_a_selection_are_exact(share: float, error: float) ->
     assert error or not is_seen.any()
 
 
+@pytest.mark.long
 def test_selected_specimens_have_no_conditional_residuals() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))

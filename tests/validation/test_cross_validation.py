@@ -83,6 +83,7 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     assert float(found.discrepancy.mean()) > float(found.calibrated.mean())
 
 
+@pytest.mark.long
 def test_few_specimens_have_fewer_folds() -> None:
     few = minimized(data=DATA[:9], propagation=prb.Reweighted(128))
     assert most_folds(few, 5) == most_folds(few, 10) == 4

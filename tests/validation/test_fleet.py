@@ -122,6 +122,7 @@ def nan_below(x: Any) -> Any:
     return np.where(x < 0.3, np.nan, 2 * x)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [None, prb.KullbackLeibler()])
 def test_a_product_with_lost_mass_is_refused_as_alone(metric: prb.Metric | None) -> None:
     x = np.random.default_rng(1).normal(0, 0.3, (3, 12))

@@ -122,6 +122,7 @@ def test_groups_count_together_where_they_share_hyperparameters(metric: prb.Metr
     assert "at least 8" not in warned(model([6, 2], True))
 
 
+@pytest.mark.long
 def test_a_spread_in_common_of_pairs_is_underestimated() -> None:
     """The maximum of the likelihood is the root of half the variance (Neyman and Scott 1948)."""
     rigs = [f"rig {k}" for k in range(10)]
