@@ -84,8 +84,14 @@ def test_a_problem_is_whole(name: str) -> None:
     assert problem.licence
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", [n for n, p in PROBLEMS.items() if p.replicates > 1])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.slow if n == "growth" else pytest.mark.long)
+        for n, p in PROBLEMS.items()
+        if p.replicates > 1
+    ],
+)
 def test_the_reference_is_of_the_data(name: str) -> None:
     # Over twenty data sets the exact posterior has the truth within its spread: the mean of squares
     # is 1 with a standard error of .3, twice that for ends of ranges, which are exponential.

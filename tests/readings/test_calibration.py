@@ -75,8 +75,14 @@ def test_failure_rates_of_pumps() -> None:
     assert ratio.max() < 2 * ratio.min()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("cell", ["binomial", "bias", "limit"])
+@pytest.mark.parametrize(
+    "cell",
+    [
+        pytest.param("binomial", marks=pytest.mark.long),
+        pytest.param("bias", marks=pytest.mark.slow),
+        pytest.param("limit", marks=pytest.mark.long),
+    ],
+)
 def test_posteriors_are_exact(cell: str) -> None:
     row = study.row(cell, 1)
     assert np.abs(row["offset"]).max() < 0.1
