@@ -35,7 +35,7 @@ from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
     compiled,
     interpreted,
-    ninf_for_invalid,
+    vectorized,
     with_leading_axis,
 )
 from prbayes.response.condition import is_condition
@@ -122,8 +122,7 @@ class Hyperparameters:
         with interpreted():
             outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
-            batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
-            return compiled([batch], batched)
+            return compiled([batch], vectorized(outputs, {theta: batch}))
 
     @cached_property
     @interpreted()

@@ -8,7 +8,7 @@ cost no run: these are the observed specimens with other weights, or simulated s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -678,9 +678,13 @@ def specimen_pool(
     return data_set
 
 
-def _shared_arrays(likelihoods: Sequence[SpecimenLikelihood]) -> list[Any]:
-    """Return the shared variables of the points and numbers A of all likelihoods."""
-    return [v for points, log_a in map(arrays, likelihoods) for v in (*points, log_a)]
+def _in_one_list(data: Iterable[tuple[list[Any], Any]]) -> list[Any]:
+    """Return points and numbers A, by likelihood, in one list."""
+    result = []
+    for points, log_a in data:
+        result += points
+        result.append(log_a)
+    return result
 
 
 @contextmanager
@@ -688,8 +692,8 @@ def other_specimens(
     likelihoods: Sequence[SpecimenLikelihood], data: Sequence[SpecimenData]
 ) -> Iterator[None]:
     """Give compiled likelihoods the points and numbers A of other specimens within the context."""
-    variables = _shared_arrays(likelihoods)
-    values = [value for points, log_a in data for value in (*points, log_a)]
+    variables = _in_one_list(map(arrays, likelihoods))
+    values = _in_one_list(data)
     originals = [variable.get_value() for variable in variables]
     try:
         for variable, value in zip(variables, values, strict=True):
@@ -728,7 +732,7 @@ class SpecimenRefits:
             gradient = pt.grad(value, theta)
             symbols = [theta, *weights]
             if not same_specimens:
-                symbols += _shared_arrays(evaluator.likelihoods)
+                symbols += _in_one_list(map(arrays, evaluator.likelihoods))
             evaluator.functions[key] = compile_batched(symbols, [value, gradient])
         return evaluator.functions[key]
 
@@ -755,22 +759,23 @@ class SpecimenRefits:
             with np.errstate(over="ignore", invalid="ignore"):  # far from the data
                 values, gradients = function(self.theta + u @ root.T, *arguments)
             gradients = np.where(np.isfinite(gradients), gradients, 0.0)
-            return np.where(np.isfinite(values), values, np.inf), gradients @ root
+            values = np.where(np.isfinite(values), values, np.inf)
+            return values, gradients @ root
 
         start = np.zeros((len(weights[0]), self.theta.size))
         u, *_ = descend_by_slopes(
             problem, start, np.eye(self.theta.size), tolerance=5e-7, max_iterations=200
         )
         values, slopes = problem(u, np.arange(len(u)))
-        converged = np.isfinite(values) & (np.abs(slopes).max(axis=1, initial=0.0) < 0.05)
+        steepest = np.abs(slopes).max(axis=1, initial=0.0)
+        converged = np.isfinite(values) & (steepest < 0.05)
         return self.theta + u @ root.T, converged
 
     def _blocks(self, size: int) -> list[Indices]:
         """Return the numbers of the data sets that are fitted at once."""
-        n_values = sum(
-            log_a.get_value(borrow=True).size
-            for _, log_a in map(arrays, self.evaluator.likelihoods)
-        )
+        n_values = 0
+        for _, log_a in map(arrays, self.evaluator.likelihoods):
+            n_values += log_a.get_value(borrow=True).size
         return np.array_split(np.arange(size), -(-size * n_values // IN_CACHE))
 
     def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool, list[SpecimenData]]]:
@@ -780,12 +785,18 @@ class SpecimenRefits:
         values = variables_at(evaluator.hyperparameters, self.theta[None])
         pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
+        sizes = [len(likelihood.readings) for likelihood in evaluator.likelihoods]
         for block in self._blocks(draws):
-            data = [[pool(rng) for pool in pools] for _ in block]
-            rows = [[v for points, log_a in row for v in (*points, log_a)] for row in data]
-            arguments = [np.stack(column) for column in zip(*rows, strict=True)]
-            weights = [np.ones((len(block), len(each.readings))) for each in evaluator.likelihoods]
-            yield from zip(*self.fit(weights, arguments), data, strict=True)
+            data = []
+            rows = []
+            for _ in block:
+                data_set = [pool(rng) for pool in pools]
+                data.append(data_set)
+                rows.append(_in_one_list(data_set))
+            stacked = [np.stack(column) for column in zip(*rows, strict=True)]
+            weights = [np.ones((len(block), size)) for size in sizes]
+            thetas, converged = self.fit(weights, stacked)
+            yield from zip(thetas, converged, data, strict=True)
 
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.

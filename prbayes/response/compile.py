@@ -16,6 +16,7 @@ import pytensor.tensor as pt
 from pymc.distributions.custom import CustomSymbolicDistRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.shape_utils import change_dist_size
+from pytensor.compile.builders import OpFromGraph
 from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
@@ -242,6 +243,32 @@ def with_leading_axis(symbols: Sequence[TensorVariable]) -> list[TensorVariable]
     return [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
 
 
+def _expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:
+    """Replace operations that PyTensor makes of others, as logsumexp, by these others.
+
+    PyTensor would loop over the rows of a batch of such an operation.
+    """
+    parts: dict[Variable, Variable] = {}
+    for v in ancestors(graphs):
+        if v.owner is None or not isinstance(v.owner.op, OpFromGraph):
+            continue
+        if isinstance(v.owner.op, SymbolicRandomVariable):
+            continue
+        inner = v.owner.op.fgraph
+        inlined = inner.bind(dict(zip(inner.inputs, v.owner.inputs, strict=True)))
+        parts[v] = inlined[v.owner.outputs.index(v)]
+    if not parts:
+        return graphs
+    return _expanded(list(graph_replace(graphs, parts, strict=False)))
+
+
+def vectorized(
+    graphs: Sequence[TensorVariable], batches: Mapping[TensorVariable, TensorVariable]
+) -> list[TensorVariable]:
+    """Return graphs for batches of some of their variables; an invalid row is -inf."""
+    return list(vectorize_graph(_expanded(ninf_for_invalid(graphs)), batches))
+
+
 def compile_batched(
     core_inputs: Sequence[TensorVariable],
     core_outputs: Sequence[TensorVariable],
@@ -249,10 +276,9 @@ def compile_batched(
 ) -> Any:
     """Compile a graph for a batch: core inputs get a leading axis, ``extra`` ones do not."""
     with interpreted():
-        outputs = ninf_for_invalid(core_outputs)
         batched = with_leading_axis(core_inputs)
-        vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
-        return compiled([*batched, *extra], vectorized, allow_input_downcast=True)
+        outputs = vectorized(core_outputs, dict(zip(core_inputs, batched, strict=True)))
+        return compiled([*batched, *extra], outputs, allow_input_downcast=True)
 
 
 # PyTensor's rules by type of operation, and those below.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -355,13 +356,17 @@ class PopulationSampler:
                 per_specimen[v] = resized(v, size)
         self._is_batched = True
         try:
-            vectorize = vectorize_distributions if covariates else vectorize_graph
-            specimens = vectorize(aleatory, per_specimen)
+            specimens = None
+            if not covariates:
+                with suppress(NotImplementedError, ValueError, MissingInputError):
+                    specimens = vectorize_graph(aleatory, per_specimen)
+            if specimens is None:  # as PyMC resizes distributions, where PyTensor cannot
+                specimens = vectorize_distributions(aleatory, per_specimen)
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
-        except (NotImplementedError, ValueError, MissingInputError) as error:
+        except (NotImplementedError, ValueError, MissingInputError, TypeError) as error:
             if covariates:
-                raise self.refusal(error) from None
+                raise error if isinstance(error, TypeError) else self.refusal(error) from None
             # PyTensor cannot vectorize the graph: draw one population at a time.
             self._is_batched, batched = False, symbols
             # Resize before the parents are replaced, because PyMC resizes a CustomDist with the

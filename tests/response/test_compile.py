@@ -15,6 +15,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.subtensor import Subtensor
+from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator, compiled_objective
@@ -48,6 +49,19 @@ def test_a_batch_gives_what_single_calls_do() -> None:
     products, sums = function(xs, vs, 3.0)
     np.testing.assert_array_equal(products, xs[:, None] * vs)
     np.testing.assert_array_equal(sums, vs.sum(axis=1) + xs)
+
+
+def test_a_mixture_has_no_loop_over_the_rows_of_a_batch() -> None:
+    mu, weight = pt.dscalar("mu"), pt.dscalar("weight")
+    components = [pm.Normal.dist(mu, 1.0), pm.Normal.dist(mu + 3, 1.0)]
+    mixture = pm.Mixture.dist(pt.stack([weight, 1 - weight]), components)
+    function = compile_batched([mu, weight], [pm.logp(mixture, 0.5), pm.logcdf(mixture, 0.5)])
+    assert not any("Blockwise" in str(node.op) for node in function.maker.fgraph.toposort())
+    logp, logcdf = function(np.array([0.0, 1.0]), np.array([0.3, 0.8]))
+    pair = stats.norm([[0.0, 3.0], [1.0, 4.0]])
+    shares = np.array([[0.3, 0.7], [0.8, 0.2]])
+    np.testing.assert_allclose(np.exp(logp), (shares * pair.pdf(0.5)).sum(axis=1))
+    np.testing.assert_allclose(np.exp(logcdf), (shares * pair.cdf(0.5)).sum(axis=1))
 
 
 def test_an_invalid_row_is_minus_infinity_and_leaves_the_others_alone() -> None:

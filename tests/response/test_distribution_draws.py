@@ -76,7 +76,8 @@ def test_priors_and_inputs_are_those_of_pymc(name: str, size: int | None) -> Non
     h = truth if size is None else np.array([low, high])
     expected = pm.draw(_dist(case, h), DRAWS, random_seed=1, mode=PLAIN)
     _assert_prior(case, h, expected, has_density=name not in _WITHOUT_DENSITY)
-    _assert_input(case, h, expected, has_density=name not in _WITHOUT_DENSITY)
+    other = low if size is None else np.array([high, low])
+    _assert_input(case, [other, h], expected, has_density=name not in _WITHOUT_DENSITY)
 
 
 def _assert_prior(case: Case, h: Any, expected: Any, *, has_density: bool) -> None:
@@ -95,11 +96,12 @@ def _assert_prior(case: Case, h: Any, expected: Any, *, has_density: bool) -> No
     np.testing.assert_allclose(hyperparameters.log_prior(thetas), right, rtol=1e-6)
 
 
-def _assert_input(case: Case, h: Any, expected: Any, *, has_density: bool) -> None:
+def _assert_input(case: Case, populations: Any, expected: Any, *, has_density: bool) -> None:
+    h = populations[1]
     with pm.Model() as model:
         parent = pm.Normal("h", h, shape=np.shape(h))
     inputs = read_inputs("y", (pm.Normal.dist(parent), _dist(case, parent)), model)
-    params = [np.stack([h, h])]
+    params = [np.stack(populations)]
     aleatory, _ = PopulationSampler(inputs)(params, DRAWS, np.random.default_rng(3))
     _assert_same_distribution(aleatory[1][1], expected)
     if not has_density:
