@@ -59,8 +59,7 @@ class Quantity(ABC):
         self.output = output
 
     def __repr__(self) -> str:
-        name = response_name(self.response)
-        return f"{self.label} of {name}" + ("" if self.output is None else f"[{self.output}]")
+        return f"{self.label} of {response_name(self.response, self.output)}"
 
     @property
     def label(self) -> str:

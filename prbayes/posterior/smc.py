@@ -49,6 +49,7 @@ from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
+from prbayes.optimize.maximum_likelihood import is_known_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
@@ -606,7 +607,9 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     draws = chains.thetas.reshape(-1, hyperparameters.size)
     unit = hyperparameters.prior_sd
     laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
-    modes = bridged_modes(target.log_posterior, draws, unit, laplace_modes, rng)
+    is_known = is_known_at(target.evaluator, np.array([x.mode for x in laplace_modes]))
+    known = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
+    modes = bridged_modes(target.log_posterior, draws, unit, known, rng)
     if modes is None:
         return chains
     error = f" (standard error {modes.errors.max():.1g})"

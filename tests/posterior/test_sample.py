@@ -139,6 +139,22 @@ def test_an_optimum_with_another_mode_is_sampled_by_smc(monkeypatch: pytest.Monk
     assert result.posterior.attrs["sampler"] == "SMC"
 
 
+def test_modes_at_which_the_points_do_not_determine_the_likelihood_are_artefacts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    x = np.random.default_rng(1).normal(1.5, 0.3, 15)
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", 0.2, 1.5), 0.3)
+        prb.Simulator("y", np.square, inputs, observed=x**2)
+    arguments = {"draws": 50, "chains": 2, "model": model, "progressbar": False}
+    assert '"second-mode"' in prb.sample(**arguments).posterior.attrs["findings"]
+    monkeypatch.setattr(
+        "prbayes.optimize.maximum_likelihood._monte_carlo_errors",
+        lambda _, thetas: np.where(thetas[:, 0] < 0, 0.6, 0.4),
+    )
+    assert prb.sample(**arguments).posterior.attrs["findings"] == "[]"
+
+
 @pytest.mark.usefixtures("_unreliable")
 def test_modes_have_their_masses_where_smc_takes_over() -> None:
     """The response x^2 has two populations, whose masses are those of the prior."""
