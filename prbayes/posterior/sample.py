@@ -207,8 +207,8 @@ def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[F
     thetas = draws.reshape(-1, draws.shape[-1])
     is_known = is_known_at(target.evaluator, np.array([mode.mode for mode in modes]))
     separate: list[Laplace] = []
-    known = [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
-    for mode in sorted(known, key=lambda mode: -mode.log_mass):
+    determined = [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
+    for mode in sorted(determined, key=lambda mode: -mode.log_mass):
         if all(has_valley(target.log_posterior, mode.mode, x.mode) for x in separate):
             separate.append(mode)
     if len(separate) < 2:

@@ -608,8 +608,8 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     unit = hyperparameters.prior_sd
     laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
     is_known = is_known_at(target.evaluator, np.array([x.mode for x in laplace_modes]))
-    known = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
-    modes = bridged_modes(target.log_posterior, draws, unit, known, rng)
+    determined = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
+    modes = bridged_modes(target.log_posterior, draws, unit, determined, rng)
     if modes is None:
         return chains
     error = f" (standard error {modes.errors.max():.1g})"

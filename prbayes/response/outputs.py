@@ -227,8 +227,8 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
                 first = first or first_text(numbers)
         if texts:
             advice = (
-                "leave others out, as in df['life'], and where one names groups, such as suppliers, "
-                f"index hyperparameters by prb.response.group({str(texts[0])!r})"
+                "leave others out, as in df['life'], and where one names groups, such as "
+                f"suppliers, index hyperparameters by prb.response.group({str(texts[0])!r})"
             )
             text = first.partition("text '")[2]
             if text.lstrip("<>=~ +-.,")[:1].isdigit():

@@ -142,7 +142,9 @@ def test_measured_outputs_are_in_the_order_of_the_predicted_ones() -> None:
     with pytest.raises(ValueError, match=r"got the outputs \['b', 'c'\], expected \['a', 'b'\]"):
         read_case(swapped.assign_coords(place=["b", "c"]), predicted)
     extra = pd.DataFrame({"specimen": [1, 2, 3], "a": y[:, 0], "b": y[:, 1]})
-    with pytest.raises(ValueError, match=r"outputs \['specimen', 'a', 'b'\], expected \['a', 'b'\]"):
+    with pytest.raises(
+        ValueError, match=r"outputs \['specimen', 'a', 'b'\], expected \['a', 'b'\]"
+    ):
         read_case(extra, predicted)
 
 
