@@ -182,9 +182,10 @@ def _known(errors: Floats, n_specimens: int) -> Bools:
 
 def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
     """Return at which thetas, (M, d), the points determine the log-likelihoods by specimen."""
-    if not evaluator.likelihoods or not len(thetas):
-        return np.ones(len(thetas), dtype=bool)
-    return _known(_monte_carlo_errors(evaluator, thetas), _n_readings(evaluator))
+    if not len(thetas):
+        return np.ones(0, dtype=bool)
+    errors = np.broadcast_to(_monte_carlo_errors(evaluator, thetas), len(thetas))
+    return _known(errors, _n_readings(evaluator))
 
 
 def _n_readings(evaluator: Evaluator) -> int:
