@@ -22,7 +22,7 @@ from prbayes.inference.checks.population import PopulationTest
 from prbayes.model.evaluator import specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.convergence import Result
-from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, specimen_refits
+from prbayes.optimize.maximum_likelihood import specimen_pool, specimen_refits
 from prbayes.response.distributions import compiled_log_density
 from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
@@ -218,7 +218,7 @@ def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_refit_of_the_observed_data_is_the_optimum(optimum: prb.Optimum) -> None:
     refits = specimen_refits(optimum, "test")
-    theta, converged = refits.fit()
+    (theta,), (converged,) = refits.fit([np.ones((1, N))])
     assert converged
     np.testing.assert_allclose(theta, optimum.theta, atol=1e-3)
     thetas, _ = refits.reweighted([np.full((1, N), 1 / N)])
@@ -241,11 +241,10 @@ def test_refits_of_simulated_data_are_maximum_likelihood_estimates(optimum: prb.
     (likelihood,) = evaluator.likelihoods
     params = evaluator.hyperparameters.constrained(optimum.theta[None])
     pool = specimen_pool(likelihood, params, np.random.default_rng(3), size=1)
-    (points,), log_a = data = pool(np.random.default_rng(4))
+    (points,), log_a = pool(np.random.default_rng(4))
     before = specimen_log_likelihoods(evaluator, optimum.theta[None])["y"]
     refits = specimen_refits(optimum, "test")
-    with other_specimens(evaluator.likelihoods, [data]):
-        theta, _ = refits.fit()
+    (theta,), _ = refits.fit([np.ones((1, N))], [points[None], log_a[None]])
     weights = np.exp(log_a - log_a.max(axis=1, keepdims=True))
     inputs = (weights * points).sum(axis=1) / weights.sum(axis=1)
     assert theta[0] == pytest.approx(inputs.mean(), abs=1e-3)

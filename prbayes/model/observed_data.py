@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
@@ -94,6 +95,8 @@ def read_data(
         rows = _rows_of_frequencies(name, weights, np.shape(values)[:1], observed, specimens)
         values, weights = values[rows], None
         places = None if places is None else places[rows]
+    elif weights is not None:
+        _report_whole_weights(name, np.asarray(weights))
     labels = None
     if specimens is not None:
         label = f"{name}: specimens"
@@ -144,6 +147,18 @@ def _rows_of_frequencies(
             "weights as floats"
         )
     return np.repeat(np.arange(frequencies.size), frequencies)
+
+
+def _report_whole_weights(name: str, weights: Any) -> None:
+    """Report relative weights that look like frequencies."""
+    if weights.dtype.kind != "f" or not (weights == np.round(weights)).all() or weights.max() < 2:
+        return
+    text = (
+        f"{name}: weights: got whole numbers of type float, which are relative weights of "
+        f"{len(weights)} specimens; pass integers if they are frequencies (counts of a histogram), "
+        "or weights / weights.sum() if not."
+    )
+    report(Finding("whole-weights", text))
 
 
 def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> tuple[str, ...]:

@@ -27,6 +27,10 @@ class Minima(NamedTuple):
     converged: Bools  # (B,)
 
 
+# function of points, (A, r), and of the rows of the functions there, (A,), that returns values and
+# gradients, (A,) and (A, r)
+type Slopes = Callable[[Floats, Indices], tuple[Floats, Floats]]
+
 # minimiser of functions from starts, (B, r)
 type Descent = Callable[[Values, Floats], Minima]
 
@@ -47,13 +51,28 @@ def descend(
     ``curvature``, (r, r), is the Hessian of a typical function. Gradients are differences: central
     ones, at twice the cost, or one-sided ones less their bias for the curvature. Minima are then
     off by half a step, times the relative deviation of a function's Hessian.
+    """
+    problem = _by_differences(value, step, curvature, is_central)
+    return descend_by_slopes(
+        problem, start, curvature, tolerance=tolerance, max_iterations=max_iterations
+    )
+
+
+def descend_by_slopes(
+    problem: Slopes,
+    start: Floats,
+    curvature: Floats,
+    *,
+    tolerance: float,
+    max_iterations: int = 40,
+) -> Minima:
+    """Minimise B functions as `descend` does, with gradients of their own.
 
     A row has converged when its next step is predicted to gain less than ``tolerance``, or when no
     shorter step gains anything. Source: Nocedal and Wright (2006), Numerical Optimization,
     chapter 6, doi:10.1007/978-0-387-40065-5.
     """
     size, r = start.shape
-    problem = _by_differences(value, step, curvature, is_central)
     x = start.copy()
     inverse = np.broadcast_to(np.linalg.inv(curvature), (size, r, r)).copy()
     rows = np.arange(size)
@@ -105,10 +124,8 @@ def descend(
     return Minima(x, f, converged)
 
 
-def _by_differences(
-    value: Values, step: float, curvature: Floats, is_central: bool
-) -> Callable[[Floats, Indices], tuple[Floats, Floats]]:
-    """Return a function of points (A, r) and rows that returns values (A,) and gradients (A, r)."""
+def _by_differences(value: Values, step: float, curvature: Floats, is_central: bool) -> Slopes:
+    """Return values and gradients at points (A, r) from values at several points of each row."""
     r = len(curvature)
     # Difference along axes of a mean length of one, along which a typical function has equal
     # curvature. The curvature along the coordinates of correlated parameters is larger, and the

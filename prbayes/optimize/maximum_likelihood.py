@@ -19,7 +19,7 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._stats import positive_scale
-from prbayes._validate import Bools, Floats, NamedArrays
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -48,6 +48,7 @@ from prbayes.model.specimen_preparation import (
     prepared,
     specimen_data,
 )
+from prbayes.numerics.batched_minimisers import descend_by_slopes
 from prbayes.numerics.mixtures import normalised_weights
 from prbayes.numerics.modes import far_apart
 from prbayes.optimize.convergence import Result
@@ -61,7 +62,7 @@ from prbayes.optimize.optimum import (
     point_text,
     require_sampling,
 )
-from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
+from prbayes.response.compile import compile_batched, interpreted
 from prbayes.specimens.points import agreeing_points, fit_proposals
 
 
@@ -697,13 +698,17 @@ def specimen_pool(
     return data_set
 
 
+def _shared_arrays(likelihoods: Sequence[SpecimenLikelihood]) -> list[Any]:
+    """Return the shared variables of the points and numbers A of all likelihoods."""
+    return [v for points, log_a in map(arrays, likelihoods) for v in (*points, log_a)]
+
+
 @contextmanager
 def other_specimens(
     likelihoods: Sequence[SpecimenLikelihood], data: Sequence[SpecimenData]
 ) -> Iterator[None]:
     """Give compiled likelihoods the points and numbers A of other specimens within the context."""
-    shared = [arrays(likelihood) for likelihood in likelihoods]
-    variables = [v for points, log_a in shared for v in (*points, log_a)]
+    variables = _shared_arrays(likelihoods)
     values = [value for points, log_a in data for value in (*points, log_a)]
     originals = [variable.get_value() for variable in variables]
     try:
@@ -723,10 +728,13 @@ class SpecimenRefits:
     theta: Floats  # (d,): start of all estimates
     covariance: Floats  # (d, d): unit of the parameters, or the prior's spread if not finite
 
-    def _function(self) -> Any:
-        """Return the compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
+    def _function(self, *, same_specimens: bool) -> Any:
+        """Compile (thetas, *weights, *points and A) -> minus the log-likelihoods, gradients.
+
+        A row is a data set. Without points the specimens are those of the evaluator.
+        """
         evaluator = self.evaluator
-        key = "weighted log-likelihood"
+        key = f"weighted log-likelihoods, {same_specimens=}"
         if key in evaluator.functions:
             return evaluator.functions[key]
         with interpreted():
@@ -738,8 +746,10 @@ class SpecimenRefits:
             ]
             (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
-            outputs = ninf_for_invalid([value, gradient])
-            evaluator.functions[key] = compiled([theta, *weights], outputs)
+            symbols = [theta, *weights]
+            if not same_specimens:
+                symbols += _shared_arrays(evaluator.likelihoods)
+            evaluator.functions[key] = compile_batched(symbols, [value, gradient])
         return evaluator.functions[key]
 
     @cached_property
@@ -751,33 +761,37 @@ class SpecimenRefits:
                 return vectors * np.sqrt(values)
         return np.diag(self.evaluator.hyperparameters.prior_sd)
 
-    def fit(self, weights: Sequence[Floats] | None = None) -> tuple[Floats, bool]:
-        """Return the estimate, (d,), and whether its search converged.
+    def fit(self, weights: Sequence[Floats], data: Sequence[Floats] = ()) -> tuple[Floats, Bools]:
+        """Return estimates of B data sets, (B, d), and whether their searches converged.
 
-        ``weights`` of the specimens, (N,) by likelihood with sum N, are one by default.
+        ``weights``, (B, N) by likelihood, have the sum N in each row. ``data`` are points, (B, N,
+        K, *event), and numbers A, (B, N, K), of other specimens.
         """
-        from scipy.optimize import minimize as scipy_minimize
-
-        if weights is None:
-            weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root
-        function = self._function()
+        function = self._function(same_specimens=not data)
 
-        def objective(u: Floats) -> tuple[float, Floats]:
-            value, gradient = function(self.theta + root @ u, *weights)
-            if not np.isfinite(value):
-                return np.inf, np.zeros_like(u)
-            return float(value), root.T @ np.where(np.isfinite(gradient), gradient, 0.0)
+        def problem(u: Floats, rows: Indices) -> tuple[Floats, Floats]:
+            arguments = [array[rows] for array in (*weights, *data)]
+            with np.errstate(over="ignore", invalid="ignore"):  # far from the data
+                values, gradients = function(self.theta + u @ root.T, *arguments)
+            gradients = np.where(np.isfinite(gradients), gradients, 0.0)
+            return np.where(np.isfinite(values), values, np.inf), gradients @ root
 
-        result = scipy_minimize(
-            objective,
-            np.zeros(self.theta.size),
-            jac=True,
-            method="BFGS",
-            options={"gtol": 1e-3, "maxiter": 200},
+        start = np.zeros((len(weights[0]), self.theta.size))
+        u, *_ = descend_by_slopes(
+            problem, start, np.eye(self.theta.size), tolerance=5e-7, max_iterations=200
         )
-        slope = np.abs(objective(result.x)[1]).max()
-        return self.theta + root @ result.x, bool(np.isfinite(result.fun) and slope < 0.05)
+        values, slopes = problem(u, np.arange(len(u)))
+        converged = np.isfinite(values) & (np.abs(slopes).max(axis=1, initial=0.0) < 0.05)
+        return self.theta + u @ root.T, converged
+
+    def _blocks(self, size: int) -> list[Indices]:
+        """Return the numbers of the data sets that are fitted at once."""
+        n_values = sum(
+            log_a.get_value(borrow=True).size
+            for _, log_a in map(arrays, self.evaluator.likelihoods)
+        )
+        return np.array_split(np.arange(size), -(-size * n_values // IN_CACHE))
 
     def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool, list[SpecimenData]]]:
         """Yield estimates of simulated data sets, whether they converged, and the data."""
@@ -786,11 +800,12 @@ class SpecimenRefits:
         values = variables_at(evaluator.hyperparameters, self.theta[None])
         pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
-        for _ in range(draws):
-            data = [pool(rng) for pool in pools]
-            with other_specimens(evaluator.likelihoods, data):
-                theta, converged = self.fit()
-            yield theta, converged, data
+        for block in self._blocks(draws):
+            data = [[pool(rng) for pool in pools] for _ in block]
+            rows = [[v for points, log_a in row for v in (*points, log_a)] for row in data]
+            arguments = [np.stack(column) for column in zip(*rows, strict=True)]
+            weights = [np.ones((len(block), len(each.readings))) for each in evaluator.likelihoods]
+            yield from zip(*self.fit(weights, arguments), data, strict=True)
 
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.
@@ -812,9 +827,10 @@ class SpecimenRefits:
             if stated is not None:  # the likelihood contains stated weights, and so do the factors
                 factors = factors / positive_scale(stated)
             by_likelihood.append(factors)
-        estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
+        blocks = self._blocks(len(weights[0]))
+        estimates = [self.fit([factors[block] for factors in by_likelihood]) for block in blocks]
         thetas, converged = zip(*estimates, strict=True)
-        return np.array(thetas), np.array(converged)
+        return np.concatenate(thetas), np.concatenate(converged)
 
 
 def is_specimen_optimum(result: object) -> bool:

@@ -78,9 +78,18 @@ def test_a_table_of_counts_of_groups() -> None:
 
 
 def test_relative_weights_are_floats() -> None:
-    optimum = prb.minimize(model(prb.KullbackLeibler(), weights=COUNTS.astype(float)), starts=0)
+    relative = COUNTS / COUNTS.sum()
+    optimum = prb.minimize(model(prb.KullbackLeibler(), weights=relative), starts=0)
     kish = COUNTS.sum() ** 2 / (COUNTS**2).sum()
     assert optimum.stderr["mu"] == pytest.approx(SAMPLE.std() / np.sqrt(kish), rel=0.1)
+
+
+def test_whole_numbers_of_type_float_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    model(prb.KullbackLeibler(), weights=COUNTS / COUNTS.sum())
+    model(prb.KullbackLeibler(), weights=(COUNTS > 1).astype(float))
+    assert not caplog.records
+    model(prb.KullbackLeibler(), weights=COUNTS.astype(float))
+    assert "pass integers if they are frequencies" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -121,12 +121,6 @@ def test_a_fleet_is_refused_with_what_to_pass(name: str) -> None:
         CALLS[name](fleet())
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", CALLS)
-def test_a_product_is_a_result(name: str) -> None:
-    CALLS[name](fleet().sel(product="B"))
-
-
 SELECTIONS: dict[str, Callable[[], Any]] = {
     "chain": lambda: posterior().isel(chain=0),
     "label": lambda: posterior().sel(chain=0),
@@ -143,12 +137,15 @@ def _from_dict() -> Any:
 
 
 @pytest.mark.parametrize("selection", SELECTIONS)
-@pytest.mark.parametrize(
-    "name", [n if n in ("population", "diagnose", "Report") else
-             pytest.param(n, marks=pytest.mark.long) for n in CALLS]
-)  # fmt: skip
+@pytest.mark.parametrize("name", ["population", "compare"])
 def test_selected_chains_and_draws_are_results(name: str, selection: str) -> None:
     CALLS[name](SELECTIONS[selection]())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [n for n in CALLS if n not in ("population", "compare")])
+def test_a_single_chain_of_a_product_is_a_result(name: str) -> None:
+    CALLS[name](SELECTIONS["product"]())
 
 
 def test_numbers_of_a_selected_chain_are_those_of_a_result_with_one() -> None:
