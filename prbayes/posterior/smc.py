@@ -399,9 +399,13 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            # Leave out few-specimens, because draws are as wide as few specimens make them. Shares
-            # of modes take the place of the optimum's finding.
-            left_out = {"few-specimens", *(finding.code for finding in chains.findings)}
+            # Leave out findings that advise to sample, because draws are as wide as few specimens
+            # and ridges make them. Shares of modes take the place of the optimum's finding.
+            codes = {finding.code for finding in optimum.findings}
+            left_out = {"few-specimens", "flat-likelihood", *(f.code for f in chains.findings)}
+            thinned = rows[:: len(rows) // 100 + 1]
+            if "narrow-population" in codes and is_known_at(evaluator, thinned).mean() > 0.95:
+                left_out.add("narrow-population")
             findings += [f for f in optimum.findings if f.code not in left_out]
             if is_estimate:
                 findings += prior_conflicts(optimum, evaluator, thetas)
