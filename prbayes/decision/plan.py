@@ -436,7 +436,8 @@ def _refuse_moving_support(sample: ResponseSample) -> None:
         transform = InverseTransform(name, sample.design.inputs, center)
     except TypeError:  # without an inverse distribution function, as of several normal inputs
         return
-    if not transform.has_support_of(sample.parents(populations.thinned())):
+    of_draws = sample.parents(populations.thinned())
+    if not transform.has_support_of(of_draws):
         raise ValueError(
             f"prb.plan: {name}: got inputs whose support moves with their hyperparameters, as of a "
             "uniform population, to which the information of specimens does not apply; draw more "

@@ -59,7 +59,8 @@ class Quantity(ABC):
         self.output = output
 
     def __repr__(self) -> str:
-        return f"{self.label} of {response_name(self.response, self.output)}"
+        name = response_name(self.response, self.output)
+        return f"{self.label} of {name}"
 
     @property
     def label(self) -> str:

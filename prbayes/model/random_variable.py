@@ -465,7 +465,8 @@ class SimulatorRV(ObservedRV):
 def response_name(function: Any, output: Any = None) -> str:
     """Return the name of a response, or the arguments of a lambda function; of one output."""
     if output is not None:
-        return f"{response_name(function)}[{output}]"
+        name = response_name(function)
+        return f"{name}[{output}]"
     inner = getattr(function, "function", function)  # unwrap a function that `scalar` has wrapped
     name = str(getattr(inner, "__name__", type(inner).__name__))
     if name != "<lambda>":

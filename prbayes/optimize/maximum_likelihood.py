@@ -178,15 +178,17 @@ def _known(errors: Floats, n_specimens: int) -> Bools:
     few points. With many specimens the limit is a tenth of a nat for each, in quadrature. The error
     for rounded readings is .06 nats a specimen.
     """
-    return np.asarray(errors <= max(0.5, 0.1 * float(np.sqrt(n_specimens))))
+    limit = max(0.5, 0.1 * float(np.sqrt(n_specimens)))
+    return np.asarray(errors <= limit)
 
 
 def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
     """Return at which thetas, (M, d), the points determine the log-likelihoods by specimen."""
     if not len(thetas):
         return np.ones(0, dtype=bool)
-    errors = np.broadcast_to(_monte_carlo_errors(evaluator, thetas), len(thetas))
-    return _known(errors, _n_readings(evaluator))
+    errors = _monte_carlo_errors(evaluator, thetas)
+    of_each = np.broadcast_to(errors, len(thetas))
+    return _known(of_each, _n_readings(evaluator))
 
 
 def _n_readings(evaluator: Evaluator) -> int:
@@ -220,7 +222,8 @@ def supported_modes(
         for likelihood in evaluator.likelihoods
     ]
     values = np.array([optimum.value for optimum in optima])
-    errors_of_points = _monte_carlo_errors(evaluator, np.stack([x.theta for x in optima]))
+    thetas = np.stack([optimum.theta for optimum in optima])
+    errors_of_points = _monte_carlo_errors(evaluator, thetas)
     is_supported = _supported(values, errors_of_points, _n_readings(evaluator))
     if is_supported.any():
         optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]

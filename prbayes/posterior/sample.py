@@ -205,7 +205,8 @@ def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[F
     not determine the likelihood, such as that of a very narrow population, is an artefact of them.
     """
     thetas = draws.reshape(-1, draws.shape[-1])
-    is_known = is_known_at(target.evaluator, np.array([mode.mode for mode in modes]))
+    centers = np.array([mode.mode for mode in modes])
+    is_known = is_known_at(target.evaluator, centers)
     separate: list[Laplace] = []
     determined = [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
     for mode in sorted(determined, key=lambda mode: -mode.log_mass):

@@ -402,9 +402,11 @@ def result_of(
             # Leave out findings that advise to sample, because draws are as wide as few specimens
             # and ridges make them. Shares of modes take the place of the optimum's finding.
             codes = {finding.code for finding in optimum.findings}
-            left_out = {"few-specimens", "flat-likelihood", *(f.code for f in chains.findings)}
+            of_modes = {finding.code for finding in chains.findings}
+            left_out = {"few-specimens", "flat-likelihood", *of_modes}
             thinned = rows[:: len(rows) // 100 + 1]
-            if "narrow-population" in codes and is_known_at(evaluator, thinned).mean() > 0.95:
+            is_narrow = "narrow-population" in codes
+            if is_narrow and is_known_at(evaluator, thinned).mean() > 0.95:
                 left_out.add("narrow-population")
             findings += [f for f in optimum.findings if f.code not in left_out]
             if is_estimate:
@@ -611,7 +613,8 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     draws = chains.thetas.reshape(-1, hyperparameters.size)
     unit = hyperparameters.prior_sd
     laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
-    is_known = is_known_at(target.evaluator, np.array([x.mode for x in laplace_modes]))
+    centers = np.array([mode.mode for mode in laplace_modes])
+    is_known = is_known_at(target.evaluator, centers)
     determined = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
     modes = bridged_modes(target.log_posterior, draws, unit, determined, rng)
     if modes is None:
