@@ -234,7 +234,7 @@ def exceedance(
             "prob": prob,
             "limit": quantity.limit,
             "below": int(below),
-            "response": response_name(response),
+            "response": response_name(response, quantity.output),
             "responses": n_searched + n_nested + sum(estimate.responses for estimate in estimates),
             "source": bounds[1].source,
             "random_seed": str(question.seed),

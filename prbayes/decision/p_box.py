@@ -147,7 +147,7 @@ def p_box(
     # Distribution functions increase, so that a bound at y also holds beyond it.
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
-    name = response_name(response)
+    name = response_name(response, output)
     lost = max(sample.lost for sample in samples)
     answer = "the mean is that of the others, and the bands contain them at either end"
     findings = findings_of(response) + left_out_findings(name, lost, answer)

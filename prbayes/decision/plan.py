@@ -20,6 +20,7 @@ from prbayes._finding import Finding, Findings, as_json, counted, report, senten
 from prbayes._stats import positive_scale, reached
 from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
 from prbayes.decision.populations import (
+    InverseTransform,
     Populations,
     ResponseSample,
     checked_by_family,
@@ -397,6 +398,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     center = sample.populations.center
     design = sample.design
     if not design.has_runs:
+        _refuse_moving_support(sample)
         return fisher_information(sample, ReadingErrors.of(sample, metric))
     node = evaluator.nodes[sample.k]
     if metric is None and node.metric.exact_likelihood:  # new specimens are known themselves
@@ -423,13 +425,33 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     return _at_most(information / n, fisher_information(sample))
 
 
+def _refuse_moving_support(sample: ResponseSample) -> None:
+    """Raise if the ends of the inputs' populations depend on hyperparameters.
+
+    The extreme specimens determine such ends. They are no part of the Fisher information.
+    """
+    populations, name = sample.populations, sample.responses.name
+    center = sample.parents(populations.center[None])
+    try:
+        transform = InverseTransform(name, sample.design.inputs, center)
+    except TypeError:  # without an inverse distribution function, as of several normal inputs
+        return
+    of_draws = sample.parents(populations.thinned())
+    if not transform.has_support_of(of_draws):
+        raise ValueError(
+            f"prb.plan: {name}: got inputs whose support moves with their hyperparameters, as of a "
+            "uniform population, to which the information of specimens does not apply; draw more "
+            "specimens from the calibrated population, and calibrate them"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ReadingErrors:
     """Errors, rounding and limits of the readings of a response."""
 
     readings: Readings  # readings whose errors and steps apply, and repeat if there are more points
     unknown: Variable[Any, Any] | None  # model variable that is the error, if it is unknown
-    limits: tuple[Any, Any]  # lower and upper limits, infinite without a limit
+    limits: tuple[Any, Any]  # lower and upper limits, NaN without a limit
 
     @classmethod
     def of(cls, sample: ResponseSample, metric: Metric | None) -> ReadingErrors | None:
@@ -472,9 +494,8 @@ class ReadingErrors:
                 "metric=prb.LogLikelihood(error=...) to prb.decision.Condition"
             )
         low, high = likelihood.censored or (None, None)
-        low = -np.inf if low is None else low
-        high = np.inf if high is None else high
-        return cls(readings, unknown, (low, high))
+        limits = (np.nan if low is None else low, np.nan if high is None else high)
+        return cls(readings, unknown, limits)
 
     def draw(
         self, outputs: Floats, scores: Floats, values: Mapping[str, Floats], step: Floats
@@ -494,7 +515,7 @@ class ReadingErrors:
         like = self.readings.rows(np.resize(np.arange(len(self.readings)), len(outputs)))
         result = add_errors(like, np.random.default_rng(0), outputs[None], factor, factor)[0]
         lowest, highest = (np.resize(limit, shape) for limit in self.limits)
-        return np.clip(result, lowest, highest), scores
+        return np.fmin(np.fmax(result, lowest), highest), scores  # NaN is no limit
 
 
 def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = None) -> Floats:

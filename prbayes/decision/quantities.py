@@ -59,8 +59,8 @@ class Quantity(ABC):
         self.output = output
 
     def __repr__(self) -> str:
-        name = response_name(self.response)
-        return f"{self.label} of {name}" + ("" if self.output is None else f"[{self.output}]")
+        name = response_name(self.response, self.output)
+        return f"{self.label} of {name}"
 
     @property
     def label(self) -> str:

@@ -462,8 +462,11 @@ class SimulatorRV(ObservedRV):
         return values
 
 
-def response_name(function: Any) -> str:
-    """Return the name of a response, or the arguments of a lambda function."""
+def response_name(function: Any, output: Any = None) -> str:
+    """Return the name of a response, or the arguments of a lambda function; of one output."""
+    if output is not None:
+        name = response_name(function)
+        return f"{name}[{output}]"
     inner = getattr(function, "function", function)  # unwrap a function that `scalar` has wrapped
     name = str(getattr(inner, "__name__", type(inner).__name__))
     if name != "<lambda>":

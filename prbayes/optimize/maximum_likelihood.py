@@ -163,24 +163,46 @@ _UNSUPPORTED = Finding(
 )
 
 
-def _monte_carlo_errors(evaluator: Evaluator, optima: Sequence[Mode]) -> Floats:
-    """Return the Monte Carlo error of the log-likelihood at each optimum, in nats."""
-    thetas = np.stack([optimum.theta for optimum in optima])
+def _monte_carlo_errors(evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the Monte Carlo error of the log-likelihood at thetas, (M, d), in nats."""
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
     return np.asarray(np.sqrt(variance))
 
 
-def _supported(values: Floats, errors: Floats, n_specimens: int) -> Bools:
-    """Return which optima, (M,), are not spurious, from their values and Monte Carlo errors.
+def _known(errors: Floats, n_specimens: int) -> Bools:
+    """Return which log-likelihoods, (M,), are known, from their Monte Carlo errors.
 
     A log-likelihood with a Monte Carlo error of more than half a nat shows a spurious maximum: a
     population that is narrower than the distances between points can have most of its density at a
     few points. With many specimens the limit is a tenth of a nat for each, in quadrature. The error
-    for rounded readings is .06 nats a specimen. A maximum is too high rather than too low: so the
-    best optimum is the best after two errors are subtracted, and what seems better is left out.
+    for rounded readings is .06 nats a specimen.
     """
-    is_known: Bools = errors <= max(0.5, 0.1 * float(np.sqrt(n_specimens)))
+    limit = max(0.5, 0.1 * float(np.sqrt(n_specimens)))
+    return np.asarray(errors <= limit)
+
+
+def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
+    """Return at which thetas, (M, d), the points determine the log-likelihoods by specimen."""
+    if not len(thetas):
+        return np.ones(0, dtype=bool)
+    errors = _monte_carlo_errors(evaluator, thetas)
+    of_each = np.broadcast_to(errors, len(thetas))
+    return _known(of_each, _n_readings(evaluator))
+
+
+def _n_readings(evaluator: Evaluator) -> int:
+    """Return the number of specimens of all log-likelihoods."""
+    return sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+
+
+def _supported(values: Floats, errors: Floats, n_specimens: int) -> Bools:
+    """Return which optima, (M,), are not spurious, from their values and Monte Carlo errors.
+
+    A maximum is too high rather than too low: so the best optimum is the best after two errors are
+    subtracted, and what seems better is left out.
+    """
+    is_known = _known(errors, n_specimens)
     if not is_known.any():
         return is_known
     best = np.argmin(np.where(is_known, values + 2 * errors, np.inf))
@@ -200,8 +222,9 @@ def supported_modes(
         for likelihood in evaluator.likelihoods
     ]
     values = np.array([optimum.value for optimum in optima])
-    size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
-    is_supported = _supported(values, _monte_carlo_errors(evaluator, optima), size)
+    thetas = np.stack([optimum.theta for optimum in optima])
+    errors_of_points = _monte_carlo_errors(evaluator, thetas)
+    is_supported = _supported(values, errors_of_points, _n_readings(evaluator))
     if is_supported.any():
         optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))

@@ -22,6 +22,7 @@ from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.numerics.modes import Laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
+from prbayes.optimize.maximum_likelihood import is_known_at
 from prbayes.optimize.optimum import Optimum
 from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
@@ -200,13 +201,19 @@ def draw_posterior(
 def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[Finding]:
     """Report the share of draws, (..., d), around each mode, if two or more have 1 % of them.
 
-    A draw belongs to the mode that is nearest in standard deviations.
+    A draw belongs to the mode that is nearest in standard deviations. A mode at which the points do
+    not determine the likelihood, such as that of a very narrow population, is an artefact of them.
     """
     thetas = draws.reshape(-1, draws.shape[-1])
+    centers = np.array([mode.mode for mode in modes])
+    is_known = is_known_at(target.evaluator, centers)
     separate: list[Laplace] = []
-    for mode in sorted(modes, key=lambda mode: -mode.log_mass):
+    determined = [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
+    for mode in sorted(determined, key=lambda mode: -mode.log_mass):
         if all(has_valley(target.log_posterior, mode.mode, x.mode) for x in separate):
             separate.append(mode)
+    if len(separate) < 2:
+        return []
     factors = [np.linalg.inv(np.linalg.cholesky(mode.covariance)) for mode in separate]
     pairs = zip(separate, factors, strict=True)
     distances = [np.linalg.norm((thetas - mode.mode) @ root.T, axis=1) for mode, root in pairs]

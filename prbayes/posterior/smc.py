@@ -49,6 +49,7 @@ from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
+from prbayes.optimize.maximum_likelihood import is_known_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
@@ -398,9 +399,15 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            # Leave out few-specimens, because draws are as wide as few specimens make them. Shares
-            # of modes take the place of the optimum's finding.
-            left_out = {"few-specimens", *(finding.code for finding in chains.findings)}
+            # Leave out findings that advise to sample, because draws are as wide as few specimens
+            # and ridges make them. Shares of modes take the place of the optimum's finding.
+            codes = {finding.code for finding in optimum.findings}
+            of_modes = {finding.code for finding in chains.findings}
+            left_out = {"few-specimens", "flat-likelihood", *of_modes}
+            thinned = rows[:: len(rows) // 100 + 1]
+            is_narrow = "narrow-population" in codes
+            if is_narrow and is_known_at(evaluator, thinned).mean() > 0.95:
+                left_out.add("narrow-population")
             findings += [f for f in optimum.findings if f.code not in left_out]
             if is_estimate:
                 findings += prior_conflicts(optimum, evaluator, thetas)
@@ -606,7 +613,10 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     draws = chains.thetas.reshape(-1, hyperparameters.size)
     unit = hyperparameters.prior_sd
     laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
-    modes = bridged_modes(target.log_posterior, draws, unit, laplace_modes, rng)
+    centers = np.array([mode.mode for mode in laplace_modes])
+    is_known = is_known_at(target.evaluator, centers)
+    determined = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
+    modes = bridged_modes(target.log_posterior, draws, unit, determined, rng)
     if modes is None:
         return chains
     error = f" (standard error {modes.errors.max():.1g})"

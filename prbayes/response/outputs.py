@@ -127,10 +127,10 @@ def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) ->
     default = tuple(range(len(expected)))
     labels = tuple(labels)
     expected = tuple(expected)
-    if len(labels) != len(expected) or labels == expected or default in (labels, expected):
+    if labels == expected or default == expected or tuple(range(len(labels))) == labels:
         return None
     numbers = [np.asarray(side) for side in (labels, expected)]
-    if all(side.dtype.kind in "iuf" for side in numbers):
+    if len(labels) == len(expected) and all(side.dtype.kind in "iuf" for side in numbers):
         order = np.argsort(numbers[0])
         rank = np.argsort(np.argsort(numbers[1]))
         if np.allclose(numbers[0][order], np.sort(numbers[1]), rtol=1e-9, atol=0):
@@ -138,7 +138,8 @@ def output_order(labels: Sequence[Any], expected: Sequence[Any], prefix: str) ->
     elif set(labels) == set(expected) and len(set(labels)) == len(labels):
         return np.array([labels.index(label) for label in expected], dtype=np.intp)
     raise KeyError(
-        f"{prefix} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
+        f"{prefix} the outputs {list(labels[:9])}, expected {list(expected[:9])}, each once, in "
+        "any order"
     )
 
 
@@ -225,12 +226,20 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
                 texts.append(column)
                 first = first or first_text(numbers)
         if texts:
+            advice = (
+                "leave others out, as in df['life'], and where one names groups, such as "
+                f"suppliers, index hyperparameters by prb.response.group({str(texts[0])!r})"
+            )
+            text = first.partition("text '")[2]
+            if text.lstrip("<>=~ +-.,")[:1].isdigit():
+                advice = (
+                    "convert texts, such as decimal commas, by pd.to_numeric, and state limits, "
+                    "such as '<3.4', by prb.LogLikelihood(censored=...)"
+                )
             raise TypeError(
                 f"{label}: got a DataFrame whose columns {texts} are no numbers "
                 f"({first or 'but other objects'}), expected a "
-                "column of measured responses for each output; leave others out, as in "
-                "df['life'], and where one names groups, such as suppliers, index hyperparameters "
-                f"by prb.response.group({str(texts[0])!r})"
+                f"column of measured responses for each output; {advice}"
             )
     values = real_array(observed, label)
     if np.ndim(values) == 2:

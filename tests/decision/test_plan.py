@@ -179,6 +179,20 @@ def test_errors_of_readings_are_part_of_the_information() -> None:
     # Censored at the mean: half of the readings are equal.
     censored = information(same, prb.LogLikelihood(censored=(None, populations.center[0])))
     assert censored[0, 0] == pytest.approx((0.5 + 1 / np.pi) / sigma**2, rel=0.05)
+    # A limit that no reading of the second output reaches, and none of the first, change nothing.
+    limited = prb.LogLikelihood(error=[0.3, 1.0], censored=(None, [None, 1e3]))
+    unchanged = information(lambda x: np.stack([x, x], axis=-1), limited)
+    np.testing.assert_array_equal(unchanged, found)
+
+
+def test_ends_that_extreme_specimens_determine_are_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Uniform.dist(0.0, pm.Normal("end", 3, 0.3))
+        prb.Simulator("y", same, x, observed=np.linspace(0.1, 2.9, 30))
+    draws = np.random.default_rng(0).uniform(2.95, 3.1, (1, 200))
+    result = xr.DataTree.from_dict({"posterior": xr.Dataset({"end": (("chain", "draw"), draws)})})
+    with pytest.raises(ValueError, match="support moves with their hyperparameters, as of a unif"):
+        prb.plan(result, {"same": prb.decision.Condition(same, x)}, k=30, model=model)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -15,7 +16,7 @@ from normal_posterior import exact_moments, moments_of, require_close
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._finding import from_json
+from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
 from prbayes.posterior.importance import ImportanceOptions
 from prbayes.response.compile import PLAIN
@@ -137,6 +138,38 @@ def test_an_optimum_with_another_mode_is_sampled_by_smc(monkeypatch: pytest.Monk
     assert any(mode["comparable"] for mode in optimum.local_optima)
     result = prb.sample(50, chains=2, optimum=optimum, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
+
+
+def test_modes_at_which_the_points_do_not_determine_the_likelihood_are_artefacts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    x = np.random.default_rng(1).normal(1.5, 0.3, 15)
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", 0.2, 1.5), 0.3)
+        prb.Simulator("y", np.square, inputs, observed=x**2)
+    arguments = {"draws": 50, "chains": 2, "model": model, "progressbar": False}
+    assert '"second-mode"' in prb.sample(**arguments).posterior.attrs["findings"]
+    monkeypatch.setattr(
+        "prbayes.optimize.maximum_likelihood._monte_carlo_errors",
+        lambda _, thetas: np.where(thetas[:, 0] < 0, 0.6, 0.4),
+    )
+    assert prb.sample(**arguments).posterior.attrs["findings"] == "[]"
+
+
+def test_draws_lack_findings_of_the_optimum_that_advise_to_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = linear_model()
+    codes = ("few-specimens", "flat-likelihood", "narrow-population", "rounded-data")
+    found = tuple(Finding(code, "Text.") for code in codes)
+    optimum = replace(prb.minimize(model, progressbar=False), findings=found)
+    for error, expected in ((0.1, codes[3:]), (9.0, codes[2:])):
+        monkeypatch.setattr(
+            "prbayes.optimize.maximum_likelihood._monte_carlo_errors", lambda *_, e=error: e
+        )
+        draws = prb.sample(50, chains=2, optimum=optimum, model=model, progressbar=False)
+        got = tuple(f.code for f in from_json(draws.posterior.attrs["findings"]))
+        assert got == expected
 
 
 @pytest.mark.usefixtures("_unreliable")

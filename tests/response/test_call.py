@@ -681,6 +681,7 @@ class Reversed(NamedTuple):
     ("result", "match"),
     [
         (pd.DataFrame(PAIRS, columns=["p", "r"]), r"outputs \['p', 'r'\], expected \['p', 'q'\]"),
+        (pd.DataFrame(0.0, range(3), ["p", "q", "id"]), r"outputs \['p', 'q', 'id'\], expected"),
         (pd.DataFrame(PAIRS, columns=["p", "p"]), r"outputs \['p', 'p'\], expected"),
         (
             xr.DataArray(PAIRS, dims=["n", "out"], coords={"out": ["a", "b"]}),

@@ -37,6 +37,11 @@ def test_a_column_of_no_numbers_is_named(names):
     table = pd.DataFrame({"supplier": names, "life": [1.0, 2.0]})
     with pytest.raises(TypeError, match=r"y: .*columns \['supplier'\] are no numbers.*group\('sup"):
         read_observed("y", table)
+    # Texts of numbers are no groups.
+    for text in ("<247", "3,09", "> 3.4", "-1,5"):
+        with pytest.raises(TypeError, match=rf"the text '{text}'.*to_numeric.*censored=") as caught:
+            read_observed("y", pd.DataFrame({"life": [text, "1"]}))
+        assert "group" not in str(caught.value)
     # Numbers may be objects.
     values, outputs = read_observed("y", table[["life"]].astype(object))
     assert values.tolist() == [1.0, 2.0]

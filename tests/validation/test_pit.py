@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -140,6 +141,11 @@ def test_measured_outputs_are_in_the_order_of_the_predicted_ones() -> None:
         np.testing.assert_array_equal(read_case(observed, predicted).conditions[0].measured, y)
     with pytest.raises(ValueError, match=r"got the outputs \['b', 'c'\], expected \['a', 'b'\]"):
         read_case(swapped.assign_coords(place=["b", "c"]), predicted)
+    extra = pd.DataFrame({"specimen": [1, 2, 3], "a": y[:, 0], "b": y[:, 1]})
+    with pytest.raises(
+        ValueError, match=r"outputs \['specimen', 'a', 'b'\], expected \['a', 'b'\]"
+    ):
+        read_case(extra, predicted)
 
 
 def test_the_area_is_the_integral_in_any_order() -> None:
