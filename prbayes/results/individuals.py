@@ -191,6 +191,8 @@ class Individuals(Tree):
 
     def to_dataframe(self) -> Any:
         """Return mean, sd and 89 % interval of each input of each specimen, a row for each."""
+        if not self._is_whole:
+            return super().to_dataframe()
         import pandas as pd
 
         tables = []
