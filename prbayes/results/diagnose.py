@@ -248,8 +248,9 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     optimum = result if isinstance(result, Optimum) else None
     tree = _checked_tree(result)
     has_draws = "posterior" in tree.children
-    has_calibration = "calibration" in tree.children
-    calibration = tree["calibration"].to_dataset() if has_calibration else xr.Dataset()
+    calibration = xr.Dataset()
+    if "calibration" in tree.children:
+        calibration = tree["calibration"].to_dataset()
     if has_draws and (not calibration or pm.Model.get_context(error_if_none=False)):
         model = model_on_context(model, "prb.diagnose")
     if model is not None:
