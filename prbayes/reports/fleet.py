@@ -189,8 +189,8 @@ def _about_products(n: int, most: int, table: xr.Dataset | None) -> str:
         return text + "Populations need the model, which was not given."
     return text + (
         f"Mean and standard deviation (sd) of the inputs have {prob} intervals in brackets. 90% of "
-        "the specimens exceed the B-basis value, with 95% confidence. Rows are sorted by the verdict "
-        "of the validity test, the probability of a decision, findings, and the B-basis value."
+        "the specimens exceed the B-basis value, with 95% confidence. Rows are sorted by the "
+        "verdict of the test, the probability of a decision, findings, and the B-basis value."
     )
 
 
