@@ -131,6 +131,10 @@ class Tree(ShownArray, xr.DataTree):  # type: ignore[misc]  # xarray gives __rep
 
     __slots__ = ()
 
+    def to_dataframe(self) -> Any:
+        """Return the variables of a group or a selection as a data frame, as `Dataset` does."""
+        return self.to_dataset().to_dataframe()
+
 
 class Table(ShownArray, xr.Dataset):
     """A dataset with sentences."""

@@ -244,6 +244,8 @@ def test_tables_have_the_numbers_of_their_results() -> None:
     row = table[table["specimen"] == drawn["posterior"]["specimen"].values[1]].iloc[0]
     expected = [draws.mean(), draws.std(), *draws.quantile([0.055, 0.945])]
     np.testing.assert_allclose(row[["mean", "sd", "lower", "upper"]].astype(float), expected)
+    # A group or a selection is a table of its variables.
+    assert "x" in drawn["posterior"].mean(("chain", "draw")).to_dataframe().columns
 
     products = result("calibrate_each")
     table = products.to_dataframe()

@@ -292,8 +292,8 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
 @pytest.mark.usefixtures("no_run")
 @pytest.mark.parametrize("name", ["posterior", pytest.param("optimum", marks=pytest.mark.long)])
 def test_a_diagnosis_states_the_power(problem: Problem, results: Any, name: str) -> None:
-    model = problem.model if name == "posterior" else None
-    found = prb.diagnose(results[name], model=model)
+    with problem.model:  # The model on the context counts, as model= does.
+        found = prb.diagnose(results[name])
     assert found.ok
     assert not found.untested
     assert str(found).startswith("No problem was found.")
@@ -326,6 +326,12 @@ def test_chains_in_different_modes_take_the_place_of_r_hat(chains: xr.DataTree) 
     apart["posterior"]["mu"][{"chain": 1}] += 2.0
     codes = [finding.code for finding in _check_sampler(apart, None, by_specimen=True).findings]
     assert codes == ["chains-in-different-modes"]
+    assert not _check_sampler(chains, None, by_specimen=True).remarks
+    all_diverge = xr.Dataset({"diverging": apart["posterior"]["mu"] > -np.inf})
+    apart["sample_stats"] = xr.DataTree(all_diverge)
+    (remark,) = _check_sampler(apart, None, by_specimen=True).remarks
+    total = chains["posterior"]["mu"].size
+    assert remark.text.startswith(f"{total} of {total} transitions of NUTS diverged")
 
 
 def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) -> None:

@@ -195,6 +195,7 @@ def _by_name(names: Sequence[str], numbers: Floats) -> NamedArrays:
     """Return numbers, (groups, k, q) -> (groups, k), by quantity, and the cv."""
     by_name = dict(zip(names, np.moveaxis(numbers, -1, 0), strict=True))
     mean, sd = by_name.pop("mean"), by_name.pop("sd")
-    # if the mean is larger than rounding errors
-    size = np.where(np.abs(mean) > 1e-9 * sd, np.abs(mean), np.nan)
-    return {"mean": mean, "sd": sd, "cv": sd / size} | by_name
+    # A mean of zero is computed with rounding errors, and has no cv.
+    mean = np.where(np.abs(mean) <= 1e-9 * sd, 0.0, mean)
+    cv = sd / np.where(mean == 0, np.nan, np.abs(mean))
+    return {"mean": mean, "sd": sd, "cv": cv} | by_name

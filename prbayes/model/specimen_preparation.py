@@ -359,7 +359,8 @@ def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
             sd = [readings_at(m, prob, 2048) for prob in (0.01, 0.84, 0.99)]
             low, middle, high = (r.error_sd(np.nan_to_num(r.values)) for r in sd)
             usable = middle > 0
-            ends.append((np.min((low / middle)[usable]), np.max((high / middle)[usable])))
+            low, middle, high = low[usable], middle[usable], high[usable]
+            ends.append((np.min(low / middle), np.max(high / middle)))
     if not ends:
         return (1.0,)
     lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))

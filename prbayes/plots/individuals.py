@@ -141,6 +141,7 @@ def _draw_inputs(axis: Axes, draws: Floats, prob: float) -> None:
     _draw_intervals(axis, places, draws[:, order], prob, label=text, gid="interval")
     axis.scatter(places, mean[order], 14, color=BLUE, label="their mean", gid="mean", zorder=3)
     axis.set_xlabel("specimens in ascending order")
+    axis.locator_params("x", integer=True)
 
 
 def _draw_readings(axis: Axes, x: Any, y: Floats, replicates: Floats, prob: float) -> None:

@@ -148,7 +148,7 @@ def modes_finding(
     text = (
         f"The posterior has {len(parts)} modes, with shares of the draws{error}: "
         f"{'; '.join(parts)}. "
-        "Means and standard deviations over all draws describe none of them; report each, or state "
+        "Means and standard deviations over all draws mix them; report each, or state "
         "a prior that excludes the others."
     )
     return [Finding("second-mode", text, "optimum_or_abc.md#two-answers")]

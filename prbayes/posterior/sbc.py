@@ -188,6 +188,8 @@ class Ranks(Tree):
 
     def to_dataframe(self) -> Any:
         """Return a row for each variable: mean and sd of its ranks, and the envelope's verdict."""
+        if not self._is_whole:
+            return super().to_dataframe()
         import pandas as pd
 
         ranks = self["prior_sbc"].to_dataset()

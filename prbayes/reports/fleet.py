@@ -135,10 +135,13 @@ def _rows_of_products(
         if findings[k] and verdicts[k] != "failed":
             validity += "; finding"
         rows.append({"product": name, "validity": validity, "specimens": n})
+    highest = np.zeros(len(names))  # probability of each product, of all decisions
     for question, risk in decisions.items():
-        for row in rows:
-            of_product = risk.sel(product=row["product"])
-            row |= _risk_of_product(question, of_product)
+        of_products = risk.sel(product=names)
+        probability = of_products["probability"].transpose("product", ...).values
+        highest = np.fmax(highest, probability.reshape(len(names), -1).max(axis=1))
+        for k, row in enumerate(rows):
+            row |= _risk_of_product(question, of_products.isel(product=k))
     keys = np.zeros(len(names))
     if table is not None:
         keys = table["estimate"].sel(quantity="B-basis").isel(name=0).values
@@ -153,10 +156,9 @@ def _rows_of_products(
                     value, interval = cells.get((of_row, quantity), (NOTHING, ""))
                     text = f"{value} ({interval})" if interval else value
                     row[f"{label}: {quantity}"] = text
-    by_product = zip(verdicts, findings, strict=True)
-    ranks = [(_WORST_FIRST.index(v), not f) for v, f in by_product]
-    finite_keys = np.nan_to_num(keys)
-    order = sorted(range(len(rows)), key=lambda k: (*ranks[k], finite_keys[k]))
+    by_product = zip(verdicts, -highest, findings, np.nan_to_num(keys), strict=True)
+    ranks = [(_WORST_FIRST.index(v), risk, not f, key) for v, risk, f, key in by_product]
+    order = sorted(range(len(rows)), key=ranks.__getitem__)
     return [rows[k] for k in order]
 
 
@@ -187,7 +189,8 @@ def _about_products(n: int, most: int, table: xr.Dataset | None) -> str:
         return text + "Populations need the model, which was not given."
     return text + (
         f"Mean and standard deviation (sd) of the inputs have {prob} intervals in brackets. 90% of "
-        "the specimens exceed the B-basis value, with 95% confidence."
+        "the specimens exceed the B-basis value, with 95% confidence. Rows are sorted by the "
+        "verdict of the test, the probability of a decision, findings, and the B-basis value."
     )
 
 

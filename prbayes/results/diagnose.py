@@ -248,9 +248,10 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     optimum = result if isinstance(result, Optimum) else None
     tree = _checked_tree(result)
     has_draws = "posterior" in tree.children
-    has_calibration = "calibration" in tree.children
-    calibration = tree["calibration"].to_dataset() if has_calibration else xr.Dataset()
-    if has_draws and not calibration:
+    calibration = xr.Dataset()
+    if "calibration" in tree.children:
+        calibration = tree["calibration"].to_dataset()
+    if has_draws and (not calibration or pm.Model.get_context(error_if_none=False)):
         model = model_on_context(model, "prb.diagnose")
     if model is not None:
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
@@ -527,7 +528,20 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
     findings += [*_repeated_draws(draws), *_particles_stuck(tree), *width_of_epsilon(tree, model)]
-    return Checked(tuple(findings))
+    return Checked(tuple(findings), _divergences(tree))
+
+
+def _divergences(tree: xr.DataTree) -> Findings:
+    """Remark on divergent transitions of NUTS after tuning."""
+    stats = tree["sample_stats"].to_dataset() if "sample_stats" in tree else {}
+    diverging = stats["diverging"] if "diverging" in stats else np.zeros(1)
+    n = int(diverging.sum())
+    text = (
+        f"{n} of {diverging.size} transitions of NUTS diverged: the draws may lack a part of the "
+        "posterior. Raise target_accept= of pm.sample, or compare with prb.sample_smc."
+    )
+    page = "validity.md#diagnostics-of-the-sampler"
+    return (Finding("divergent-transitions", text, page),) if n else ()
 
 
 def _convergence(posterior: xr.Dataset) -> list[Finding]:

@@ -103,6 +103,8 @@ def individuals(
     for likelihood in likelihoods:
         suffix = "" if len(likelihoods) == 1 else f" of {likelihood.name}"
         labels = specimen_labels(likelihood)
+        if labels is None:  # The rows of a single simulator, in their order
+            labels = likelihood.measurements[0].specimens
         size = len(likelihood.readings)
         specimens = {f"specimen{suffix}": np.arange(size) if labels is None else labels}
         inputs, gross_error = draw_inputs(with_more_points(likelihood), rng, points)
@@ -191,6 +193,8 @@ class Individuals(Tree):
 
     def to_dataframe(self) -> Any:
         """Return mean, sd and 89 % interval of each input of each specimen, a row for each."""
+        if not self._is_whole:
+            return super().to_dataframe()
         import pandas as pd
 
         tables = []

@@ -129,6 +129,8 @@ class ResidualTable(Tree):
 
     def to_dataframe(self) -> Any:
         """Return a row for each reading, with the name of its simulator and the eta of inputs."""
+        if not self._is_whole:
+            return super().to_dataframe()
         import pandas as pd
 
         tables = []

@@ -646,6 +646,8 @@ class Products(Tree):
 
     def to_dataframe(self) -> Any:
         """Return a row for each product: mean and sd of each hyperparameter, and its test."""
+        if not self._is_whole:
+            return super().to_dataframe()
         posterior, products = self._tables()
         columns: dict[str, Any] = {}
         for name, draws in posterior.data_vars.items():

@@ -11,6 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
+from prbayes.decision.population_quantities import _by_name
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.margins import margins
@@ -336,3 +337,9 @@ def test_a_coefficient_of_variation_and_correlations_have_no_unit() -> None:
     assert len(pure) == 2
     assert all(unit == {"ksi"} for quantity, unit in units.items() if quantity not in pure)
     assert set(table.sel(quantity="cv").to_dataframe()["unit"]) == {""}
+
+
+def test_a_mean_within_rounding_errors_of_zero_is_zero() -> None:
+    numbers = _by_name(["mean", "sd"], np.array([[[-2e-17, 0.15], [2.0, 1.0], [np.nan, np.nan]]]))
+    np.testing.assert_array_equal(numbers["mean"], [[0.0, 2.0, np.nan]])
+    np.testing.assert_array_equal(numbers["cv"], [[np.nan, 0.5, np.nan]])

@@ -25,6 +25,7 @@ from prbayes.model.specimen_likelihood import (
     log_likelihoods,
     specimen_likelihoods,
 )
+from prbayes.model.specimen_preparation import _error_scales
 from prbayes.response.compile import PLAIN
 
 N = 20
@@ -645,6 +646,18 @@ def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
         for place in ((10.0, 1.0), (11.0, 0.8), (9.5, 2.0)):
             got = float(log_likelihood({"mu": place[0], "sigma_log__": np.log(place[1])}))
             assert got == pytest.approx(expected(*place, limit), abs=0.4)
+
+
+def test_scales_of_a_relative_error_leave_missing_readings_out() -> None:
+    with pm.Model() as model:
+        metric = prb.LogLikelihood(error=pm.HalfNormal("error", 1.0), relative=True)
+        observed = np.array([[1.0, 2.0], [2.0, np.nan], [3.0, 5.0]])
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("y", lambda x: np.stack([x, 2 * x], -1), x, observed=observed, metric=metric)
+    (likelihood,) = specimen_likelihoods(model).values()
+    scales = _error_scales(likelihood)
+    # Divided by the 84 % quantile, the 1 and 99 % quantiles of a half-normal prior.
+    np.testing.assert_allclose([scales[0], scales[-1]], [0.0089, 1.83], rtol=0.2)
 
 
 @pytest.mark.long

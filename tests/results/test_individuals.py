@@ -138,3 +138,15 @@ def test_a_metric_has_no_record_of_specimens() -> None:
     optimum = prb.minimize(normal_model([1.0, 2.0, 3.0], prb.AreaMetric()), starts=0)
     with pytest.raises(TypeError, match="metrics compare distributions"):
         prb.individuals(optimum)
+
+
+def test_specimens_have_their_labels() -> None:
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1), name="x")
+        observed, labels = [1.0, 3.0, 2.0, 2.5], ["c", "a", "d", "b"]
+        prb.Simulator("y", lambda x: 2 * x, x, observed=observed, specimens=labels)
+        tree = prb.individuals(prb.minimize(starts=0), n_draws=20)
+    for group in ("posterior", "posterior_predictive", "observed_data"):
+        assert tree[group]["specimen"].values.tolist() == labels
+    draws = tree["posterior"]["x"].sel(specimen="a")
+    np.testing.assert_allclose(draws, 1.5, rtol=1e-4)

@@ -212,8 +212,15 @@ def test_a_product_without_a_result_is_a_row_of_nan(caplog: pytest.LogCaptureFix
     np.testing.assert_array_equal(
         got["estimate"].sel(product="near"), table()["estimate"].sel(product="near")
     )
-    report = prb.Report("Springs", posterior=broken, model=template()[0], pictures=False)
-    assert report.sections[1].table["product"].tolist()[0] == "far"
+    # Of products with the same verdict those with the largest probability come first.
+    decision = risk().copy(deep=True)
+    decision["probability"].loc[{"product": ["wide", "sheet"]}] = [0.1, 1.0]
+    orders = ["far", "wide", "sheet", "near"], ["far", "sheet", "wide", "near"]
+    for of_report, order in zip((None, decision), orders, strict=True):
+        report = prb.Report(
+            "Springs", posterior=broken, model=template()[0], pictures=False, decision=of_report
+        )
+        assert report.sections[1].table["product"].tolist() == order
 
 
 def test_arguments_that_no_product_accepts_raise() -> None:
