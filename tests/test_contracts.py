@@ -39,6 +39,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from pymc.stats.convergence import log_warnings, run_convergence_checks
 from pytensor import shared
 from pytensor.compile import function
+from pytensor.compile.builders import OpFromGraph
 from pytensor.compile.mode import Mode, optdb
 from pytensor.compile.ops import ViewOp
 from pytensor.compile.sharedvalue import SharedVariable
@@ -104,6 +105,17 @@ def test_shapes_without_draws_in_every_mode() -> None:
     bare = Mode(linker="py", optimizer=None)  # that of PyMC's pictures
     assert "minimum_compile" in bare.linker.required_rewrites
     assert "optimize_inner_graph" in {rewriter.name for rewriter in optdb.query("+minimum_compile")}
+
+
+def test_an_operation_of_others_has_their_graph() -> None:
+    x = pt.dvector()
+    y = pt.logsumexp(x)
+    assert isinstance(y.owner.op, OpFromGraph)
+    inner = y.owner.op.fgraph
+    (inlined,) = inner.bind(dict(zip(inner.inputs, [2 * x], strict=True)))
+    assert not any(isinstance(v.owner.op, OpFromGraph) for v in ancestors([inlined]) if v.owner)
+    value = inlined.eval({x: [0.0, 0.0]}, mode=PLAIN)
+    assert value == pytest.approx(np.log(2))
 
 
 def test_an_element_of_each_row_is_a_blockwise_operation() -> None:

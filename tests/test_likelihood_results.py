@@ -254,6 +254,18 @@ def test_refits_of_simulated_data_are_maximum_likelihood_estimates(optimum: prb.
 
 
 @pytest.mark.usefixtures("no_run")
+def test_data_sets_are_fitted_together_as_one_by_one(
+    optimum: prb.Optimum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refits = specimen_refits(optimum, "test")
+    together = [theta for theta, _, _ in refits.simulated(5, seed=3)]
+    monkeypatch.setattr("prbayes.optimize.maximum_likelihood.IN_CACHE", 1)
+    one_by_one = [theta for theta, _, _ in refits.simulated(5, seed=3)]
+    np.testing.assert_allclose(together, one_by_one, atol=1e-6)
+    assert np.ptp(together, axis=0).min() > 0
+
+
+@pytest.mark.usefixtures("no_run")
 def test_cross_validation_is_the_log_density_of_specimens_left_out(optimum: prb.Optimum) -> None:
     table = prb.cross_validate(optimum)
     assert table.sizes == {"fold": 5, "simulator": 1, "specimen": N}

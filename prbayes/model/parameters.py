@@ -34,8 +34,9 @@ from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import (
     compiled,
+    expanded,
     interpreted,
-    vectorized,
+    ninf_for_invalid,
     with_leading_axis,
 )
 from prbayes.response.condition import is_condition
@@ -122,7 +123,8 @@ class Hyperparameters:
         with interpreted():
             outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
-            return compiled([batch], vectorized(outputs, {theta: batch}))
+            batched = vectorize_graph(expanded(ninf_for_invalid(outputs)), {theta: batch})
+            return compiled([batch], batched)
 
     @cached_property
     @interpreted()

@@ -799,7 +799,8 @@ class SpecimenRefits:
         n_values = 0
         for _, log_a in map(arrays, self.evaluator.likelihoods):
             n_values += log_a.get_value(borrow=True).size
-        return np.array_split(np.arange(size), -(-size * n_values // IN_CACHE))
+        at_once = max(1, IN_CACHE // n_values)
+        return np.split(np.arange(size), np.arange(at_once, size, at_once))
 
     def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool, list[SpecimenData]]]:
         """Yield estimates of simulated data sets, whether they converged, and the data."""

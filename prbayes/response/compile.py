@@ -243,7 +243,7 @@ def with_leading_axis(symbols: Sequence[TensorVariable]) -> list[TensorVariable]
     return [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
 
 
-def _expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:
+def expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:
     """Replace operations that PyTensor makes of others, as logsumexp, by these others.
 
     PyTensor would loop over the rows of a batch of such an operation.
@@ -259,14 +259,7 @@ def _expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:
         parts[v] = inlined[v.owner.outputs.index(v)]
     if not parts:
         return graphs
-    return _expanded(list(graph_replace(graphs, parts, strict=False)))
-
-
-def vectorized(
-    graphs: Sequence[TensorVariable], batches: Mapping[TensorVariable, TensorVariable]
-) -> list[TensorVariable]:
-    """Return graphs for batches of some of their variables; an invalid row is -inf."""
-    return list(vectorize_graph(_expanded(ninf_for_invalid(graphs)), batches))
+    return expanded(list(graph_replace(graphs, parts, strict=False)))
 
 
 def compile_batched(
@@ -276,9 +269,10 @@ def compile_batched(
 ) -> Any:
     """Compile a graph for a batch: core inputs get a leading axis, ``extra`` ones do not."""
     with interpreted():
+        outputs = expanded(ninf_for_invalid(core_outputs))
         batched = with_leading_axis(core_inputs)
-        outputs = vectorized(core_outputs, dict(zip(core_inputs, batched, strict=True)))
-        return compiled([*batched, *extra], outputs, allow_input_downcast=True)
+        vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
+        return compiled([*batched, *extra], vectorized, allow_input_downcast=True)
 
 
 # PyTensor's rules by type of operation, and those below.
