@@ -221,8 +221,14 @@ def test_refit_of_the_observed_data_is_the_optimum(optimum: prb.Optimum) -> None
     (theta,), (converged,) = refits.fit([np.ones((1, N))])
     assert converged
     np.testing.assert_allclose(theta, optimum.theta, atol=1e-3)
-    thetas, _ = refits.reweighted([np.full((1, N), 1 / N)])
+    errors = np.sqrt(np.diag(optimum.covariance))
+    correlated = replace(refits, covariance=np.outer(errors, errors) * [[1.0, 0.7], [0.7, 1.0]])
+    thetas, _ = correlated.reweighted([np.full((1, N), 1 / N)])
     np.testing.assert_allclose(thetas[0], theta, atol=1e-3)
+    (theta, other), _ = correlated.fit([np.stack([np.ones(N), np.arange(N) * 2 / (N - 1)])])
+    np.testing.assert_allclose(theta, optimum.theta, atol=1e-3)
+    (alone,), _ = refits.fit([np.arange(N)[None] * 2 / (N - 1)])
+    np.testing.assert_allclose(other, alone, atol=1e-3)
 
 
 @pytest.mark.usefixtures("no_run")
