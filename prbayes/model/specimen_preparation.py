@@ -436,8 +436,32 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *emulator_findings(name, readings, error, data.remedies),
         *coverage_findings(likelihood, data, points, draws.specimens()),
         *_end_findings(runs, data, emulation, points, draws),
+        *_root_findings(data, proposals),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
+
+
+def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
+    """Report readings with more values of the only input in the prior's centre than a fold has.
+
+    Narrow populations around some of these may be as likely as the one that is found.
+    """
+    if len(data.free) > 1 or len(data.scales) > 1 or proposals.is_open():
+        return []
+    modes = proposals.modes
+    z = proposals.residuals.coordinates(modes.specimen, modes.a)[:, data.free]
+    low, high = np.quantile(data.prior[:, data.free], [0.1, 0.9], axis=0)
+    is_central = ((z >= low) & (z <= high)).all(axis=1)
+    counts = np.bincount(modes.specimen, is_central)
+    share = (counts > 2).mean()
+    if share < 0.1:
+        return []
+    text = (
+        f"{data.name}: {share:.0%} of the readings have three or more inputs in the centre of the "
+        "priors that explain them; narrow populations that were not found may have a share of the "
+        "posterior: narrow the priors, or compare models with a prior around each."
+    )
+    return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
 
 
 def _part(likelihood: SpecimenLikelihood, size: int = 512) -> SpecimenData | None:

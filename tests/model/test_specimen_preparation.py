@@ -61,6 +61,17 @@ def test_moments_are_those_of_the_posterior(scale: float) -> None:
     assert not np.array_equal(other.thetas, draws.thetas)
 
 
+@pytest.mark.parametrize(("rate", "codes"), [(3.0, ["second-mode"]), (0.3, [])])
+def test_readings_with_several_roots_in_the_priors_centre_are_reported(
+    rate: float, codes: list[str]
+) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", lambda x: np.sin(rate * x), x, observed=np.sin(rate * 0.2 * X))
+    (likelihood,) = specimen_likelihoods(model).values()
+    assert [finding.code for finding in prepared(likelihood).findings] == codes
+
+
 def test_smoothing_widens_populations() -> None:
     model = normal_model()
     populations = populations_of(model)
