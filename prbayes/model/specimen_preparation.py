@@ -457,9 +457,9 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     if share < 0.1:
         return []
     text = (
-        f"{data.name}: {share:.0%} of the readings have three or more inputs in the centre of the "
-        "priors that explain them; narrow populations that were not found may have a share of the "
-        "posterior: narrow the priors, or compare models with a prior around each."
+        f"{data.name}: got {share:.0%} of the readings with three or more values of the input in "
+        "the centre of its prior, expected at most two: narrow populations of some of them may have "
+        "been missed; narrow the prior, or compare models with a prior around each."
     )
     return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
 

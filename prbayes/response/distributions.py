@@ -360,7 +360,7 @@ class PopulationSampler:
             if not covariates:
                 with suppress(NotImplementedError, ValueError, MissingInputError):
                     specimens = vectorize_graph(aleatory, per_specimen)
-            if specimens is None:  # as PyMC resizes distributions, where PyTensor cannot
+            if specimens is None:  # PyTensor cannot vectorize the graph, and PyMC may resize it.
                 specimens = vectorize_distributions(aleatory, per_specimen)
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
