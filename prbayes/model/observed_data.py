@@ -151,11 +151,8 @@ def _rows_of_frequencies(
 
 def _report_whole_weights(name: str, weights: Any) -> None:
     """Report relative weights that look like frequencies."""
-    if (
-        weights.dtype.kind != "f"
-        or not (weights == np.round(weights)).all()
-        or weights.max(initial=0) < 2
-    ):
+    is_whole = weights.dtype.kind == "f" and (weights == np.round(weights)).all()
+    if not is_whole or weights.max(initial=0) < 2:
         return
     text = (
         f"{name}: weights: got whole numbers of type float, which are relative weights of "

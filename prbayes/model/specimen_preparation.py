@@ -458,8 +458,8 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
         return []
     text = (
         f"{data.name}: got {share:.0%} of the readings with three or more values of the input in "
-        "the centre of its prior, expected at most two: narrow populations of some of them may have "
-        "been missed; narrow the prior, or compare models with a prior around each."
+        "the centre of its prior, expected at most two: narrow populations of some of them may be "
+        "missing; narrow the prior, or compare models with a prior around each."
     )
     return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
 

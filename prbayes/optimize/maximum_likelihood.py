@@ -50,7 +50,7 @@ from prbayes.model.specimen_preparation import (
 )
 from prbayes.numerics.batched_minimisers import descend_by_slopes
 from prbayes.numerics.mixtures import normalised_weights
-from prbayes.numerics.modes import far_apart
+from prbayes.numerics.modes import Laplace, far_apart
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.design_refinement import MAX_ROUNDS
 from prbayes.optimize.optimum import (
@@ -189,6 +189,13 @@ def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
     errors = _monte_carlo_errors(evaluator, thetas)
     of_each = np.broadcast_to(errors, len(thetas))
     return _known(of_each, _n_readings(evaluator))
+
+
+def determined_modes(evaluator: Evaluator, modes: Sequence[Laplace]) -> list[Laplace]:
+    """Return the modes at which the points determine the log-likelihoods by specimen."""
+    centers = np.array([mode.mode for mode in modes])
+    is_known = is_known_at(evaluator, centers)
+    return [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
 
 
 def _n_readings(evaluator: Evaluator) -> int:

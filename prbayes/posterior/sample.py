@@ -22,7 +22,7 @@ from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.numerics.modes import Laplace
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.maximum_likelihood import is_known_at
+from prbayes.optimize.maximum_likelihood import determined_modes
 from prbayes.optimize.optimum import Optimum
 from prbayes.posterior import smc
 from prbayes.posterior.importance import ImportanceOptions, importance_sample
@@ -205,10 +205,8 @@ def mode_findings(target: Target, modes: list[Laplace], draws: Floats) -> list[F
     not determine the likelihood, such as that of a very narrow population, is an artefact of them.
     """
     thetas = draws.reshape(-1, draws.shape[-1])
-    centers = np.array([mode.mode for mode in modes])
-    is_known = is_known_at(target.evaluator, centers)
     separate: list[Laplace] = []
-    determined = [mode for mode, ok in zip(modes, is_known, strict=True) if ok]
+    determined = determined_modes(target.evaluator, modes)
     for mode in sorted(determined, key=lambda mode: -mode.log_mass):
         if all(has_valley(target.log_posterior, mode.mode, x.mode) for x in separate):
             separate.append(mode)

@@ -49,7 +49,7 @@ from prbayes.model.specimen_audit import audited_evaluator
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.modes import LogDensity
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
-from prbayes.optimize.maximum_likelihood import is_known_at
+from prbayes.optimize.maximum_likelihood import determined_modes, is_known_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
@@ -613,9 +613,7 @@ def _with_bridged_modes(target: Target, chains: Chains, rng: np.random.Generator
     draws = chains.thetas.reshape(-1, hyperparameters.size)
     unit = hyperparameters.prior_sd
     laplace_modes = modes_of(target.log_posterior, target.starts, target.scale) or []
-    centers = np.array([mode.mode for mode in laplace_modes])
-    is_known = is_known_at(target.evaluator, centers)
-    determined = [mode for mode, ok in zip(laplace_modes, is_known, strict=True) if ok]
+    determined = determined_modes(target.evaluator, laplace_modes)
     modes = bridged_modes(target.log_posterior, draws, unit, determined, rng)
     if modes is None:
         return chains
