@@ -14,6 +14,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import ArrayLike
+from pytensor.graph.basic import Variable
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._display import Table, View, percentage
@@ -35,10 +36,15 @@ from prbayes.decision.quantities import (
     refuse_quantity,
 )
 from prbayes.inference.asymptotics import oriented
-from prbayes.model.emulated import EmulatedSample, EmulatedSimulator
+from prbayes.model.emulated import (
+    EmulatedSample,
+    EmulatedSimulator,
+    PopulationSimulator,
+    replaced_inputs,
+)
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
 from prbayes.model.locking import locked
-from prbayes.model.parameters import variables_at
+from prbayes.model.parameters import parent_values, variables_at
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum, require_sampling
 from prbayes.posterior.nested import NestedFamily, nested_posterior
@@ -114,11 +120,22 @@ class Populations:
         """Return about `N_CHECKED` thetas, evenly spaced in their order."""
         return self.thetas[:: max(1, len(self.thetas) // N_CHECKED)]
 
+    def parents(self, thetas: Floats, k: int, inputs: Inputs) -> list[Floats]:
+        """Return the parents of inputs of the k-th simulator, or of others in their place."""
+        if inputs is self.evaluator.simulators[k].inputs:
+            return self.evaluator.parents(thetas, k)
+        variables = variables_at(self.evaluator.hyperparameters, thetas)
+        return parent_values(variables, inputs, None, ())
+
     def responses(self, response: Function, inputs: Sequence[Any]) -> Responses:
-        """Return a response with its inputs."""
+        """Return a response with its inputs, which are those of one population."""
+        responses = self._responses(response, inputs)
+        refuse_several_populations(f"{self.caller}: {responses.name}", responses.inputs.parents)
+        return responses
+
+    def _responses(self, response: Function, inputs: Sequence[Any]) -> Responses:
         name = named_response(response, self.calling, "write the response with def")
         sorted_inputs = read_inputs_of_copy(name, inputs, self.evaluator.model, function=response)
-        refuse_several_populations(f"{self.caller}: {name}", sorted_inputs.parents)
         simulators = self.evaluator.simulators
         outputs = known_outputs(simulators, response)
         scatter = known_scatter(simulators, response)
@@ -133,7 +150,7 @@ class Populations:
         )
 
     @cached_property
-    def _designs(self) -> dict[int, ReweightedBound | EmulatedSample]:
+    def _designs(self) -> dict[tuple[Any, ...], ReweightedBound | EmulatedSample]:
         return {}
 
     def sample(self, response: Function, inputs: Sequence[Any], output: Any) -> ResponseSample:
@@ -148,23 +165,32 @@ class Populations:
         design does not support the populations, or too many responses are NaN.
         """
         responses = self.responses(response, inputs)
-        simulators = self.evaluator.simulators
-        simulator = serving(simulators, responses)
+        population = responses.inputs
+        simulator: PopulationSimulator | None = serving(self.evaluator.simulators, responses)
+        replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+        if simulator is None:
+            simulator, replaced = replaced_inputs(self.evaluator.emulated, responses)
+            places = {new: old for old, new in replaced.items()}
+            own = [places.get(x, x) if isinstance(x, Variable) else x for x in population.sources]
+            responses = self._responses(response, own)
         if simulator is None:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
                 "simulator of the model, expected the .dist() objects of one with "
-                "prb.Reweighted() or prb.LogLikelihood(), and constants; prb.exceedance takes "
-                "other .dist() objects with n_points=1000, prb.predict also model variables"
+                "prb.Reweighted() or prb.LogLikelihood(), for the latter also others of the same "
+                "names, and constants; prb.exceedance takes all with n_points=1000"
             )
-        k = simulators.index(simulator)
-        if k not in self._designs:
+        k = self.evaluator.simulators.index(simulator)
+        key = (k, *replaced.values())
+        if key not in self._designs:
             if isinstance(simulator, EmulatedSimulator):
-                parents = self.evaluator.parents(self.thetas, k)
-                self._designs[k] = EmulatedSample.of(simulator, parents)
+                of_sample = population if replaced else simulator.inputs
+                parents = self.parents(self.thetas, k, of_sample)
+                emulated = EmulatedSample.of(simulator, parents, of_sample, replaced)
+                self._designs[key] = emulated
             elif simulator.reweighted is not None:
-                self._designs[k] = simulator.reweighted
-        design = self._designs[k]
+                self._designs[key] = simulator.reweighted
+        design = self._designs[key]
         sample = ResponseSample(self, k, design, responses, design.values_of(responses), None)
         parents = sample.parents(self.thinned())
         if design.has_runs:
@@ -292,7 +318,7 @@ class ResponseSample:
 
     def parents(self, thetas: Floats) -> list[Floats]:
         """Return the parents of populations, (k, d) -> (k, *shape) each."""
-        return self.populations.evaluator.parents(thetas, self.k)
+        return self.populations.parents(thetas, self.k, self.design.inputs)
 
     def masses(self, thetas: Floats) -> Floats:
         """Return weights of all points, also of those without response, (k, d) -> (k, n)."""

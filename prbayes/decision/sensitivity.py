@@ -176,7 +176,11 @@ def sensitivity(
         columns[f"{name}_error"] = ("factor", np.concatenate(errors))
     evaluator = populations.evaluator
     simulator = evaluator.simulators[sample.k]
-    names = aleatory_names(simulator.inputs, simulator.responses.function)
+    named = aleatory_names(simulator.inputs, simulator.responses.function)
+    is_replaced = sample.design.inputs is not simulator.inputs
+    own = sample.responses.inputs if is_replaced else simulator.inputs
+    places = [simulator.inputs.aleatory.index(x) for x in own.aleatory]
+    names = [named[place] for place in places]
     kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
     return SensitivityTable(
         columns,

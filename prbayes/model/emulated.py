@@ -7,14 +7,16 @@ reports use.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
 from scipy.special import logsumexp
 
 from prbayes._validate import AT_ONCE, ArrayFunction, Floats, Indices, Shape
@@ -32,8 +34,9 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.mixtures import effective_sample_size, normalised_weights
 from prbayes.propagation.base import MAX_LOST, DesignError, responding_weights
 from prbayes.propagation.importance import new_specimens
+from prbayes.response.condition import is_condition
 from prbayes.response.distributions import compiled_log_density
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, aleatory_names, event_shape
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
 from prbayes.specimens.coordinates import Coordinates
@@ -133,12 +136,17 @@ class EmulatedResponse:
         return with_failures(values, z / self._width, self.z / self._width, self.y)
 
 
-def values_of_inputs(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
-    """Return the values of a subset of the inputs, from those of all inputs of a response."""
-    places = [
-        next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
-        for x in subset.aleatory
-    ]
+def values_of_inputs(
+    values: Sequence[Floats],
+    inputs: Inputs,
+    subset: Inputs,
+    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]] = MappingProxyType({}),
+) -> list[Floats]:
+    """Return the values of a subset of the inputs, from those of all inputs of a response.
+
+    Some of the subset may be replaced by others among the inputs.
+    """
+    places = [inputs.aleatory.index(replaced.get(x, x)) for x in subset.aleatory]
     return [values[place] for place in places]
 
 
@@ -214,7 +222,7 @@ class EmulatedSimulator:
         The quasi-random numbers are the same for all calls.
         """
         size, n = len(parents[0]), _SIZES.specimens
-        values = self.emulated(draw_specimens(self, parents, n))
+        values = self.emulated(draw_specimens(self, self.inputs, parents, n))
         return values.reshape(size, n, *self.measurement.event), np.full((size, n), 1 / n)
 
     def discrepancies(self, parents: Sequence[Floats], target: Discrepancy) -> Floats:
@@ -224,9 +232,11 @@ class EmulatedSimulator:
         return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(values))])
 
 
-def draw_specimens(simulator: EmulatedSimulator, parents: Sequence[Floats], n: int) -> list[Floats]:
+def draw_specimens(
+    simulator: EmulatedSimulator, inputs: Inputs, parents: Sequence[Floats], n: int
+) -> list[Floats]:
     """Return n specimens of each of k populations, (k n, *event) by input."""
-    inputs, conditions = simulator.inputs, simulator.measurement.conditions
+    conditions = simulator.measurement.conditions
     if conditions is not None:
         conditions = conditions[simulator.rows]
     rng = np.random.default_rng(0)
@@ -278,6 +288,46 @@ def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedR
     return EmulatedResponse(coordinates, z, y, surface.values, slice(None), event, error)
 
 
+def replaced_inputs(
+    simulators: Sequence[EmulatedSimulator], responses: Responses
+) -> tuple[EmulatedSimulator | None, dict[Variable[Any, Any], Variable[Any, Any]]]:
+    """Return a simulator whose inputs a response has from another population, and which are which.
+
+    The response of the simulator has its inputs in the same places. Another response has inputs of
+    the same names. Returns None and an empty mapping without such a simulator.
+    """
+    for simulator in simulators:
+        replaced = _replaced(simulator, responses)
+        own, others = list(replaced), list(replaced.values())
+        shapes = [[event_shape(x) for x in inputs] for inputs in (own, others)]
+        conditions = [[x for x in inputs if is_condition(x)] for inputs in (own, others)]
+        is_same_kind = shapes[0] == shapes[1] and conditions[0] == conditions[1]
+        is_complete = set(others) == set(responses.inputs.aleatory)
+        if is_same_kind and is_complete and simulator.has_specimens:
+            return simulator, replaced
+    return None, {}
+
+
+def _replaced(
+    simulator: EmulatedSimulator, responses: Responses
+) -> dict[Variable[Any, Any], Variable[Any, Any]]:
+    """Return the inputs of a response by the simulator's inputs in whose place they are."""
+    own, inputs = simulator.inputs, responses.inputs
+    if responses.function is not simulator.responses.function:
+        names = aleatory_names(own, simulator.responses.function)
+        by_name = dict(zip(names, own.aleatory, strict=True))
+        names = aleatory_names(inputs, responses.function)
+        pairs = zip(names, inputs.aleatory, strict=True)
+        return {by_name[name]: x for name, x in pairs if name in by_name}
+    replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+    for x, y in zip(own.sources, inputs.sources, strict=True):
+        if isinstance(x, Variable) and isinstance(y, Variable):
+            replaced[x] = y
+        elif isinstance(x, Variable) or isinstance(y, Variable) or not np.array_equal(x, y):
+            return {}
+    return replaced
+
+
 type PopulationSimulator = Node | EmulatedSimulator
 
 
@@ -311,8 +361,10 @@ class EmulatedSample:
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
     # (n,): batch of each specimen; each of the eight batches represents the mixture itself.
     blocks: Indices
-    inputs: Inputs  # inputs of the simulator
+    inputs: Inputs  # inputs of the simulator, or of another population
     n_points: int  # number of specimens
+    # inputs of the simulator that are those of another population here
+    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]]
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
@@ -322,22 +374,28 @@ class EmulatedSample:
     on_line: ClassVar[bool] = False  # whether the points form a quadrature rule
 
     @classmethod
-    def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
-        """Draw specimens from populations at parents, shapes (k, *shape)."""
+    def of(
+        cls,
+        simulator: EmulatedSimulator,
+        parents: Sequence[Floats],
+        inputs: Inputs,
+        replaced: Mapping[Variable[Any, Any], Variable[Any, Any]],
+    ) -> EmulatedSample:
+        """Draw specimens of inputs from populations at parents, shapes (k, *shape)."""
         places = np.linspace(0, len(parents[0]) - 1, _SIZES.populations)
         rows = np.unique(places.round().astype(int))
         parents = [parent[rows] for parent in parents]
         of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
         of_each *= _SIZES.blocks
-        flat = draw_specimens(simulator, parents, of_each)
-        log_p = _population_log_densities(simulator.inputs, parents, flat)
+        flat = draw_specimens(simulator, inputs, parents, of_each)
+        log_p = _population_log_densities(inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
-        return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
+        return cls(simulator, flat, log_mixture, blocks, inputs, len(log_mixture), replaced)
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
-        return values_of_inputs(self.points, self.inputs, inputs)
+        return values_of_inputs(self.points, self.inputs, inputs, self.replaced)
 
     def values_of(self, responses: Responses) -> Floats:
         """Return a response of the specimens, (n,) or (n, m)."""
@@ -349,7 +407,7 @@ class EmulatedSample:
         The errors are that at left-out runs, and that beyond the range of the runs.
         """
         emulator = self._emulator(responses)
-        inputs = values_of_inputs(points, self.inputs, responses.inputs)
+        inputs = values_of_inputs(points, self.inputs, responses.inputs, self.replaced)
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
 

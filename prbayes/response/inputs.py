@@ -531,17 +531,15 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
     if groups is not None:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "
-            "inputs of one population; prb.predict has a population for each of "
-            f"{groups.names}, and prb.exceedance(..., n_points=1000) takes the .dist() of one of "
-            "them or of a new group, such as pm.Normal.dist(mu[0], sigma)"
+            f"the .dist() of one of {groups.names} or of a new group in its place, such as "
+            "pm.Normal.dist(mu[0], sigma); prb.predict has a population for each group"
         )
     covariates = [str(v.name) for v in parents if is_condition(v)]
     if covariates:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.condition({covariates[0]!r}), "
-            "expected inputs of one population; prb.predict(..., at={"
-            f"{covariates[0]!r}: value}}) has the responses of a population, and "
-            "prb.exceedance(..., n_points=1000) takes a .dist() with the value in its parameters"
+            "expected a .dist() with a value of it in its parameters, such as "
+            "pm.Normal.dist(a + 250 * b, sigma); prb.predict takes the value by at="
         )
 
 
