@@ -234,6 +234,7 @@ def sequential_design(
         may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if emulation.bias <= data.options.bias and is_complete and is_smooth:
+            emulation = without_spurious_modes(run, data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population), plausible)
             before = emulation.surface
             # If the audit fails, the next batch is drawn from the same likely inputs.
@@ -598,6 +599,38 @@ def audited(
     else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)
     return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
+
+
+def without_spurious_modes(
+    run: Run, data: SpecimenData, emulation: Emulation, likely: Likely
+) -> Emulation:
+    """Return the emulation with runs at those modes of specimens that the emulator does not know.
+
+    Far from its runs an emulator may reach the readings where the response does not. Such a mode is
+    improbable, but those of all specimens together may be a population.
+    """
+    proposals, scale = likely.proposals, likely.scale(data)
+    spread = data.readings.spread()
+    for _ in range(4):
+        if proposals.is_open():
+            break
+        modes = proposals.modes
+        z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
+        deviation = np.sqrt(emulation.surface.variance(z))
+        # As `is_rough`, and far less certain than at most likely inputs.
+        is_doubtful = deviation > np.maximum(0.03 * spread, 10 * emulation.error)
+        doubtful = z[is_doubtful.any(axis=1)]
+        if not len(doubtful):
+            break
+        runs = farthest(emulation.z, doubtful, min(4, len(doubtful)), scale)
+        grown, misfit, _ = _compared(run, emulation, runs, scale)
+        audited = range(len(emulation.z), len(grown.z))
+        grown = replace(grown, audited=(*emulation.audited, *audited))
+        emulation, _ = _refitted(data, grown, likely.population)
+        if (np.abs(misfit) < 0.1 * spread).all():  # the modes exist
+            break
+        proposals = fit_proposals(data, emulation, proposals.residuals.population)
+    return emulation
 
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:

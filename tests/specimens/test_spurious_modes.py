@@ -1,0 +1,59 @@
+"""Modes of specimens where an emulator without runs reaches the readings, and the response does not."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.model.emulated import emulated_simulators
+from prbayes.model.specimen_preparation import prepared
+
+
+def points(response: Callable[..., Any], prior: tuple[Any, Any], x: Any) -> Any:
+    """Return the likely inputs of specimens with inputs (N, d), shape (N, K, d)."""
+    d = x.shape[1]
+    with pm.Model() as model:
+        mu = pm.Normal("mu", *prior, shape=d)
+        sigma = pm.HalfNormal("sigma", 1, shape=d)
+        inputs = [pm.Normal.dist(mu[k], sigma[k]) for k in range(d)]
+        prb.Simulator("y", response, *inputs, observed=response(*x.T))
+    (simulator,) = emulated_simulators(model)
+    found = prepared(simulator.likelihood).points
+    z = np.where(np.isfinite(found.log_a)[..., None], found.z, np.nan)
+    return simulator.likelihood.coordinates.inputs(z.reshape(-1, d)), z.shape
+
+
+ONE_INPUT: dict[str, tuple[Callable[[Any], Any], int, float, float, tuple[float, float]]] = {
+    "increasing": (lambda x: np.log1p(np.exp(x)), 34, 1.67, 0.17, (1.54, 3.0)),
+    "decreasing": (lambda x: 5 * np.exp(-x), 29, 3.47, 0.29, (3.39, 2.0)),
+}
+
+
+@pytest.mark.parametrize("name", ONE_INPUT)
+def test_a_monotone_response_has_one_input_for_each_reading(name: str) -> None:
+    response, n, mean, sd, prior = ONE_INPUT[name]
+    x = np.random.default_rng(0).normal(mean, sd, (n, 1))
+    (found,), shape = points(response, prior, x)
+    np.testing.assert_array_less(np.nan_to_num(abs(found.reshape(shape[:2]) - x)), 1e-2)
+
+
+def test_two_inputs_have_one_mode_for_each_specimen() -> None:
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([np.exp(0.5 * a), np.log1p(np.exp(b)) + 0.5 * a], axis=-1)
+
+    x = np.random.default_rng(6).normal([2.4, 1.8], [0.3, 0.4], (18, 2))
+    found, shape = points(response, ([2.4, 1.6], 2.0), x)
+    distance = abs(np.stack(found, axis=-1).reshape(shape) - x[:, None])
+    np.testing.assert_array_less(np.nan_to_num(distance), 2e-2)
+
+
+def test_modes_that_exist_stay() -> None:
+    """A response with two inputs for each reading, one of them far from the runs."""
+    x = np.random.default_rng(0).normal(2.0, 0.2, (20, 1))
+    (found,), shape = points(lambda x: x**2, (2.0, 2.0), x)
+    roots = found.reshape(shape[:2])
+    np.testing.assert_allclose(np.nanmax(roots, axis=1), x[:, 0], atol=1e-3)
+    np.testing.assert_allclose(np.nanmin(roots, axis=1), -x[:, 0], atol=1e-3)
