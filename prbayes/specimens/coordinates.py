@@ -58,7 +58,7 @@ class Coordinates:
         flat = draw(1, populations)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
-        is_share = (flat <= 1).all(axis=0) & (high > 0.5)
+        is_share = ((flat >= 0) & (flat <= 1)).all(axis=0) & (high > 0.5)
         is_log = (flat > 0).all(axis=0) & (high > 10 * low) & ~is_share
         # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
         is_infinite = is_share & ((np.abs(flat - 0.5) > 0.499).mean(axis=0) > 0.01)

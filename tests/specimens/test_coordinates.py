@@ -143,3 +143,9 @@ def test_runs_stay_within_ends_that_are_the_same_for_all_populations() -> None:
     assert low[4] < -20
     inner = np.full((3, 5), 0.2)
     np.testing.assert_array_equal(ended.within(inner), inner)
+
+
+def test_narrow_inputs_around_zero_have_no_ends() -> None:
+    """They are below one as shares are, and have values below zero, as an unknown offset has."""
+    x = coordinates(lambda factor: [pm.Normal.dist(0.0, 0.25 * factor)])
+    assert np.isinf(x.ends).all()
