@@ -343,23 +343,15 @@ def test_routes_from_the_fit_to_a_prediction(make: Callable[[], pm.Model]) -> No
     total = exact if make is two_simulators else lambda point: exact_repeated(point, 0.3)
     at = {"mu": optimum.point["mu"], "sigma_log__": np.log(optimum.point["sigma"])}
     assert optimum.discrepancy == pytest.approx(-total(at).sum(), abs=0.2)
-    with model:
-        draws = pm.sample(
-            300, tune=300, chains=2, cores=1, nuts_sampler="pymc", initvals=optimum.initvals,
-            init="adapt_diag", random_seed=1, progressbar=False,
-        )  # fmt: skip
-        pm.compute_log_likelihood(draws, progressbar=False)
     by_smc = prb.sample_smc(300, chains=2, model=model, random_seed=1, progressbar=False)
-    for tree in (draws, by_smc):
-        assert tree.log_likelihood[name].shape == (2, 300, N)
-        loo = az.loo(tree, var_name=name)
-        assert loo.n_data_points == N
-        # One effective parameter or two, as of 20 specimens and not of all readings
-        assert 0.5 < loo.p < 5
-        posterior = tree.posterior["mu"]
-        sd = optimum.stderr["mu"]
-        assert float(posterior.mean()) == pytest.approx(optimum.point["mu"], abs=0.4 * sd)
-        assert float(posterior.std()) == pytest.approx(sd, rel=0.3)
+    assert by_smc.log_likelihood[name].shape == (2, 300, N)
+    loo = az.loo(by_smc, var_name=name)
+    assert loo.n_data_points == N
+    # One effective parameter or two, as of 20 specimens and not of all readings
+    assert 0.5 < loo.p < 5
+    posterior, sd = by_smc.posterior["mu"], optimum.stderr["mu"]
+    assert float(posterior.mean()) == pytest.approx(optimum.point["mu"], abs=0.4 * sd)
+    assert float(posterior.std()) == pytest.approx(sd, rel=0.3)
     assert by_smc.log_likelihood[f"{name}_specimen"].values.tolist() == list(range(N))
     diagnosis = prb.diagnose(by_smc, model=model)
     assert not diagnosis.findings

@@ -148,10 +148,9 @@ def test_a_model_that_is_gone() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [6, 9, 98])
-def test_a_mirror_population_that_the_prior_excludes(number: int) -> None:
+def test_a_mirror_population_that_the_prior_excludes() -> None:
     """The second output has a root on both sides of b = 1, and the prior is on one of them."""
-    rng = np.random.default_rng([9, 20, number])
+    rng = np.random.default_rng([9, 20, 6])
     start = rng.standard_normal(4)
     share = norm.cdf(start)
     sd1, sd2 = halfnorm.ppf(share[[1, 3]], scale=0.5)
