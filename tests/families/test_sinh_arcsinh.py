@@ -19,7 +19,6 @@ import prbayes as prb
 from prbayes._finding import from_json
 from prbayes._validate import Floats
 from prbayes.decision.populations import Populations
-from prbayes.families.sinh_arcsinh import SinhArcsinhRV
 from prbayes.posterior.nested import NestedFamily, nested_posterior
 
 FAMILIES = [prb.families.SinhArcsinh, prb.families.LogSinhArcsinh]
@@ -85,12 +84,6 @@ def test_the_family_contains_the_usual_one(family: Any, usual: Any) -> None:
     at = usual.ppf(LEVELS)
     density = pm.logp(made(family, 1.0, 2.0, 0.0, 1.0), at).eval()
     np.testing.assert_allclose(density, usual.logpdf(at), rtol=1e-9)
-
-
-def test_the_operation_declares_where_it_is_the_usual_one() -> None:
-    name, values = SinhArcsinhRV.nested
-    assert name == "normal"
-    assert values == {2: 0.0, 3: 1.0}
 
 
 @pytest.mark.parametrize("family", FAMILIES)

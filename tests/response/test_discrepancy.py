@@ -178,9 +178,7 @@ def terms_of(discrepancy: Any, conditions: Any) -> Any:
     ("shape", "conditions"),
     [
         (prb.response.Smooth(0.0), LOADS),
-        (prb.response.Smooth(2.5), LOADS),
         (prb.response.Smooth(1.1, length=3.0), LOADS),
-        (prb.response.Smooth(0.0), np.array([20.0, 1000.0])),
         (prb.response.Smooth(-1.0, length=0.4, reach=0.3), np.linspace(0, 2, 40)),
         (prb.response.Smooth(0.5), LOADS[[0, 0, 1, 3]]),
         (prb.response.Smooth(0.0), np.linspace(0, 5, 4000)),

@@ -54,7 +54,7 @@ def _assert_same_distribution(draws: Any, expected: Any) -> None:
         assert stats.ks_2samp(x, y, method="asymp").pvalue > 1e-5
 
 
-# Scalars are inputs in benchmarks/tests/test_distributions.py too.
+# Scalar parameters of all distributions are in benchmarks/tests/test_distributions.py.
 _SLOW = (",", "Hurdle", "ZeroInflated", "Mixture")
 _LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n in CASES}
 
@@ -63,20 +63,16 @@ _LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n
     "ignore::RuntimeWarning", "ignore::UserWarning", "ignore::FutureWarning"
 )
 @pytest.mark.parametrize(
-    "size", [pytest.param(None, marks=pytest.mark.long), 2], ids=["scalar", "vector"]
-)
-@pytest.mark.parametrize(
     "name", [pytest.param(name, marks=_LONG[name]) for name in CASES if name not in _UNDRAWN]
 )
-def test_priors_and_inputs_are_those_of_pymc(name: str, size: int | None) -> None:
-    if size is not None and name in _SCALAR_ONLY:
-        pytest.skip("its parameters are no scalars")
+def test_priors_and_inputs_are_those_of_pymc(name: str) -> None:
     case = CASES[name]
     low, truth, high = case.nearby()
-    h = truth if size is None else np.array([low, high])
+    is_scalar = name in _SCALAR_ONLY
+    h = truth if is_scalar else np.array([low, high])
     expected = pm.draw(_dist(case, h), DRAWS, random_seed=1, mode=PLAIN)
     _assert_prior(case, h, expected, has_density=name not in _WITHOUT_DENSITY)
-    other = low if size is None else np.array([high, low])
+    other = low if is_scalar else np.array([high, low])
     _assert_input(case, [other, h], expected, has_density=name not in _WITHOUT_DENSITY)
 
 

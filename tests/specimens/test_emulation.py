@@ -125,14 +125,6 @@ def test_a_specimen_without_a_point_in_one_half_is_left_out() -> None:
 # Emulator error: the bias that shifts of the inputs cause.
 
 
-def test_a_constant_shift_moves_the_mean() -> None:
-    x = np.random.default_rng(1).normal(10, 2, (16, 1))
-    bias = predicted_bias(np.full((16, 1), -0.2), x, 50)
-    # The true input is at x - .2: the estimate of the mean is .2 too large.
-    assert bias[0] == pytest.approx(0.2 / x.std() * np.sqrt(50))
-    assert bias[1] == pytest.approx(0, abs=1e-12)
-
-
 def test_biases_are_those_of_the_true_inputs() -> None:
     rng = np.random.default_rng(2)
     x = rng.normal(0, [1.0, 3.0], (4000, 2))
