@@ -154,6 +154,7 @@ def test_two_simulators_equal_one_with_outputs_that_were_not_measured() -> None:
             "y", lambda x: np.stack([up(x), down(x, 3.0)], axis=-1), population(), observed=y,
             metric=metric(error=[0.3, 0.2]),
         )  # fmt: skip
+    assert [rv.name for rv in model.free_RVs] == ["mu", "sigma"]  # none of missing values
     assert np.allclose(values(shared(), "b"), values(fine(model), "y"), atol=1e-8)
 
 

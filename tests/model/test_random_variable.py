@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import arviz as az
@@ -119,46 +116,6 @@ def test_a_copy_shares_nothing_that_changes(way: str) -> None:
     assert ratios()[0] == pytest.approx(2, rel=1e-12)
     assert (node.bound.n_points, copied.bound.n_points) == (64, 128)
     assert node.responses.count == 64
-
-
-SCRIPT = """
-import logging, pickle, sys
-import numpy as np
-with open(sys.argv[1], "rb") as file:
-    model = pickle.load(file)
-import prbayes as prb, pymc as pm
-logging.getLogger("pymc").setLevel(logging.ERROR)
-from prbayes.response.compile import PLAIN
-quick = {"mode": PLAIN}
-at = {"mu": 1.2, "sigma_log__": np.log(0.7)}
-print(repr(float(model.compile_logp(vars=[model["y"]], **quick)(at))))
-drawn = pm.sample_prior_predictive(3, model=model, random_seed=1, compile_kwargs=quick)
-print(repr(float(drawn.prior_predictive["y"].sum())))
-prb.set_epsilon(model, {"y": 0.2})
-print(repr(float(model.compile_logp(vars=[model["y"]], **quick)(at))))
-print(repr(prb.minimize(model, starts=0, progressbar=False).point["mu"]))
-"""
-
-
-@pytest.mark.long
-def test_a_model_works_in_another_process(tmp_path: Path) -> None:
-    model = build()
-    file = tmp_path / "model.pkl"
-    file.write_bytes(cloudpickle.dumps(model))
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", SCRIPT, str(file)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    density, drawn, halved, mu = map(float, run.stdout.split())
-    assert density == pytest.approx(log_density(model)(AT), rel=1e-9)
-    quick = {"mode": PLAIN}
-    mine = pm.sample_prior_predictive(3, model=model, random_seed=1, compile_kwargs=quick)
-    assert drawn == pytest.approx(float(mine.prior_predictive["y"].sum()), rel=1e-9)
-    assert halved == pytest.approx(density / 2, rel=1e-9)
-    assert mu == pytest.approx(prb.minimize(model, starts=0, **QUIET).point["mu"], rel=1e-9)
 
 
 # The operation.
@@ -379,15 +336,13 @@ def test_the_value_of_a_log_density_has_to_be_the_data() -> None:
             symbolic.eval({**at, value: other}, mode=PLAIN)
 
 
-@pytest.mark.parametrize("n", [7, 20, 60])
-def test_the_default_epsilon_follows_the_data(n: int) -> None:
-    data = np.random.default_rng(1).normal(1.0, 0.5, n)
-    model = build(observed=data, metric=prb.KullbackLeibler(), epsilon=None)
+def test_the_default_epsilon_follows_the_data() -> None:
+    model = build(metric=prb.KullbackLeibler(), epsilon=None)
     evaluator = Evaluator.of(model)
-    (other,) = evaluator.observing({"y": data + 1.0}).nodes
+    (other,) = evaluator.observing({"y": OBSERVED + 1.0}).nodes
     assert has_default_epsilon(evaluator.nodes[0])
     assert has_default_epsilon(other)
-    prb.set_epsilon(model, {"y": 1.01 / n})
+    prb.set_epsilon(model, {"y": 1.01 / OBSERVED.size})
     assert not has_default_epsilon(evaluator.nodes[0])
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 import pymc as pm
 import pytest
 from first_use import first_use
-from line_problem import EPSILON, MU, POINTS, QUIET, SIGMA, N, build, line
+from line_problem import MU, POINTS, QUIET, SIGMA, N, build, line
 from pytensor import config
 from scipy import stats
 
@@ -151,15 +151,10 @@ def test_fresh_is_refused_by_methods_with_gradients(sampler: Callable[[pm.Model]
         sampler(model_of("Fresh")[0])
 
 
-def test_fresh_with_an_epsilon_for_the_run() -> None:
-    model, node = build(prb.Fresh(POINTS), epsilon=None)
-    settings = {"model": model, "adjustment": None, "random_seed": 1, **QUIET}
-    idata = prb.sample_smc(100, chains=1, epsilon=EPSILON, **settings)
-    assert abs(float(idata.posterior["mu"].mean()) - MU) < 0.1
-    assert float(idata.calibration["epsilon"][0]) == EPSILON
-    assert np.isnan(node.epsilon_value)
+def test_fresh_without_an_epsilon_is_refused_by_the_sampler() -> None:
+    model, _ = build(prb.Fresh(POINTS), epsilon=None)
     with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
-        prb.sample_smc(100, **settings)
+        prb.sample_smc(100, model=model, adjustment=None, **QUIET)
 
 
 # Predictive sampling.

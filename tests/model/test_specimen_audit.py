@@ -125,13 +125,6 @@ def test_sequential_monte_carlo_is_audited(tmp_path: Path) -> None:
         prb.sample_smc(model=model, chains=1, checkpoint=tmp_path / "stages.npz", **settings)
 
 
-def test_a_budget_of_the_first_runs_gives_no_answer() -> None:
-    with pytest.raises(
-        prb.response.BudgetError, match="max_runs = 40 was reached before there was"
-    ):
-        prb.sample(model=build(*PROBLEMS["pole"]), max_runs=40)
-
-
 def test_a_smooth_response_needs_no_further_run() -> None:
     x = np.random.default_rng(1).normal(1, 0.5, 20)
     model = build(lambda x: 2 * x + 1, (1.0, 1.0), 1.0, x)

@@ -117,20 +117,6 @@ def test_gradients_are_those_of_the_closed_form() -> None:
     assert np.allclose(gradient, reference, atol=1e-4)
 
 
-def test_no_run_is_made_when_a_model_is_written_and_few_at_its_first_use() -> None:
-    response = Line()
-    model = build(response)
-    assert response.runs == 0
-    evaluator = Evaluator.of(model)
-    assert response.runs == 0
-    values(model)
-    runs = response.runs
-    assert 0 < runs <= 60
-    assert evaluator.n_responses == runs
-    values(model, {"mu": 0.0, "sigma_log__": 0.0})
-    assert response.runs == runs
-
-
 @pytest.mark.parametrize("weights", [np.arange(1.0, N + 1), 1.0 * (np.arange(N) < N // 2)])
 def test_weights_sum_to_the_effective_number_of_specimens(weights: Floats) -> None:
     ours = values(build(weights=weights))
@@ -186,64 +172,11 @@ def test_a_mixture_of_two_populations() -> None:
     assert np.allclose(values(model), np.log(0.3 * parts[0] + 0.7 * parts[1]), atol=0.03)
 
 
-def test_two_inputs_of_a_response_with_two_outputs() -> None:
-    rng = np.random.default_rng(2)
-    a, b = rng.normal(1.0, 0.5, N), rng.normal(0.0, 1.0, N)
-    with pm.Model() as model:
-        mu, sigma = priors()
-        inputs = pm.Normal.dist(mu, sigma), pm.Normal.dist(0.0, 1.0)
-        observed = {"sum": a + b, "difference": a - b}
-        prb.Simulator(
-            "y", lambda a, b: {"sum": a + b, "difference": a - b}, *inputs, observed=observed
-        )
-    expected = stats.norm.logpdf(a, 0.8, np.exp(-0.5)) + stats.norm.logpdf(b) - np.log(2)
-    assert np.allclose(values(model), expected, atol=0.05)
-
-
-def test_missing_outputs_are_no_values_to_impute() -> None:
-    rng = np.random.default_rng(2)
-    a = rng.normal(1.0, 0.5, N)
-    y = np.stack([a, 2 * a], axis=1)
-    y[::4, 0] = np.nan
-    with pm.Model() as model:
-        x = pm.Normal.dist(*priors())
-        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y)
-    assert [rv.name for rv in model.free_RVs] == ["mu", "sigma"]
-    difference = values(model, {"mu": 1.2, "sigma_log__": -0.5}) - values(model)
-    s = np.exp(-0.5)
-    expected = stats.norm.logpdf(a, 1.2, s) - stats.norm.logpdf(a, 0.8, s)
-    assert np.allclose(difference, expected, atol=1e-3)
-
-
 def labelled(groups: list[str]) -> xr.DataArray:
     rng = np.random.default_rng(5)
     index = np.array([groups.index(g) for g in np.resize(groups, N)])
     names = np.array(groups)[index]
     return xr.DataArray(rng.normal(index, 0.3), {"supplier": ("specimen", names)}, "specimen")
-
-
-def grouped(response: Any) -> tuple[pm.Model, xr.DataArray]:
-    names = ["Adler", "Busch"]
-    data = labelled(names)
-    with pm.Model(coords={"supplier": names}) as model:
-        mu, sigma = pm.Normal("mu", 0, 2, dims="supplier"), pm.HalfNormal("sigma", 1)
-        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma)
-        prb.Simulator("y", response, x, observed=data)
-    return model, data
-
-
-def test_groups_have_populations_of_their_own_and_share_runs() -> None:
-    response = Line()
-    model, data = grouped(response)
-    means = np.array([0.3, 0.9])
-    index = (data["supplier"].values == "Busch").astype(int)
-    ours = values(model, {"mu": means, "sigma_log__": -0.5})
-    expected = stats.norm.logpdf(data.values, 1 + 2 * means[index], 2 * np.exp(-0.5))
-    assert np.allclose(ours, expected, atol=0.03)
-    assert 0 < response.runs <= 60
-    known = pm.do(model, {"mu": [0.0, 10.0], "sigma": 0.1})
-    drawn = pm.draw(known["y"], random_seed=1, mode=PLAIN)
-    assert drawn[index == 0].mean() < drawn[index == 1].mean()
 
 
 LIMIT = 1.2
@@ -298,16 +231,6 @@ def test_each_group_is_truncated_by_itself() -> None:
     thetas = np.array([[*np.ravel(point["mu"]), point["sigma_log__"]] for point in points])
     (arrays,) = specimen_log_likelihoods(Evaluator.of(model), thetas).values()
     assert np.allclose(arrays[1] - arrays[0], ours, atol=1e-9)
-
-
-def test_simulators_with_equal_inputs_stay_apart() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(*priors())
-        prb.Simulator("one", Line(), x, observed=Y)
-        prb.Simulator("two", lambda x: 3 * x, x, observed=Y)
-    assert np.allclose(values(model, rv="one"), exact(), atol=0.03)
-    expected = stats.norm.logpdf(Y, 3 * 0.8, 3 * np.exp(-0.5))
-    assert np.allclose(values(model, rv="two"), expected, atol=0.03)
 
 
 def test_a_model_prints() -> None:
