@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -59,16 +57,6 @@ def test_smoothing_recovers_a_response_below_its_noise() -> None:
     noisy = prb.Surrogate.fit(scattered, BOX, 256, model=settings)
     assert np.sqrt(np.mean((noisy(*FRESH) - bent(*FRESH)) ** 2)) < 0.03
     assert noisy.error.rms == pytest.approx(0.05, rel=0.2)  # se of an rms of 256 is 4%
-
-
-def test_a_regressor_of_scikit_learn_serves_and_is_left_unfitted() -> None:
-    # The length of greatest likelihood is .60; it is not estimated, as the likelihood of responses
-    # without noise is rounded.
-    regressor = GaussianProcessRegressor(RBF(0.6), alpha=1e-8, optimizer=None)
-    found = prb.Surrogate.fit(lambda x, y: 1e6 + 1e4 * bent(x, y), BOX, 64, model=regressor)
-    off = found(*FRESH) - 1e6 - 1e4 * bent(*FRESH)
-    assert np.sqrt(np.mean(off**2)) < 10
-    assert not hasattr(regressor, "X_train_")
 
 
 class Plane(Surface):

@@ -56,17 +56,6 @@ def test_outside_it_returns_nan_with_one_warning_or_raises(
         found(1.0)
 
 
-def test_where_the_nearest_design_point_failed_it_fails() -> None:
-    def response(x: Any, y: Any) -> Any:
-        return np.where(x > 2, np.inf, np.where(x < 0.5, np.nan, bent(x, y)))
-
-    found = prb.Surrogate.fit(response, BOX, 128, on_failure=Replace())
-    assert np.isnan(found(0.1, 1.5))
-    assert found(2.6, 1.5) == np.inf
-    assert found(1.2, 1.5) == pytest.approx(bent(1.2, 1.5), abs=0.05)
-    assert np.isnan(found.error.residuals).sum() == (~np.isfinite(found.responses)).sum() > 20
-
-
 def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Path) -> None:
     plain = prb.Surrogate.fit(bent, BOX, 32, random_seed=2)
     assert plain.n_runs == 32

@@ -335,43 +335,35 @@ def test_a_specimen_with_repeated_readings_counts_once_in_a_held_out_loss() -> N
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("make", [two_simulators, repeated])
-def test_routes_from_the_fit_to_a_prediction(make: Callable[[], pm.Model]) -> None:
-    model = make()
-    name = "b" if make is two_simulators else "y"
+def test_routes_from_the_fit_to_a_prediction() -> None:
+    model = two_simulators()
     optimum = prb.minimize(model, starts=0, progressbar=False)
     assert optimum.converged
-    total = exact if make is two_simulators else lambda point: exact_repeated(point, 0.3)
     at = {"mu": optimum.point["mu"], "sigma_log__": np.log(optimum.point["sigma"])}
-    assert optimum.discrepancy == pytest.approx(-total(at).sum(), abs=0.2)
+    assert optimum.discrepancy == pytest.approx(-exact(at).sum(), abs=0.2)
     by_smc = prb.sample_smc(300, chains=2, model=model, random_seed=1, progressbar=False)
-    assert by_smc.log_likelihood[name].shape == (2, 300, N)
-    loo = az.loo(by_smc, var_name=name)
+    assert by_smc.log_likelihood["b"].shape == (2, 300, N)
+    loo = az.loo(by_smc, var_name="b")
     assert loo.n_data_points == N
     # One effective parameter or two, as of 20 specimens and not of all readings
     assert 0.5 < loo.p < 5
     posterior, sd = by_smc.posterior["mu"], optimum.stderr["mu"]
     assert float(posterior.mean()) == pytest.approx(optimum.point["mu"], abs=0.4 * sd)
     assert float(posterior.std()) == pytest.approx(sd, rel=0.3)
-    assert by_smc.log_likelihood[f"{name}_specimen"].values.tolist() == list(range(N))
+    assert by_smc.log_likelihood["b_specimen"].values.tolist() == list(range(N))
     diagnosis = prb.diagnose(by_smc, model=model)
     assert not diagnosis.findings
     assert len(diagnosis.messages) == len(diagnosis.findings)
     assert not diagnosis.untested
-    response = specimen_likelihoods(model)[model[name]].measurements[-1].responses
+    (x,) = specimen_likelihoods(model)[model["b"]].inputs.aleatory
     for result in (optimum, by_smc):
-        predicted = prb.predict(
-            result, response.function, *response.inputs.fill(response.inputs.aleatory, []),
-            model=model, progressbar=False,
-        )  # fmt: skip
-        expected = response.function(at["mu"], *([3.0] if name == "b" else []))
-        assert float(predicted.mean()) == pytest.approx(expected, abs=0.2)
+        predicted = prb.predict(result, down, x, 3.0, model=model, progressbar=False)
+        assert float(predicted.mean()) == pytest.approx(down(at["mu"], 3.0), abs=0.2)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("make", [two_simulators, repeated])
-def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
-    optimum = prb.minimize(make(), starts=0, progressbar=False)
+def test_other_data_sets_are_of_specimens() -> None:
+    optimum = prb.minimize(repeated(), starts=0, progressbar=False)
     sd = optimum.stderr["mu"]
     bootstrap = prb.bootstrap(optimum, draws=100, random_seed=1, progressbar=False)
     # Standard error of a standard deviation of 100 draws: 7 %

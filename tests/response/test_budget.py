@@ -94,13 +94,6 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     assert optimum.message == at_once.message
 
 
-def test_before_anything_is_known_minimize_says_what_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(BudgetError, match=r"prb\.minimize: .*no result|before there was a result"):
-        found(tmp_path, max_runs=10)
-    stored = prb.response.Store(tmp_path, "y", version="1")
-    assert len(stored) == 16 + 10
-
-
 def test_minimize_stops_in_time(tmp_path: Path) -> None:
     # A theta takes 0.16 s, a chunk a hundredth.
     response = Counted(0.01)

@@ -6,7 +6,6 @@ import logging
 import math
 import re
 import sqlite3
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import (
@@ -26,7 +25,6 @@ import xarray as xr
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import (
     CallSettings,
@@ -110,22 +108,6 @@ def run(
 
 
 # -- the same numbers, wherever they are computed --------------------------------------------------
-
-
-def test_resimulated_and_fresh_use_the_executor_too() -> None:
-    seen = set()
-
-    def response(x: Any, a: Any) -> Any:
-        seen.add(threading.current_thread().name)
-        return a * x
-
-    with ThreadPoolExecutor(2, thread_name_prefix="far") as pool:
-        for propagation in (prb.Resimulated(N, executor=pool), prb.Fresh(N, executor=pool)):
-            evaluator = Evaluator.of(model(response, propagation))
-            seen.clear()
-            evaluator(np.zeros((2, 1)))
-            assert seen
-            assert all(name.startswith("far") for name in seen)
 
 
 def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(

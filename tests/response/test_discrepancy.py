@@ -131,11 +131,6 @@ def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture)
     assert [record.message for record in caplog.records] == [said]
 
 
-def test_it_can_be_pickled() -> None:
-    again = pickle.loads(pickle.dumps(prb.response.Additive(TIMES).of(curve, TIMES)))
-    np.testing.assert_allclose(again(1.0, 3.0), [1.0, 3.0, 7.0])
-
-
 @pytest.mark.parametrize(
     ("condition", "response", "coefficients"),
     [

@@ -138,14 +138,5 @@ def test_biases_are_those_of_the_true_inputs() -> None:
     assert bias[1] == pytest.approx(sd, abs=0.03)  # of second order in the change of the sd
 
 
-def test_bias_has_no_unit() -> None:
-    rng = np.random.default_rng(3)
-    shift, x = rng.normal(0, 0.1, (16, 2)), rng.standard_normal((16, 2))
-    expected = predicted_bias(shift, x, 30)
-    unit, order = np.array([10.0, 1e-4]), rng.permutation(16)
-    assert predicted_bias(shift * unit, x * unit, 30) == pytest.approx(expected)
-    assert predicted_bias(shift[order], x[order], 30) == pytest.approx(expected)
-
-
 def test_inputs_at_one_place_have_an_unknown_bias() -> None:
     assert np.isinf(predicted_bias(np.full((4, 1), 0.1), np.ones((4, 1)), 20)).all()
