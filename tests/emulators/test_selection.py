@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bent_response import BOX, bent
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -15,12 +16,6 @@ from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.selection import CrossValidation, TrainingRuns, points_needed, weight_of_runs
 from prbayes.emulators.surfaces import FOLDS, Polynomial, Surface
-
-BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
-
-
-def bent(x: Any, y: Any) -> Any:
-    return np.sin(x) * y
 
 
 def test_the_error_is_that_of_left_out_points() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bent_response import BOX, FRESH, bent
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -16,13 +17,6 @@ from prbayes.emulators.following import Follower, fit_follower
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import Polynomial, Surface
-
-BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
-FRESH = np.random.default_rng(3).uniform([0, 1], [3, 2], (500, 2)).T
-
-
-def bent(x: Any, y: Any) -> Any:
-    return np.sin(x) * y
 
 
 @pytest.mark.parametrize("degree", [1, 3])

@@ -10,18 +10,13 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from bent_response import BOX, bent
 
 import prbayes as prb
 from prbayes.emulators.surrogate import hashed_rows
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import DesignError
 from prbayes.response.failures import Abort, Replace, ResponseError
-
-BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
-
-
-def bent(x: Any, y: Any) -> Any:
-    return np.sin(x) * y
 
 
 @pytest.fixture(scope="module")

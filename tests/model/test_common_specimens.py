@@ -8,12 +8,10 @@ from functools import cache
 from typing import Any
 
 import arviz as az
-import cloudpickle
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from pymc.model.fgraph import clone_model
 from scipy import stats
 
 import prbayes as prb
@@ -196,23 +194,6 @@ def test_specimens_of_one_simulator_may_have_fewer_readings_than_inputs() -> Non
     assert change.sum() == pytest.approx((expected(OTHER) - expected(POINT)).sum(), abs=0.15)
 
 
-@pytest.mark.long
-def test_errors_of_both_simulators_may_be_variables() -> None:
-    with pm.Model() as model:
-        x = population()
-        e = pm.HalfNormal("e", 0.5)
-        prb.Simulator("a", up, x, observed=Y[A, 0], specimens=A, metric=metric(error=e))
-        b = metric(error=0.2)
-        prb.Simulator("b", down, x, 3.0, observed=Y[B, 1], specimens=B, metric=b)
-    ours = log_density(fine(model, 128), "b")
-    assert_without_a_graph(model, "b", ours)
-    for error in (0.25, 0.4):
-        assert_close(
-            lambda point, error=error: ours(point | {"e_log__": np.log(error)}),
-            lambda point, error=error: exact(point, errors=(error, 0.2)),
-        )
-
-
 def test_gross_errors_are_of_a_specimen_in_all_its_readings() -> None:
     with pm.Model() as model:
         x = population()
@@ -280,20 +261,6 @@ def test_other_data_of_the_first_simulator_are_seen_by_the_last() -> None:
         compiled(POINT)
     other = Y + np.array([0.5, 0.0])
     assert np.allclose(values(model, "b"), exact(POINT, other), atol=TOLERANCE)
-
-
-def test_copies_have_the_same_points() -> None:
-    copy = cloudpickle.loads(cloudpickle.dumps(clone_model(shared())))
-    assert np.allclose(values(copy, "b"), values(shared(), "b"), rtol=1e-12)
-
-
-def test_draws_of_both_simulators_have_the_shape_of_their_readings() -> None:
-    known = pm.do(shared(), {"mu": 1.0, "sigma": 0.5})
-    a, b = pm.draw([known["a"], known["b"]], 200, random_seed=1, mode=PLAIN)
-    assert (a.shape, b.shape) == ((200, len(A)), (200, len(B)))
-    # 2800 draws: standard errors of 1 % or less
-    assert a.std() == pytest.approx(np.hypot(1.0, 0.3), rel=0.06)
-    assert b.std() == pytest.approx(np.hypot(0.5, 0.2), rel=0.06)
 
 
 def test_repeated_readings_share_the_inputs_of_their_specimen() -> None:

@@ -16,7 +16,6 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.model.data_checks import (
     DataCheckOptions,
-    chance_of_repeats,
     check_constant,
     count_at_ends,
     data_findings,
@@ -176,24 +175,6 @@ def test_identical_specimens_are_groups_of_indices() -> None:
     y = np.array([[1, 2], [3, np.nan], [1, 2], [np.nan, np.nan], [3, np.nan], [1, 2], [1, np.nan]])
     assert identical_specimens(y) == ((0, 2, 5), (1, 4))
     assert identical_specimens(np.full((4, 2), np.nan)) == ()
-
-
-@pytest.mark.parametrize(("m", "step"), [(1, 0.1), (2, 0.01)])
-def test_size_of_repeats(m: int, step: float) -> None:
-    rng = np.random.default_rng([m, int(100 * step)])
-    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 99) for _ in range(30)]
-    # size 0 to .03; standard error .03
-    assert np.mean(np.array(p) <= 0.01) <= 0.14
-
-
-@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.1)])
-def test_copies_are_identified(m: int, step: float) -> None:
-    rng = np.random.default_rng(14)
-    found = [
-        "identical-specimens" in codes(with_copies(correlated(rng, 20, m, step))) for _ in range(20)
-    ]
-    # power 1.00, and .95 with two outputs and a step of .1; standard error .05
-    assert np.mean(found) >= (1.0 if step < 0.1 else 0.75)
 
 
 def one_output(rng: np.random.Generator) -> Floats:

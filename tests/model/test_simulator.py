@@ -22,7 +22,6 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, epsilons
-from prbayes.model.parameters import unconstrained
 from prbayes.model.random_variable import Node, simulators
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
@@ -330,21 +329,21 @@ def test_labels_that_only_look_the_same_are_refused(labels: Any, message: str | 
 # Simulators of one response.
 
 
-def two_of_one(propagation: Propagation, second: float = 1.0) -> tuple[pm.Model, list[int]]:
+def two_of_one(propagation: Propagation) -> tuple[pm.Model, list[int]]:
     """Return a model whose two simulators have one response, and the sizes of its calls."""
     sizes: list[int] = []
 
-    def response(x: Any, z: float) -> Any:
+    def response(x: Any) -> Any:
         x = np.asarray(x, dtype=np.float64)
         if x.size > 1:  # a specimen by itself is no run
             sizes.append(x.size)
-        return z * x
+        return x
 
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
         given = {"observed": np.linspace(1.0, 3.0, 20), "propagation": propagation}
-        prb.Simulator("a", response, x, 1.0, metric=AREA, **given)
-        prb.Simulator("b", response, x, second, metric=prb.KullbackLeibler(), **given)
+        prb.Simulator("a", response, x, metric=AREA, **given)
+        prb.Simulator("b", response, x, metric=prb.KullbackLeibler(), **given)
     return model, sizes
 
 
@@ -379,14 +378,6 @@ def test_simulators_of_one_response_share_the_runs_of_a_population(
     separate = Evaluator.of(two_of_one(propagation)[0])
     for k in (1, 0):
         np.testing.assert_allclose(separate.discrepancies(thetas, k), together[:, k], rtol=1e-12)
-
-
-def test_another_constant_is_another_run() -> None:
-    evaluator = Evaluator.of(two_of_one(prb.Resimulated(64), second=3.0)[0])
-    theta = unconstrained(evaluator.hyperparameters, {"mu": 2.0, "sigma": 0.5})[None]
-    populations = [evaluator.populations(theta, k) for k in range(2)]
-    means = [(values * weights).sum() for values, weights in populations]
-    assert means[1] == pytest.approx(3 * means[0], rel=1e-9)
 
 
 def test_functions_of_a_wrong_shape_are_refused_before_any_run() -> None:

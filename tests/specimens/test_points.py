@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from normal_populations import NormalDraws
 from scipy.special import logsumexp, ndtr
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_normal
 
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings, scaled_errors
@@ -25,30 +26,6 @@ from prbayes.specimens.points import (
 )
 
 N = 8
-
-
-@dataclass(frozen=True)
-class NormalDraws:
-    """Draws of the means and standard deviations of independent normal inputs."""
-
-    means: Floats  # (S, d)
-    sds: Floats  # (S, d)
-
-    @property
-    def thetas(self) -> Floats:
-        return np.concatenate([self.means, self.sds], axis=1)
-
-    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        log_p = norm(self.means[:, None, None], self.sds[:, None, None]).logpdf(z).sum(axis=-1)
-        return np.asarray(logsumexp(log_p + log_a, axis=2))
-
-    def specimens(self) -> Floats:
-        rng = np.random.default_rng(0)
-        z = self.means + self.sds * rng.standard_normal((64, *self.means.shape))
-        return z.reshape(-1, self.means.shape[1])
-
-    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
-        return self
 
 
 def draws_of(d: int, mean_sd: float = 0.03, sd: float = 0.15) -> NormalDraws:
