@@ -20,7 +20,7 @@ RANDOM = np.random.default_rng(1).random((1200, 2)) * [6, 4] - [2, 2]
 HOLE = RANDOM[(np.abs(RANDOM - [1, 0]) > 0.9).any(axis=1)][:300]
 ROOT = np.linalg.cholesky([[1, 0.999], [0.999, 1]]) * [[1.5], [1.0]]
 CORRELATED = np.random.default_rng(2).normal(size=(120, 2)) @ ROOT.T + [1, 0]
-LEVELS = np.stack(np.meshgrid(np.linspace(-2, 4, 20), np.linspace(-2, 2, 5)), -1).reshape(-1, 2)
+LEVELS = np.stack(np.meshgrid(np.linspace(-2, 4, 12), np.linspace(-2, 2, 5)), -1).reshape(-1, 2)
 
 
 def bump(x: Any) -> Any:

@@ -67,7 +67,7 @@ def test_readings_with_several_roots_in_the_priors_centre_are_reported(
 ) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", lambda x: np.sin(rate * x), x, observed=np.sin(rate * 0.2 * X))
+        prb.Simulator("y", lambda x: np.sin(rate * x), x, observed=np.sin(rate * 0.2 * X[:6]))
     (likelihood,) = specimen_likelihoods(model).values()
     assert [finding.code for finding in prepared(likelihood).findings] == codes
 

@@ -54,17 +54,44 @@ def _assert_same_distribution(draws: Any, expected: Any) -> None:
         assert stats.ks_2samp(x, y, method="asymp").pvalue > 1e-5
 
 
-# Scalar parameters of all distributions are in benchmarks/tests/test_distributions.py.
-_SLOW = (",", "Hurdle", "ZeroInflated", "Mixture")
-_LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n in CASES}
+# One for each way in which PyMC draws a distribution, or has its density. The long tests have those
+# that are made of others, the slow ones all distributions of a single random variable.
+_SHORT = (
+    "AsymmetricLaplace",
+    "Bernoulli",
+    "Censored",
+    "CustomDist",
+    "DensityDist",
+    "DiracDelta",
+    "HalfStudentT",
+    "Interpolated",
+    "Kumaraswamy",
+    "Moyal",
+    "Normal",
+    "OrderedLogistic",
+    "Poisson",
+    "Simulator",
+    "Truncated",
+    "Weibull",
+)
+_PARTS = (",", "Hurdle", "ZeroInflated", "Mixture")
+_NAMES = [
+    *_SHORT,
+    *(
+        pytest.param(
+            name,
+            marks=pytest.mark.long if any(x in name for x in _PARTS) else pytest.mark.slow,
+        )
+        for name in CASES
+        if name not in (*_SHORT, *_UNDRAWN)
+    ),
+]
 
 
 @pytest.mark.filterwarnings(  # of PyMC
     "ignore::RuntimeWarning", "ignore::UserWarning", "ignore::FutureWarning"
 )
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=_LONG[name]) for name in CASES if name not in _UNDRAWN]
-)
+@pytest.mark.parametrize("name", _NAMES)
 def test_priors_and_inputs_are_those_of_pymc(name: str) -> None:
     case = CASES[name]
     low, truth, high = case.nearby()

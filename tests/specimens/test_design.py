@@ -134,7 +134,7 @@ def test_smooth_responses_need_few_runs(function: Callable[[Floats], Floats], x:
 
 
 def test_fewer_readings_than_inputs_need_few_runs() -> None:
-    x = population([0.1, 0.1], [0.1, 0.1])
+    x = population([0.1, 0.1], [0.1, 0.1], n=10)
     draws = draws_around(x.mean(axis=0), x.std(axis=0), len(x))
     run, emulation, points = emulated(underdetermined, x, posterior=lambda *_: draws)
     assert len(run.z) <= 60
