@@ -222,7 +222,7 @@ def test_after_an_error_the_next_use_tries_again(
     (node,) = first_use(model).values()
     counts = node.responses
     assert (counts.count, counts.computed, counts.failed) == (runs, runs, ())
-    assert response.runs == calls + 2
+    assert response.runs == calls + 2  # one in each use that failed
 
 
 @pytest.mark.parametrize("budgeted", [prb.minimize, prb.refine, prb.sample_smc])

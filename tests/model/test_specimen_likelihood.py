@@ -263,7 +263,9 @@ def test_copies_have_the_same_points(make: str) -> None:
 @pytest.mark.parametrize("change", [pm.do, pm.observe])
 def test_a_hyperparameter_that_is_set_needs_no_run(change: Callable[..., pm.Model]) -> None:
     model = shared()
-    runs = Evaluator.of(model).n_responses
+    (measurement,) = specimen_likelihoods(model)[model["y"]].measurements
+    response = measurement.responses.function
+    runs = response.runs
     other = change(model, {"sigma": 0.5})
     ours = values(other, {"mu": 0.8})
     assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 1.0), atol=0.03)
@@ -271,7 +273,7 @@ def test_a_hyperparameter_that_is_set_needs_no_run(change: Callable[..., pm.Mode
         pm.set_data({"sigma": 1.0}, model=other)
         ours = values(other, {"mu": 0.8})
         assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 2.0), atol=0.03)
-    assert Evaluator.of(model).n_responses == runs
+    assert response.runs == runs
 
 
 def test_other_data_of_the_same_model() -> None:

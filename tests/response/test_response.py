@@ -215,13 +215,17 @@ def second_is_reversed(x: Any) -> Any:
         (lambda x: x - x.mean(), ()),
         (lambda x: np.cumsum(x, axis=-1)[..., ::-1], ()),
         (warm_start, ()),
+        (lambda x: x + 0.6 * (x - np.concatenate([x[..., :1], x[..., :-1]], axis=-1)), ()),
+        (lambda x: 0.5 * (x + x[..., :1]), ()),
         (lambda x: np.cumsum(x, axis=-1), ()),
         (lambda x: np.maximum.accumulate(x, axis=-1), (POINTS.reshape(2, 32)[::-1, ::-1],)),
+        (lambda x: np.gradient(x, axis=-1), (POINTS**2,)),
         (second_is_reversed, ()),
         (second_is_reversed, (np.array([0.5]), POINTS)),  # a batch of one shows nothing
     ],
     ids=[
-        *("flip", "mean", "sum", "warm start", "cumsum", "running maximum", "output", "later"),
+        *("flip", "mean", "sum", "warm start", "difference", "first", "cumsum"),
+        *("running maximum", "gradient", "output", "later"),
     ],
 )
 def test_a_response_that_mixes_its_specimens_is_refused(response: Any, batches: Any) -> None:
