@@ -80,13 +80,6 @@ def test_inputs_that_do_not_exist_have_no_mass() -> None:
     np.testing.assert_allclose(draws.std(axis=1) / sd, 1, atol=0.1)
 
 
-def test_the_maximum_is_at_inputs_that_exist() -> None:
-    response, *priors, x = PROBLEMS["pole"]
-    optimum = prb.minimize(build(response, *priors, x))
-    np.testing.assert_allclose(optimum.theta[0], x.mean(), rtol=1e-3)
-    assert optimum.local_optima == ()
-
-
 @pytest.mark.long
 def test_a_budget_that_ends_in_the_audit_keeps_the_draws() -> None:
     model = build(*PROBLEMS["pole"])

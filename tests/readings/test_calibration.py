@@ -29,7 +29,7 @@ def exact_log_likelihood(case: study.Case, natural: Floats) -> Floats:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "cell", ["poisson", "binomial", "negative binomial", "combined", "bias", "limit"]
+    "cell", ["gaver", "poisson", "binomial", "negative binomial", "combined", "bias"]
 )
 def test_log_likelihoods_are_exact(cell: str) -> None:
     case = study.case_of(cell, 0)
@@ -72,8 +72,13 @@ def test_failure_rates_of_pumps() -> None:
     assert ratio.max() < 2 * ratio.min()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cell", ["binomial", "bias", "limit"])
+@pytest.mark.parametrize(
+    "cell",
+    [
+        *(pytest.param(cell, marks=pytest.mark.slow) for cell in ("binomial", "bias")),
+        pytest.param("limit", marks=pytest.mark.long),
+    ],
+)
 def test_posteriors_are_exact(cell: str) -> None:
     row = study.row(cell, 1)
     assert np.abs(row["offset"]).max() < 0.1

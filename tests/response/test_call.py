@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from concurrent.futures import (
+    BrokenExecutor,
     Executor,
     Future,
     ThreadPoolExecutor,
@@ -369,6 +370,20 @@ def test_what_is_being_computed_when_one_fails_is_kept(tmp_path: Path) -> None:
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
+
+
+class Broken(Executor):
+    """Loses its workers."""
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+        raise BrokenExecutor("killed")
+
+
+def test_an_executor_without_workers_ends_the_run_with_a_remedy() -> None:
+    calling = CallSettings("y", prb.scalar(times), Broken())
+    match = r"y: a worker was lost \(BrokenExecutor: killed\); if a response ends its .*run again"
+    with pytest.raises(ResponseError, match=match):
+        respond(calling, line(4), Tally())
 
 
 # -- failures are not results ----------------------------------------------------------------------
