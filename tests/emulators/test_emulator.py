@@ -152,28 +152,6 @@ def test_the_gradient_of_the_likelihood_is_its_derivative(kernel: str) -> None:
         assert gradient[a] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("model", [*CANDIDATES, Polynomial(3)], ids=str)
-def test_emulators_without_runs_have_the_left_out_errors(model: Surface) -> None:
-    """Of smooth outputs too, whose matrix has hardly a digit."""
-    z = design(60, 2)
-    emulator = fit_emulator(z, smooth(z), tried=[model])
-    masks = np.eye(60, dtype=bool)
-    if isinstance(model, Polynomial):
-        masks = getattr(emulator.surfaces[0], "folds", masks)
-    for mask, without in zip(masks, emulator.without_each(masks), strict=True):
-        errors = smooth(z[mask]) - without.values(z[mask])
-        np.testing.assert_allclose(errors, emulator.left_out[mask], rtol=1e-2, atol=1e-5)
-
-
-def test_the_variance_is_that_of_errors_at_close_runs() -> None:
-    z = np.concatenate([design(48, 2), 0.4 + 0.1 * np.random.default_rng(0).normal(size=(40, 2))])
-    points = 0.4 + 0.1 * np.random.default_rng(1).normal(size=(200, 2))
-    emulator = fit_emulator(z, smooth(z), (np.abs(z - 0.4) < 0.4).all(axis=1))
-    errors = np.sqrt(((emulator.values(points) - smooth(points)) ** 2).mean(axis=0))
-    ratio = errors / np.sqrt(emulator.variance(points).mean(axis=0))
-    assert ((ratio > 0.1) & (ratio < 10)).all()
-
-
 def test_neither_order_nor_units_matter() -> None:
     z, elsewhere = design(48, 2), design(16, 2, seed=5)
     values, jacobian = fit_emulator(z, smooth(z))(elsewhere)
@@ -285,18 +263,6 @@ def test_blocks_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
                 np.testing.assert_allclose(blocked, array, rtol=1e-7, atol=1e-7)
         assert [x.shape for x in emulator(points[:0])] == [(0, 2), (0, 2, 2)]
         assert emulator.variance(points[:0]).shape == (0, 2)
-
-
-@pytest.mark.parametrize("size", [4, 30], ids=["outputs", "components"])
-def test_outputs_of_each_point_alone(size: int) -> None:
-    z, elsewhere, t = design(40, 2), design(20, 2, seed=5), np.linspace(0, 1, size)
-    emulator = fit_emulator(z, np.exp(0.4 * z[:, :1] * t) + z[:, 1:])
-    columns = np.random.default_rng(0).integers(0, size, (20, 3))
-    values, jacobian = emulator(elsewhere)
-    own_values, own_jacobian = emulator(elsewhere, columns)
-    rows = np.arange(20)[:, None]
-    np.testing.assert_allclose(own_values, values[rows, columns], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(own_jacobian, jacobian[rows, columns], rtol=1e-9, atol=1e-12)
 
 
 def test_outputs_of_single_points_have_surfaces_of_their_own_if_components_are_many() -> None:

@@ -8,18 +8,14 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from bent_response import BOX, FRESH, bent
 from sklearn.linear_model import Ridge
 
 import prbayes as prb
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.store import StoreError
 
-BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
-X, Y = np.random.default_rng(3).uniform([0, 1], [3, 2], (500, 2)).T
-
-
-def bent(x: Any, y: Any) -> Any:
-    return np.sin(x) * y
+X, Y = FRESH
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF
+from bent_response import BOX, FRESH, bent
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -18,13 +17,6 @@ from prbayes.emulators.following import Follower, fit_follower
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import Polynomial, Surface
-
-BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
-FRESH = np.random.default_rng(3).uniform([0, 1], [3, 2], (500, 2)).T
-
-
-def bent(x: Any, y: Any) -> Any:
-    return np.sin(x) * y
 
 
 @pytest.mark.parametrize("degree", [1, 3])
@@ -59,16 +51,6 @@ def test_smoothing_recovers_a_response_below_its_noise() -> None:
     noisy = prb.Surrogate.fit(scattered, BOX, 256, model=settings)
     assert np.sqrt(np.mean((noisy(*FRESH) - bent(*FRESH)) ** 2)) < 0.03
     assert noisy.error.rms == pytest.approx(0.05, rel=0.2)  # se of an rms of 256 is 4%
-
-
-def test_a_regressor_of_scikit_learn_serves_and_is_left_unfitted() -> None:
-    # The length of greatest likelihood is .60; it is not estimated, as the likelihood of responses
-    # without noise is rounded.
-    regressor = GaussianProcessRegressor(RBF(0.6), alpha=1e-8, optimizer=None)
-    found = prb.Surrogate.fit(lambda x, y: 1e6 + 1e4 * bent(x, y), BOX, 64, model=regressor)
-    off = found(*FRESH) - 1e6 - 1e4 * bent(*FRESH)
-    assert np.sqrt(np.mean(off**2)) < 10
-    assert not hasattr(regressor, "X_train_")
 
 
 class Plane(Surface):

@@ -160,19 +160,6 @@ def test_predictions_are_at_the_conditions_of_new_specimens() -> None:
         assert prb.predict(optimum, grown, x, 4.0).dims == ("chain", "draw", "sample")
 
 
-def test_a_response_under_conditions_of_its_own_has_no_common_score() -> None:
-    """The density of responses under all loads is not that of a specimen under its load."""
-    likelihood = likelihood_of(LOADS["linear"])
-    table = prb.cross_validate(
-        prb.minimize(likelihood.model(), starts=0, progressbar=False), folds=3
-    )
-    assert np.isfinite(table["discrepancy"]).all()
-    assert table["score"].isnull().all()
-    assert "12 specimens without a score" in str(table)
-    with pytest.raises(ValueError, match="depend on a condition of each specimen"):
-        prb.rank({"first": table, "second": table})
-
-
 def test_problems_with_other_conditions_differ() -> None:
     y = np.exp(X) * LOADS["linear"]
     first, second = (likelihood_of(load, observed=y) for load in (LOADS["linear"], LOADS["log"]))

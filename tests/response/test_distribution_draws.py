@@ -54,29 +54,52 @@ def _assert_same_distribution(draws: Any, expected: Any) -> None:
         assert stats.ks_2samp(x, y, method="asymp").pvalue > 1e-5
 
 
-# Scalars are inputs in benchmarks/tests/test_distributions.py too.
-_SLOW = (",", "Hurdle", "ZeroInflated", "Mixture")
-_LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n in CASES}
+# One for each way in which PyMC draws a distribution, or has its density. The long tests have those
+# that are made of others, the slow ones all distributions of a single random variable.
+_SHORT = (
+    "AsymmetricLaplace",
+    "Bernoulli",
+    "Censored",
+    "CustomDist",
+    "DensityDist",
+    "DiracDelta",
+    "HalfStudentT",
+    "Interpolated",
+    "Kumaraswamy",
+    "Moyal",
+    "Normal",
+    "OrderedLogistic",
+    "Poisson",
+    "Simulator",
+    "Truncated",
+    "Weibull",
+)
+_PARTS = (",", "Hurdle", "ZeroInflated", "Mixture")
+_NAMES = [
+    *_SHORT,
+    *(
+        pytest.param(
+            name,
+            marks=pytest.mark.long if any(x in name for x in _PARTS) else pytest.mark.slow,
+        )
+        for name in CASES
+        if name not in (*_SHORT, *_UNDRAWN)
+    ),
+]
 
 
 @pytest.mark.filterwarnings(  # of PyMC
     "ignore::RuntimeWarning", "ignore::UserWarning", "ignore::FutureWarning"
 )
-@pytest.mark.parametrize(
-    "size", [pytest.param(None, marks=pytest.mark.long), 2], ids=["scalar", "vector"]
-)
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=_LONG[name]) for name in CASES if name not in _UNDRAWN]
-)
-def test_priors_and_inputs_are_those_of_pymc(name: str, size: int | None) -> None:
-    if size is not None and name in _SCALAR_ONLY:
-        pytest.skip("its parameters are no scalars")
+@pytest.mark.parametrize("name", _NAMES)
+def test_priors_and_inputs_are_those_of_pymc(name: str) -> None:
     case = CASES[name]
     low, truth, high = case.nearby()
-    h = truth if size is None else np.array([low, high])
+    is_scalar = name in _SCALAR_ONLY
+    h = truth if is_scalar else np.array([low, high])
     expected = pm.draw(_dist(case, h), DRAWS, random_seed=1, mode=PLAIN)
     _assert_prior(case, h, expected, has_density=name not in _WITHOUT_DENSITY)
-    other = low if size is None else np.array([high, low])
+    other = low if is_scalar else np.array([high, low])
     _assert_input(case, [other, h], expected, has_density=name not in _WITHOUT_DENSITY)
 
 

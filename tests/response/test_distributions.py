@@ -283,14 +283,6 @@ def test_random_walks_have_pymc_s_density_and_no_other() -> None:
         np.testing.assert_allclose(row, expected, rtol=1e-10)
 
 
-def test_prior_draws_of_a_child_vary_with_its_parent() -> None:
-    with pm.Model():
-        child = pm.Normal("child", pm.Normal("parent", 0, 1), 0.1)
-    (draws,) = PriorSampler([child])(4000, 1)
-    # Five standard errors; .1 if all draws had one parent.
-    assert np.std(draws) == pytest.approx(np.sqrt(1.01), rel=5 / np.sqrt(2 * 4000))
-
-
 def test_ends_of_supports_are_those_that_no_hyperparameter_moves() -> None:
     with pm.Model():
         mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)

@@ -17,12 +17,7 @@ import pytest
 import units
 
 import prbayes as prb
-from benchmarks.hostile import processes
 from prbayes.response import fmu
-from prbayes.response.call import CallSettings, Points, Tally, respond
-from prbayes.response.executors import Pool
-from prbayes.response.outputs import read_observed
-from prbayes.response.store import Store
 
 
 @pytest.fixture(scope="module")
@@ -131,19 +126,6 @@ def test_what_takes_too_long_is_ended_between_steps(unit: Path) -> None:
     ):
         response(1.0, 1050.0)
     np.testing.assert_array_equal(joined(response(2.0, 3.0)), [4.5, 18.0])
-
-
-def test_outputs_are_stored_in_the_order_of_what_was_observed(unit: Path, tmp_path: Path) -> None:
-    force = np.linspace(2.0, 4.0, 16)
-    points = Points([2.0, force], [False, True])
-    _, outputs = read_observed("y", {"work": force, "position": force})
-    expected = np.stack([2 * force**2, force / 2 * 3.0], axis=1)
-    for n_computed in (16, 0):
-        store, tally = Store(tmp_path, "y", columns=2, version="1", outputs=2), Tally()
-        with ThreadPoolExecutor(2) as pool:
-            calling = CallSettings("y", spring(unit), pool, store, outputs=outputs)
-            np.testing.assert_allclose(respond(calling, points, tally), expected, rtol=1e-14)
-        assert tally.computed == n_computed
 
 
 def test_a_simulator_that_does_not_fit_is_refused_before_anything_is_simulated(
@@ -363,45 +345,6 @@ if hasattr(os, "fork"):
     packed = pickle.dumps(work(unit))
     subprocess.run(program, input=packed, check=True, timeout=60, env=home)
     assert not list(tmp_path.glob("*fmu*"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("stiffness", "timeout"),
-    [
-        pytest.param(-7.0, None, id="crashes"),
-        pytest.param(-9.0, 2.0, id="hangs", marks=pytest.mark.slow),
-    ],
-)
-def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_are_used_again(
-    unit: Path, tmp_path: Path, stiffness: float, timeout: float | None
-) -> None:
-    response = prb.fmu(unit, inputs=["stiffness", "force"], outputs=["position"])
-    x = np.arange(1.0, 21.0)
-    x[5] = stiffness
-    points, tally = Points([x, 2 * x], [True, True]), Tally()
-    store, policy = Store(tmp_path, "y", columns=2), prb.response.Replace(-1.0)
-    with processes() as executor:
-        calling = CallSettings("y", response, executor, store, policy, timeout=timeout)
-        found = respond(calling, points, tally)
-        np.testing.assert_array_equal(found, np.where(x == stiffness, -1.0, 6.0))
-        (failure,) = tally.failed.values()
-        assert failure.inputs[0] == stiffness
-        assert failure.reason.startswith("it ended its worker (")
-        # The others are in the store, and the failure is; nothing is computed for it again.
-        again = Tally()
-        respond(calling, points, again)
-        assert again.computed == 0
-        # Workers have made one instance each, whatever the number of specimens.
-        more = Points([x + 0.5, 2 * x + 1], [True, True]).at(np.delete(np.arange(20), 5))
-        np.testing.assert_array_equal(respond(calling, more, Tally()), np.full(19, 6.0))
-        pool = Pool("y", executor)
-        made = "[one.n_loaded for one in __import__('prbayes').response.fmu._open_units.values()]"
-        counts = [pool.submitted(eval, made).result() for _ in range(8)]
-        assert [1] in counts
-        assert all(count in ([], [1]) for count in counts)
-        if pool.executor is not executor:
-            pool.executor.shutdown()
 
 
 def test_a_file_that_is_changed_or_gone_is_noticed_where_the_work_is_done(

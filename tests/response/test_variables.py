@@ -26,7 +26,6 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
-import scipy.interpolate
 from scipy.special import zetac
 
 import prbayes as prb
@@ -67,12 +66,10 @@ class Machine:
 
     def __init__(self) -> None:
         self.load = 1.0
-        self.table = [1.0] * 20
-        self.inner = types.SimpleNamespace(values=np.ones(3), names={"a": {"load": 1.0}})
+        self.inner = types.SimpleNamespace(names={"a": {"load": 1.0}})
 
     def __call__(self, x: Any) -> Any:
-        a = self.inner.names["a"]["load"]
-        return self.load * self.factor * self.table[3] * self.inner.values[1] * a * x
+        return self.load * self.factor * self.inner.names["a"]["load"] * x
 
     def method(self, x: Any) -> Any:
         return self(x)
@@ -111,9 +108,7 @@ def decorated(function: Any) -> Any:
 
 
 NOTEBOOK = """
-import numpy as np
 load = 1.0
-array = np.ones(3)
 settings = {"loads": [1.0, 2.0]}
 class Part:
     load = 1.0
@@ -122,7 +117,7 @@ def helper(x):
 def inner(x):
     return (lambda y: helper(y))(x)
 def f(x):
-    return array[0] * settings["loads"][0] * Part.load * inner(x)
+    return settings["loads"][0] * Part.load * inner(x)
 """
 
 
@@ -142,8 +137,8 @@ def of_closure() -> tuple[Any, Callable[[], Any]]:
     return response, lambda: loads.__setitem__(0, 2.0)
 
 
-def of_array(size: int, dtype: Any = float) -> tuple[Any, Callable[[], Any]]:
-    array = np.ones(size, dtype)
+def of_array(size: int) -> tuple[Any, Callable[[], Any]]:
+    array = np.ones(size)
 
     def response(x: Any) -> Any:
         return array.sum() / size * x
@@ -188,19 +183,9 @@ def of_partial() -> tuple[Any, Callable[[], Any]]:
     return functools.partial(inner), lambda: settings.update(load=2.0)
 
 
-def of_keywords() -> tuple[Any, Callable[[], Any]]:
-    function = functools.partial(lambda x, b: b * x, b=1.0)
-    return function, lambda: function.keywords.update(b=2.0)
-
-
 def of_table() -> tuple[Any, Callable[[], Any]]:
     table = pd.DataFrame({"load": [1.0, 2.0]})
     return lambda x: table["load"].to_numpy()[0] * x, lambda: table.iloc.__setitem__((0, 0), 2.0)
-
-
-def of_interpolant() -> tuple[Any, Callable[[], Any]]:
-    spline = scipy.interpolate.CubicSpline([-3.0, 0.0, 3.0], [-3.0, 0.0, 3.0])
-    return lambda x: spline(x), lambda: spline.c.__imul__(2.0)
 
 
 def of_graph() -> tuple[Any, Callable[[], Any]]:
@@ -236,14 +221,10 @@ def of_code() -> tuple[Any, Callable[[], Any]]:
 KINDS: dict[str, Callable[[], tuple[Any, Callable[[], Any]]]] = {
     "attribute": of_machine(lambda m: setattr(m, "load", 2.0)),
     "class attribute": of_machine(lambda m: setattr(type(m), "factor", 2.0)),
-    "list of an attribute": of_machine(lambda m: m.table.__setitem__(3, 2.0)),
-    "nested array": of_machine(lambda m: m.inner.values.__setitem__(1, 2.0)),
     "nested dictionary": of_machine(lambda m: m.inner.names["a"].update(load=2.0)),
     "method": of_machine(lambda m: setattr(m, "load", 2.0), lambda m: m.method),
-    "method-wrapper": of_machine(lambda m: setattr(m, "load", 2.0), lambda m: m.__call__),
     "redefined method": of_machine(lambda m: setattr(type(m), "__call__", lambda _, x: 2 * x)),
     "scalar": of_machine(lambda m: setattr(m, "load", 2.0), scalar),
-    "lambda": of_machine(lambda m: setattr(m, "load", 2.0), lambda m: lambda x: m(x)),
     "decorated": of_machine(lambda m: setattr(m, "load", 2.0), decorated),
     "wrapper": of_machine(lambda m: setattr(m, "load", 2.0), Wrapping),
     "np.vectorize": of_machine(lambda m: setattr(m, "load", 2.0), np.vectorize),
@@ -256,17 +237,13 @@ KINDS: dict[str, Callable[[], tuple[Any, Callable[[], Any]]]] = {
     "array": lambda: of_array(1000),
     "large array": lambda: of_array(3 * 10**6),
     "dates": of_dates,
-    "integers": lambda: of_array(10, int),
     "default": of_defaults,
     "attribute of a function": of_function_attribute,
     "partial": of_partial,
-    "keyword of a partial": of_keywords,
     "table": of_table,
-    "interpolant": of_interpolant,
     "shared variable": of_graph,
     "code": of_code,
     "global": lambda: notebook("load = 2.0"),
-    "global array in place": lambda: notebook("array[0] = 2.0"),
     "nested global": lambda: notebook("settings['loads'][0] = 2.0"),
     "global function": lambda: notebook("def helper(x): return 2 * x"),
     "variable of a module": of_library,
@@ -499,20 +476,10 @@ def harmless(kind: str) -> Any:
     return functions[kind]
 
 
-HARMLESS = [
-    "counter",
-    "memory",
-    "generator",
-    "logger",
-    "last",
-    "lazy",
-    "lru_cache",
-    "numba",
-    "lock",
-]
-
-
-@pytest.mark.parametrize("kind", HARMLESS)
+@pytest.mark.parametrize(
+    "kind",
+    ["counter", "memory", "generator", "logger", "last", "lazy", "lru_cache", "numba", "lock"],
+)
 def test_what_calls_change_is_no_change(kind: str) -> None:
     stored, values = computed(harmless(kind))
     other, _ = computed(stored.function)
@@ -552,9 +519,8 @@ def test_a_look_at_a_signature_is_no_change(function: Any) -> None:
     assert not changed_names(digests, digests_of(response))
 
 
-@pytest.mark.parametrize("kind", ["counter", "generator", "last"])
-def test_calls_by_hand_are_no_change(kind: str) -> None:
-    stored, _ = computed(harmless(kind))
+def test_calls_by_hand_are_no_change() -> None:
+    stored, _ = computed(harmless("counter"))
     for _ in range(2):
         stored.function(0.5)
         assert not stored.may_differ
@@ -651,27 +617,21 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "deep": deep,
     "many": lambda: {i: (i, str(i)) for i in range(100_000)},
     "generator": lambda: (i for i in range(3)),
-    "lock": threading.Lock,
     "thread": threading.current_thread,
     "file": lambda: sys.stdout,
-    "module": lambda: np,
     "main": lambda: sys.modules["__main__"],
     "ufunc": lambda: np.sin,
     "python ufunc": lambda: np.frompyfunc(abs, 1, 1),
-    "builtin": lambda: len,
     "class": lambda: dict,
     "weakref": lambda: __import__("weakref").ref(Machine),
     "memoryview": lambda: memoryview(b"abc"),
     "records": lambda: np.zeros(2, [("a", float), ("b", object)]),
-    "scalar array": lambda: np.array(3.0),
     "empty": lambda: np.empty((0, 3)),
     "masked": lambda: np.ma.masked_array([1.0, 2.0], [True, False]),
-    "read only": lambda: np.broadcast_to(1.0, (3, 4)),
     "surrogate": lambda: "\udc80",
     "null": lambda: "a\0b",
     "set": lambda: {1, "a", (2, object())},
     "model": lambda: MODEL,
-    "variable": lambda: X,
     "frame": sys._getframe,
     "pool": lambda: __import__("concurrent.futures").futures.ThreadPoolExecutor(1),
 }
@@ -771,8 +731,7 @@ def test_digests_of_a_store_are_protected_by_a_checksum(tmp_path: Path) -> None:
 # -- states ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("period", [2, 3, 5, 7])
-@pytest.mark.parametrize("n", [128, 256])
+@pytest.mark.parametrize(("period", "n"), [(2, 128), (7, 256)])
 def test_a_state_of_some_places_of_a_batch_is_found(period: int, n: int) -> None:
     def response(x: Any) -> Any:
         values = np.array(x, float)

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
-from scipy.stats import norm
+from normal_populations import NormalDraws
 
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
@@ -38,40 +37,20 @@ from prbayes.specimens.points import (
 from prbayes.specimens.weighted_points import fit_normal
 
 
-@dataclass(frozen=True)
-class NormalDraws:
-    """Normal populations around the one that fits weighted points best."""
+def draws_around(mean: Floats, sd: Floats, n: int) -> NormalDraws:
+    """Return normal populations as n specimens with this mean and deviation determine them."""
+    scatter = np.random.default_rng(3).standard_normal((32, 2, len(mean))) / np.sqrt(n)
+    return NormalDraws(mean + sd * scatter[:, 0], sd * np.exp(scatter[:, 1] / np.sqrt(2)))
 
-    mean: Floats
-    sd: Floats
-    n: int
 
-    @property
-    def thetas(self) -> Floats:
-        rng = np.random.default_rng(3)
-        scatter = rng.standard_normal((32, 2, len(self.mean))) / np.sqrt(self.n)
-        means = self.mean + self.sd * scatter[:, 0]
-        return np.concatenate([means, self.sd * np.exp(scatter[:, 1] / np.sqrt(2))], axis=1)
-
-    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        means, sds = np.split(self.thetas[:, None, None], 2, axis=-1)
-        log_p = norm(means, sds).logpdf(z).sum(axis=-1)
-        return np.asarray(logsumexp(log_p + log_a, axis=2))
-
-    def specimens(self) -> Floats:
-        rng = np.random.default_rng(0)
-        means, sds = np.split(self.thetas, 2, axis=1)
-        z = means + sds * rng.standard_normal((64, *means.shape))
-        return z.reshape(-1, len(self.mean))
-
-    @staticmethod
-    def posterior(z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
-        rows = np.isfinite(log_a).any(axis=1)
-        mean, root = fit_normal(z[rows], log_a[rows])
-        variance = np.diag(root @ root.T).copy()
-        if smoothing is not None:
-            variance += np.diag(smoothing)
-        return NormalDraws(mean, np.sqrt(variance), len(z))
+def posterior(z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+    """Return populations around the one that fits weighted points best."""
+    rows = np.isfinite(log_a).any(axis=1)
+    mean, root = fit_normal(z[rows], log_a[rows])
+    variance = np.diag(root @ root.T).copy()
+    if smoothing is not None:
+        variance += np.diag(smoothing)
+    return draws_around(mean, np.sqrt(variance), len(z))
 
 
 @dataclass
@@ -97,8 +76,8 @@ def emulated(
     run, (n, d) = Recorded(function), x.shape
     prior = prior_sd * np.random.default_rng(1).standard_normal((4096, d))
     readings = settings.pop("readings", None) or Readings.exact(function(x))
-    posterior = settings.pop("posterior", NormalDraws.posterior)
-    data = SpecimenData(readings, np.full((n, d), np.nan), prior, posterior, **settings)
+    settings = {"posterior": posterior} | settings
+    data = SpecimenData(readings, np.full((n, d), np.nan), prior, **settings)
     emulation, points, _, _ = emulate(run, data)
     return run, emulation, points
 
@@ -127,7 +106,6 @@ def underdetermined(z: Floats) -> Floats:
 
 
 CASES = [
-    (line, population(0.1, 0.15)),
     (line, population([0.1, -0.1], [0.15, 0.1])),
     (fold, population(0.4, 0.1)),
     (frame, population([0.2, -0.1], [0.1, 0.15])),
@@ -156,8 +134,8 @@ def test_smooth_responses_need_few_runs(function: Callable[[Floats], Floats], x:
 
 
 def test_fewer_readings_than_inputs_need_few_runs() -> None:
-    x = population([0.1, 0.1], [0.1, 0.1])
-    draws = NormalDraws(x.mean(axis=0), x.std(axis=0), len(x))
+    x = population([0.1, 0.1], [0.1, 0.1], n=10)
+    draws = draws_around(x.mean(axis=0), x.std(axis=0), len(x))
     run, emulation, points = emulated(underdetermined, x, posterior=lambda *_: draws)
     assert len(run.z) <= 60
     assert emulation.bias <= 0.15
@@ -260,21 +238,13 @@ def test_limits_grow_with_the_inputs() -> None:
     assert [most_runs(d) for d in (1, 2, 4, 8)] == [256, 384, 512, 1920]
 
 
-@pytest.mark.long
-def test_runs_are_those_of_the_seed() -> None:
-    x = population([0.2, -0.1], [0.1, 0.15])
-    first, second, third = (emulated(frame, x, seed=seed)[0] for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.z, second.z)
-    assert not np.array_equal(first.batches[0], third.batches[0])
-
-
 def test_an_earlier_emulation_of_the_response_is_extended() -> None:
     """As for a bootstrap sample: its specimens have most of the runs already."""
     x = population(0.1, 0.15)
     run, emulation, _ = emulated(np.exp, x)
     prior = 0.4 * np.random.default_rng(1).standard_normal((4096, 1))
     known = np.full((20, 1), np.nan)
-    data = SpecimenData(Readings.exact(np.exp(x[::-1])), known, prior, NormalDraws.posterior)
+    data = SpecimenData(Readings.exact(np.exp(x[::-1])), known, prior, posterior)
     again = Recorded(np.exp)
     extended, *_ = emulate(again, data, emulation)
     np.testing.assert_array_equal(extended.z[: len(run.z)], run.z)
@@ -298,8 +268,8 @@ def test_an_emulator_of_some_specimens_is_audited_at_all(is_wavy: bool) -> None:
         ends = np.inf * bounds
         unit = Coordinates(((),), nothing, np.zeros(1), np.ones(1), bounds, ends, nothing)
         return SpecimenData(
-            readings, known, prior, NormalDraws.posterior, unit,
-            draws=lambda thetas: NormalDraws(*np.split(thetas.mean(axis=0), 2), len(x)),
+            readings, known, prior, posterior, unit,
+            draws=lambda thetas: draws_around(*np.split(thetas.mean(axis=0), 2), len(x)),
         )  # fmt: skip
 
     run, of_part = Recorded(response), Recorded(response)
@@ -323,7 +293,7 @@ def test_likely_inputs_are_corrected_by_the_response() -> None:
     nothing = np.full(x.shape, np.nan)
     options = SpecimenOptions(n_first=24)
     readings = Readings.exact(kinked(x))
-    data = SpecimenData(readings, nothing, prior, NormalDraws.posterior, options=options)
+    data = SpecimenData(readings, nothing, prior, posterior, options=options)
     first = first_emulation(run, data)
     emulation = corrected(run, data, first, normal_of(x))
     assert [len(batch) for batch in run.batches[1:]] in ([30, 30], [30, 30, 30])
@@ -336,24 +306,13 @@ def test_likely_inputs_are_corrected_by_the_response() -> None:
     assert np.median(np.abs(kinked(z) - kinked(x)[modes.specimen])) < 0.2 * before
 
 
-def test_outputs_far_beyond_the_data_leave_the_digits_near_them() -> None:
-    def steep(z: Floats) -> Floats:
-        return np.exp(8 * z)
-
-    x = population(0.1, 0.05)
-    run, emulation, _ = emulated(steep, x)
-    assert steep(run.z).max() > 100 * steep(x).std()
-    misfit = emulation.values(x) - steep(x)
-    assert np.abs(misfit).max() < 1e-3 * steep(x).std()
-
-
 @pytest.mark.parametrize(
     ("shift", "width", "is_near"), [(0.3, 1.2, True), (2.0, 1.0, False), (0.0, 5.0, False)]
 )
 def test_another_population_is_not_near(shift: float, width: float, is_near: bool) -> None:
     """In deviations of the earlier one, with any unit and in any direction."""
     mean, sd = np.array([1.0, 2000.0]), np.array([0.1, 300.0])
-    draws = NormalDraws(mean, sd, 50), NormalDraws(mean + shift * sd, width * sd, 50)
+    draws = draws_around(mean, sd, 50), draws_around(mean + shift * sd, width * sd, 50)
     nothing: Any = None
     earlier, later = (Plausible(d, nothing, nothing, 1.0, 1) for d in draws)
     assert later.is_near(earlier) is is_near

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from normal_populations import NormalDraws
 from scipy.special import logsumexp, ndtr
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_normal
 
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings, scaled_errors
@@ -25,30 +26,6 @@ from prbayes.specimens.points import (
 )
 
 N = 8
-
-
-@dataclass(frozen=True)
-class NormalDraws:
-    """Draws of the means and standard deviations of independent normal inputs."""
-
-    means: Floats  # (S, d)
-    sds: Floats  # (S, d)
-
-    @property
-    def thetas(self) -> Floats:
-        return np.concatenate([self.means, self.sds], axis=1)
-
-    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        log_p = norm(self.means[:, None, None], self.sds[:, None, None]).logpdf(z).sum(axis=-1)
-        return np.asarray(logsumexp(log_p + log_a, axis=2))
-
-    def specimens(self) -> Floats:
-        rng = np.random.default_rng(0)
-        z = self.means + self.sds * rng.standard_normal((64, *self.means.shape))
-        return z.reshape(-1, self.means.shape[1])
-
-    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
-        return self
 
 
 def draws_of(d: int, mean_sd: float = 0.03, sd: float = 0.15) -> NormalDraws:
@@ -164,20 +141,6 @@ def test_rounded_and_censored_readings_have_the_probability_of_their_interval() 
     assert np.abs(error).max() < 5 * 0.05
 
 
-def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
-    """The likelihood of a uniform population's end is theta^-N above the largest x, else zero."""
-    x = np.random.default_rng(0).uniform(-0.8, 0.6, 30)
-    points = points_of(np.exp, Readings.exact(np.exp(x)[:, None]), draws_of(1, sd=0.4))
-
-    def total(end: float) -> float:
-        with np.errstate(divide="ignore"):
-            inside = np.log((points.z[..., 0] > -1) & (points.z[..., 0] < end))
-        return float(logsumexp(inside - np.log(end + 1) + points.log_a, axis=1).sum())
-
-    assert total(x.max() + 1e-3) == pytest.approx(-30 * np.log(x.max() + 1.001) - x.sum(), abs=0.02)
-    assert total(x.max() - 1e-3) == -np.inf
-
-
 def test_the_log_proposal_serves_another_error() -> None:
     # As for an error that is a model variable: the density of the readings is added later.
     draws = draws_of(2)
@@ -207,16 +170,6 @@ def test_points_are_doubled_until_both_halves_agree() -> None:
     few = SpecimenOptions(most_points=128, most_in_all=128)
     with pytest.raises(DesignError, match=r"got two halves of .* points .*narrow the priors"):
         points_of(lambda z: z @ a.T, readings, draws, options=few)
-
-
-def test_a_fold_has_the_points_of_both_branches() -> None:
-    x = np.linspace(-0.5, 0.7, N + 1)[[0, 1, 2, 3, 5, 6, 7, 8]]
-    draws = draws_of(1, sd=0.3)
-    points = points_of(lambda z: z**2, Readings.exact(x[:, None] ** 2), draws)
-    assert (points.n_roots == 2).all()
-    both = np.logaddexp(*(norm(draws.means, draws.sds).logpdf(sign * x) for sign in (-1, 1)))
-    error = errors(points, both - np.log(2 * np.abs(x)), draws)
-    assert np.abs(error).max() < 0.01
 
 
 def test_joined_halves_have_the_mean_of_their_likelihoods() -> None:

@@ -12,8 +12,6 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-import prbayes as prb
-from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
 from prbayes.propagation.population_density import ExponentialForm, PopulationDensity
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
@@ -144,20 +142,6 @@ def test_other_families_have_their_graph() -> None:
     roots = by_name(inputs, {"a0": FIRST[:3], "b0": SECOND[:3]})
     expected = by_graph(inputs, roots, [X], LOG_A)
     assert np.allclose(log_likelihoods(inputs, roots, [X], LOG_A), expected, rtol=1e-12)
-
-
-def test_an_evaluator_has_the_log_likelihood_of_pymc() -> None:
-    observed = [0.0, 1.0, 2.0, 4.0, 5.0, 3.0, 2.5, 9.0]
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        metric = prb.LogLikelihood(gross_errors=True)
-        prb.Simulator("y", lambda x: 2 * x, x, metric=metric, observed=observed)
-    evaluator = Evaluator.of(model)
-    thetas = evaluator.hyperparameters.prior_points(16, 0)
-    graphs = evaluator.hyperparameters.compile(specimen_graphs(evaluator))
-    expected = graphs(thetas)[0]
-    assert np.allclose(specimen_log_likelihoods(evaluator, thetas)["y"], expected, rtol=1e-11)
-    assert np.allclose(evaluator.log_other(thetas), expected.sum(axis=1), rtol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["normal", "gamma"])
