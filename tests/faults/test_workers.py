@@ -34,20 +34,27 @@ def by_input(tally: Tally) -> dict[float, str]:
 
 # -- hostile responses -----------------------------------------------------------------------------
 
-SLOW = pytest.mark.slow
+
+def long(where: str) -> Any:
+    return pytest.param(where, marks=pytest.mark.long)
+
+
+def slow(where: str) -> Any:
+    """Return an executor whose losses are those of processes; by hand alone."""
+    return pytest.param(where, marks=pytest.mark.slow)
+
+
 NEEDED = {"loky": "joblib.externals.loky", "dask": "distributed"}
 
 
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 @pytest.mark.parametrize(
-    "where",
-    ["nothing", "threads", "processes", pytest.param("loky", marks=SLOW), pytest.param("dask", marks=SLOW)],
-)  # fmt: skip
+    "where", [*map(long, ("nothing", "processes")), *map(slow, ("loky", "dask"))]
+)
 def test_hostile_responses_cost_their_points(
     where: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    safe = where in ("nothing", "threads")
+    safe = where == "nothing"
     limit = 6.0 if where == "dask" else 0.4
     if where in NEEDED:
         pytest.importorskip(NEEDED[where])
@@ -86,16 +93,6 @@ def test_hostile_responses_cost_their_points(
     assert len(caplog.text) < 20_000
 
 
-@pytest.mark.parametrize("result", [[[1], [1, 2]], object(), 1j, np.ones((3, 2000, 1000))])
-@pytest.mark.parametrize("where", ["nothing", "threads"])
-def test_what_is_no_response_ends_the_run_with_a_sentence(where: str, result: Any) -> None:
-    with (
-        EXECUTORS[where]() as executor,
-        pytest.raises(ResponseError, match=r"^y: the response returned .*expected"),
-    ):
-        respond(CallSettings("y", lambda x: result, executor, None, Replace()), line(3), Tally())
-
-
 def test_a_failure_that_cannot_say_what_it_is_is_told() -> None:
     class Mute(Exception):  # noqa: N818
         def __str__(self) -> str:
@@ -131,9 +128,8 @@ def test_a_response_that_changes_its_arguments_changes_nothing_else(where: str, 
         np.testing.assert_array_equal(respond(calling, points, Tally()), expected)
 
 
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
-@pytest.mark.parametrize("where", ["processes", pytest.param("loky", marks=SLOW)])
+@pytest.mark.parametrize("where", [long("processes"), slow("loky")])
 def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so(
     where: str, tmp_path: Path
 ) -> None:
