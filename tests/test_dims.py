@@ -62,7 +62,7 @@ def numbers(
 ) -> dict[str, Any]:
     """Return the optimum, its standard errors, draws and predictions."""
     m, x = model(build, p, metric)
-    optimum = prb.minimize(m, **QUIET)
+    optimum = prb.minimize(m, starts=0, **QUIET)
     idata = prb.sample(draws, chains=2, model=m, optimum=optimum, **QUIET)
     prediction = prb.predict(idata, np.positive, x, model=m, n_samples=20, **QUIET)
     values = {f"optimum {k}": v for k, v in optimum.point.items()}
@@ -109,7 +109,7 @@ def test_an_error_with_dimensions_is_estimated() -> None:
             x = p.Normal.dist(p.Normal("mu", 0, 2), 0.3)
             metric = prb.LogLikelihood(error=p.HalfNormal("e", 0.1))
             prb.Simulator("y", np.exp, x, observed=Y, metric=metric)
-        optima.append(prb.minimize(m, **QUIET).point)
+        optima.append(prb.minimize(m, starts=0, **QUIET).point)
     for name in ("mu", "e"):
         np.testing.assert_array_equal(*[point[name] for point in optima])
 

@@ -44,7 +44,7 @@ def test_other_programs_have_the_same_answer(name: str) -> None:
     assert sigma == pytest.approx(0.125, abs=0.007)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_theophylline_has_the_published_estimates(capsys: pytest.CaptureFixture[str]) -> None:
     """Within a tenth of a standard error; the two kinds of subjects are those of the simulation."""
     module = runpy.run_path(str(EXAMPLES / "theophylline.py"))

@@ -203,7 +203,7 @@ def two_frequencies(a: Any, b: Any) -> Any:
 
 
 def in_order(rng: np.random.Generator, outputs: slice) -> pm.Model:
-    y = two_frequencies(sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3))
+    y = two_frequencies(sample(rng, 12, 1.0, 0.3), sample(rng, 12, 1.3, 0.3))
     return model_of(two_frequencies, two_inputs, y[:, outputs])
 
 

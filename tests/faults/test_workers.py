@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from concurrent.futures import (
     BrokenExecutor,
@@ -239,25 +238,3 @@ def test_an_executor_that_is_closed_meanwhile_is_reported_and_nothing_finished_i
     # It is closed for good.
     with pytest.raises(ResponseError, match=r"y: the executor failed \(RuntimeError: cannot sche"):
         respond(CallSettings("y", twice, pool, store, Replace()), points, Tally())
-
-
-# -- Dask on the loopback interface ------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
-@pytest.mark.parametrize("what", ["client", "cluster"])
-def test_a_cluster_that_is_closed_is_an_error_and_no_hang(what: str) -> None:
-    def slow(x: float) -> float:
-        time.sleep(0.2)
-        return 2 * x
-
-    with EXECUTORS["dask"]() as executor:
-        client = executor._client  # type: ignore[attr-defined]
-        closing = threading.Timer(1.0, getattr(client, what, client).close)
-        closing.start()
-        with pytest.raises(
-            ResponseError, match=r"y: (the executor (was closed|failed)|a worker was lost) "
-        ):
-            respond(CallSettings("y", prb.scalar(slow), executor), line(600), Tally())
-        closing.join()

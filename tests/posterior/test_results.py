@@ -240,9 +240,9 @@ def test_log_likelihoods_of_many_specimens_are_thinned(monkeypatch: pytest.Monke
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", lambda x: 2 * x, x, observed=2 * data)
-    whole = prb.sample(200, chains=2, model=model, **QUIET)
-    monkeypatch.setattr(results, "AT_ONCE", 2 * 200 * 20 // 8)
-    thinned = prb.sample(200, chains=2, model=model, **QUIET)
+    whole = prb.sample(1000, chains=2, model=model, **QUIET)
+    monkeypatch.setattr(results, "AT_ONCE", 2 * 1000 * 20 // 8)
+    thinned = prb.sample(1000, chains=2, model=model, **QUIET)
     assert thinned.log_likelihood.coords["draw"].values[:3].tolist() == [0, 4, 8]
     np.testing.assert_array_equal(
         thinned.log_likelihood["y"], whole.log_likelihood["y"].sel(draw=slice(None, None, 4))

@@ -341,7 +341,7 @@ def test_two_outputs_by_a_joint_metric() -> None:
         settings = {"metric": prb.Joint(PR), "propagation": prb.Reweighted(256)}
         response = lambda a, b: np.stack([a + b, a - b], axis=-1)  # noqa: E731
         prb.Simulator("y", response, a, b, observed=observed, **settings)
-    optimum = prb.minimize(model=model, progressbar=False)
+    optimum = optimum_of(model)
     draws = posterior_of(likelihood_at(optimum))
     for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
         exact = exact_moments(VAGUE.log_density, inputs)

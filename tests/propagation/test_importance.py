@@ -147,26 +147,6 @@ def test_runs_are_added_where_emulators_predict_little(monkeypatch: pytest.Monke
             assert bound.n_runs == runs
 
 
-def test_a_part_of_a_sample_for_a_while() -> None:
-    evaluator, bound = emulated()
-    values, weights = evaluator.populations(THETA, 0)
-    (whole,) = evaluator(THETA).discrepancies
-    rows = bound.blocks == 3
-    with designs_restored([bound]):
-        bound.design = bound.design.rows(rows)
-        part_values, part_weights = evaluator.populations(THETA, 0)
-        expected = weights[:, rows] / weights[:, rows].sum()
-        np.testing.assert_allclose(part_weights, expected, rtol=1e-9)
-        np.testing.assert_array_equal(part_values, values[:, rows])
-        (part,) = evaluator(THETA).discrepancies
-        bound.add(evaluator.parents(THETA, 0), 32)
-        assert bound.n_runs == 96
-    assert 0 < abs(part[0] - whole[0]) < 0.2 * whole[0]
-    assert bound.n_runs == 64
-    np.testing.assert_array_equal(evaluator(THETA).discrepancies[0], whole)
-    np.testing.assert_array_equal(evaluator.populations(THETA, 0)[1], weights)
-
-
 @pytest.mark.long
 def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     errors = {}
