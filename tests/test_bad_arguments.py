@@ -138,9 +138,9 @@ surrogate = Later(lambda: prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIE
 
 # -- bad values by the annotation and the name of an argument ----------------------------------------
 
-FLAG = ("no", 1, None)
-COUNT = (0, 1.5, "64")
-FLOAT = ("a", None, True)
+FLAG = ("no", 1)
+COUNT = (0, 1.5)
+FLOAT = ("a", True)
 SHARE = (0, 1, np.nan)
 POSITIVE = (0, -1.0, np.nan)
 SEED = (-1, 1.5, "a")

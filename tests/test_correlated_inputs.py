@@ -127,12 +127,6 @@ def test_a_factor_in_place_of_a_covariance_is_refused_before_any_response(propag
         first_use(model)
 
 
-def by_lkj_factor() -> Any:
-    chol, corr, _ = pm.LKJCholeskyCov("c", n=2, eta=1, sd_dist=pm.HalfNormal.dist(2.0, shape=2))
-    pm.Deterministic("rho", corr[0, 1])
-    return pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=2), chol=chol)
-
-
 def by_correlations() -> Any:
     factor = pm.LKJCorr("factor", n=2, eta=1)
     deviations = pm.HalfNormal("sd", 2.0, shape=2)
@@ -148,14 +142,21 @@ def by_hand() -> Any:
     return pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=2), cov=covariance)
 
 
-@pytest.mark.long
-def test_two_outputs_identify_the_correlation() -> None:
-    rho, size = 0.95, 20
+@pytest.mark.parametrize(
+    ("inputs", "rho", "size"),
+    [
+        pytest.param(by_hand, 0.6, 50, marks=pytest.mark.long),
+        pytest.param(by_correlations, 0.95, 20, marks=pytest.mark.slow),
+    ],
+)
+def test_two_outputs_identify_the_correlation(
+    inputs: Callable[[], Any], rho: float, size: int
+) -> None:
     covariance = np.outer(SDS, SDS) * np.array([[1.0, rho], [rho, 1.0]])
     observed = np.random.default_rng(1).multivariate_normal(MEAN, covariance, size)
     with pm.Model() as model:
         metric = prb.Joint(prb.ProbabilityResidual())
-        prb.Simulator("y", np.positive, by_correlations(), metric=metric, observed=observed)
+        prb.Simulator("y", np.positive, inputs(), metric=metric, observed=observed)
     optimum = prb.minimize(model, starts=0, progressbar=False)
     assert optimum.converged
     assert "not-identified" not in {finding.code for finding in optimum.findings}
