@@ -138,19 +138,14 @@ surrogate = Later(lambda: prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIE
 
 # -- bad values by the annotation and the name of an argument ----------------------------------------
 
-FLAG = ("no", 1, 0.0, None)
-COUNT = (0, -5, 1.5, "64", None, True, np.nan)
-FLOAT = ("a", None, True)
-SHARE = (0, 1, -0.5, np.nan)
-POSITIVE = (0, -1.0, np.nan, np.inf)
-SEED = (-1, 1.5, True, "a", np.nan, [1.5], [])
-NO_DATA = (
-    *(OBSERVED > 2, ["a", "b", "c"], [1.0, np.nan, 2.0], [], 1.0, np.ones((3, 2)), None),
-    *({"a": OBSERVED}, [1j, 2.0], [[1.0], [1.0, 2.0]], ["1.0", 2.0, None], [10**400, 1.0]),
-    np.array(["2020-01-01", "2021-01-01"], dtype="M8[D]"),
-    np.ma.masked_array([1.0, 2.0, 3.0], [0, 1, 0]),
-)
-NO_WEIGHTS = (np.ones(3), -np.ones(30), np.zeros(30), "abc", OBSERVED > 2)
+FLAG = ("no", 1)
+COUNT = (0, 1.5)
+FLOAT = ("a", True)
+SHARE = (0, 1, np.nan)
+POSITIVE = (0, -1.0, np.nan)
+SEED = (-1, 1.5, "a")
+NO_DATA = ([1.0, np.nan, 2.0], np.ones((3, 2)), {"a": OBSERVED})
+NO_WEIGHTS = (np.ones(3), -np.ones(30), "abc")
 NO_INPUT = (None, "a", np.nan, 3.0, pm.Normal)
 NO_LIMIT = (np.nan, np.inf, [1.0])
 BY_NAME: dict[str, tuple[Any, ...]] = {
@@ -159,7 +154,7 @@ BY_NAME: dict[str, tuple[Any, ...]] = {
     "coords": (3, {"no such dim": 1}),
     "density": (prb.GaussianKDE,),
     "executor": (map, object()),
-    "figsize": (3, "wide", (3,), (0, 4), (np.inf, 4), ("a", 4)),
+    "figsize": (3, "wide", (3,)),
     "filter_vars": (3, "glob"),
     "folds": (1, 29),
     "idata_kwargs": ({"model": 1}, {"dims": 1}, {"log_prior": 1}),
@@ -169,17 +164,17 @@ BY_NAME: dict[str, tuple[Any, ...]] = {
     "max_seconds": POSITIVE,
     "metric": (prb.AreaMetric, np.mean),
     "model": (bare,),
-    "observed": ([], [np.nan], "a", None, OBSERVED > 2, np.ones((3, 3)), {"a": OBSERVED}),
+    "observed": ([], [np.nan], "a"),
     "on_failure": (prb.response.Abort,),
     "optimum": (posterior, {"mu": 1.0}),
     "output": (0, "a"),
     "path": ("",),
-    "predicted": ([], np.array(["a"]), xr.DataArray([1.0, 2.0]), OBSERVED > 2),
+    "predicted": ([], np.array(["a"]), xr.DataArray([1.0, 2.0])),
     "prob": SHARE,
     "probability": SHARE,
     "response": (dict,),
     "result": (xr.DataTree(), comparison, []),
-    "seen": (None, "x", 1.0, [1.0, 1.0], [0.0, np.inf], [[0.0, 1.0]]),
+    "seen": (None, "x", 1.0),
     "shape": (lambda c: np.nan * c, lambda c: 1.0),
     "store": ("", b"folder"),
     "threshold": SHARE,
@@ -329,59 +324,47 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "Simulator": Row(
         {"observed": OBSERVED, "name": "y"},
         call=simulator,
-        name=("", "  ", "mu", b"y"),
-        constant=(None, "a", np.nan, np.inf, pm.Normal, ["a"], 1j, True, {"a": 1}),
+        name=("", "  ", "mu"),
+        constant=(None, "a", np.nan),
         observed=(*NO_DATA, [1.0]),
         epsilon=(*POSITIVE, {"y": 1.0}, 1j),
-        weights=(
-            *(np.ones(29), np.ones((2, 30)), np.r_[-1, np.ones(29)], np.r_[np.nan, np.ones(29)]),
-            *(np.zeros(30), OBSERVED > 2, "abc", 1.0),
-        ),
-        specimens=(
-            *(range(29), [None] * 30, [*range(29), None], [np.nan] * 30, [*"a" * 29, np.nan]),
-            *(np.ones((30, 1)), "abc", 3, {"a": 1}, [True] * 30, [[1]] * 30),
-        ),
-        dims=("nope", "few", "", ("few", "few"), True),
+        weights=(np.ones(29), np.ones((2, 30)), np.r_[-1, np.ones(29)]),
+        specimens=(range(29), [None] * 30, [*range(29), None]),
+        dims=("nope", "few", ""),
         propagation=(prb.Reweighted, prb.AreaMetric()),
         units=({"nothing": "mm"}, {"x": 3}, {3: "mm"}),
         own="observed",
     ),
     "response.Smooth": Row(
-        {"zero_at": 0.0}, zero_at=(np.nan, np.inf, "a", True), length=POSITIVE, reach=POSITIVE
+        {"zero_at": 0.0}, zero_at=(np.nan, np.inf, "a"), length=POSITIVE, reach=POSITIVE
     ),
     "Summary": Row(
         {"n": 20, "mean": 2.0, "sd": 1.0, "minimum": 0.0, "maximum": 4.0, "quantiles": {0.5: 2.1}},
         n=(1, 2.5, None),
-        mean=(-1.0, 4.5, np.nan, "a", True),
-        sd=(0.0, -1.0, 3.0, 0.1, np.nan),
+        mean=(-1.0, 4.5, np.nan),
+        sd=(0.0, -1.0, 3.0),
         minimum=(2.5, np.inf, "a"),
         maximum=(1.5, -np.inf, "a"),
-        quantiles=({}, {0.5: 5.0}, {0.25: 2.0, 0.5: 1.0}, {1.0: 3.0}, {0.5: np.nan}, [2.0], 2.0),
+        quantiles=({}, {0.5: 5.0}, {0.25: 2.0, 0.5: 1.0}),
     ),
     "Reweighted": Row(max_points=(3,), emulator=(3, "a"), timeout=WITHOUT_PROCESSES),
     "Resimulated": Row(n=(1,), points=("halton",), timeout=WITHOUT_PROCESSES),
     "Fresh": Row(timeout=WITHOUT_PROCESSES),
     "response.by_specimen": Row(
         {"functions": line, "records": [1.0, 2.0]},
-        functions=([line], [line, 1.0], [pm.Normal, line], line(1.0, 2.0), [line, line]),
-        records=(None, "ab", {"a": 1, "b": 2}, [1.0], 3),
+        functions=([line], [line, 1.0], [pm.Normal, line]),
+        records=(None, "ab", {"a": 1, "b": 2}),
     ),
     "response.condition": Row(
         {"name": "load", "values": [1.0, 2.0]},
         name=("",),
-        values=(1.0, [1.0], [1.0, np.nan], [1.0, 1.0], ["a", "b"], None),
+        values=(1.0, [1.0], [1.0, np.nan]),
     ),
     "response.group": Row(
         call=group,
         dim=("", "batch", ["supplier"]),
-        coords=(
-            *({"supplier": ["a"]}, {"supplier": ["a", "a"]}, {"supplier": ["a/b", "c"]}),
-            {"other": ["a", "b"]},
-        ),
-        observed=(
-            *(OBSERVED, OBSERVED.tolist(), in_groups(["a"] * 30), in_groups(["a"] * 29 + ["b"])),
-            *(in_groups(["a", "b", "c"] * 10), in_groups([None] * 30)),
-        ),
+        coords=({"supplier": ["a"]}, {"supplier": ["a", "a"]}, {"supplier": ["a/b", "c"]}),
+        observed=(OBSERVED, OBSERVED.tolist(), in_groups(["a"] * 30)),
     ),
     "response.Replace": Row(value=(-np.inf, [1.0], 1j)),
     "response.Retry": Row(then=(prb.response.Retry(), prb.response.Abort)),
@@ -391,13 +374,13 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "command": Row(
         {"arguments": [sys.executable, "{x}"], "inputs": ["x"], "read": float},
         arguments=([], [3], [sys.executable, None]),
-        inputs=(["y"], ["x", "x"], ["a b"], [3]),
-        write=({"../in.txt": "{x}"}, {"/in.txt": "{x}"}, {3: "{x}"}, {"a": 3}),
+        inputs=(["y"], ["x", "x"], ["a b"]),
+        write=({"../in.txt": "{x}"}, {"/in.txt": "{x}"}, {3: "{x}"}),
         folder=("", b"folder"),
     ),
     "umbridge": Row(
         {"url": "http://127.0.0.1:9"},
-        url=("", "localhost:4242", "ftp://localhost", "http://"),
+        url=("", "localhost:4242", "ftp://localhost"),
         model=(3, "", None),
         config=({"level": np.arange(2)}, [1]),
         patience=POSITIVE,
@@ -413,7 +396,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "ProbabilityResidual": Row(scale_base=POSITIVE),
     "LogLikelihood": Row(
-        error=("a", 0, -1.0, True),
+        error=("a", 0, -1.0),
         gross_errors=(-1.0, 2.0),
         censored=((1.0,), ("a", "b"), [None, None]),
         rounded=("a", -1.0),
@@ -433,23 +416,20 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "a metric": Row(
         {"simulated": OBSERVED, "observed": OBSERVED},
         call=prb.AreaMetric(),
-        simulated=([1.0, np.nan], [], "a", OBSERVED > 2, None, 1.0),
+        simulated=([1.0, np.nan], [], "a"),
         observed=NO_DATA,
         weights=NO_WEIGHTS,
     ),
     "a metric of several outputs": Row(
         {"simulated": OUTPUTS, "observed": OUTPUTS},
         call=prb.Joint(prb.AreaMetric()),
-        simulated=(np.full((9, 2), np.nan), np.ones((9, 3)), OUTPUTS[:, 0], "a", None, []),
-        observed=(
-            *(OUTPUTS[None], OUTPUTS[:3], OUTPUTS * [1, 0], OUTPUTS * [1, np.nan]),
-            *(OUTPUTS * [1, -np.inf], OUTPUTS * np.nan, OUTPUTS[:, [0, 0]], OUTPUTS > 2),
-        ),
+        simulated=(np.full((9, 2), np.nan), np.ones((9, 3)), OUTPUTS[:, 0]),
+        observed=(OUTPUTS[None], OUTPUTS[:3], OUTPUTS * [1, 0]),
         weights=NO_WEIGHTS,
     ),
     "minimize": Row(
         {"refine": False},
-        start=({"nu": 1.0}, {"mu": "a"}, {"mu": np.nan}, {"mu": [1.0, 2.0]}, {"mu": True}, {}),
+        start=({"nu": 1.0}, {"mu": "a"}, {"mu": np.nan}),
         method=("BFSG", prb.AreaMetric, ""),
         options=(["maxiter"], {"nonsense": 1}, {3: 1}),
         starts=ZERO_OR_MORE,
@@ -457,23 +437,18 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "refine": Row(
         {"thetas": [[1.0]]},
-        thetas=(
-            *({"mu": 1.0}, "a", 3.0, [[1.0, 2.0]], [1.0], [[np.nan]], [["a"]], [[True]]),
-            np.empty((0, 1)),
-        ),
+        thetas=({"mu": 1.0}, "a", 3.0),
     ),
     "cost": Row(model=(print, optimum)),
     "set_epsilon": Row(
         {"epsilon": {}},
-        epsilon=(
-            *(["y"], {"z": 1.0}, {"y": True}, {"y": 0}, {"y": np.nan}, {"y": None}, {3: 1.0}),
-        ),
+        epsilon=(["y"], {"z": 1.0}, {"y": True}),
     ),
     "sample_smc": Row(
         {**SMALL, "adjustment": None, "refine": False},
-        adjustment=("affine", True, 1, np.nan, ["estimate"]),
+        adjustment=("affine", True, 1),
         draws=(5,),
-        epsilon=(*POSITIVE, {"z": 1.0}, {"y": "a"}, {"y": None}, 1j),
+        epsilon=POSITIVE,
         start=({"nu": [1.0]}, [{}, {}], {"mu": [1.0]}),
         own="adjustment",
     ),
@@ -487,7 +462,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         n=(1,), draws=(5,), adjustment=(3, "affine"), own="adjustment"
     ),
     "compare": Row(
-        results=({}, {"a": "b"}, {"a": None}, {"a": xr.DataTree()}, {"": 3}),
+        results=({}, {"a": "b"}, {"a": None}),
         metrics=(["area"], [prb.AreaMetric], [None]),
     ),
     "predict": Row(
@@ -507,14 +482,14 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plan": Row(
         {"candidates": Later(lambda: {"same": prb.decision.Condition(line, specimen())})},
-        candidates=({}, {"a": 3}, {3: prb.decision.Condition(line)}, [1]),
+        candidates=({}, {"a": 3}, {3: prb.decision.Condition(line)}),
         k=([], [0], "ab"),
         quantity=(prb.decision.Mean,),
-        target=({}, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
+        target=({}, {"tau": 1.0}, {"mu": 0.0}),
     ),
     "population": Row(
-        inputs=("nothing", [], ["x", "nothing"], 3, np.mean),
-        quantiles=("ab", 3, [0.5, 1.0], [np.nan], None),
+        inputs=("nothing", [], ["x", "nothing"]),
+        quantiles=("ab", 3, [0.5, 1.0]),
         at=({"nothing": 1.0}, {"x": 1.0}),
         n_draws=(1,),
     ),
@@ -536,7 +511,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "area_test": Row(
         {"null": prb.validation.PosteriorNull(19)},
         null=(prb.validation.ExactModel,),
-        specimens=([1, 2], "abc", [None] * 9, [np.nan] * 9, 3, [[1]] * 9),
+        specimens=([1, 2], "abc", [None] * 9),
         own="specimens",
     ),
     "validation.PosteriorNull": Row(replicates=(5,), random_seed=SEED, own="random_seed"),
@@ -556,34 +531,24 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "rank": Row(
         {"candidates": Later(lambda: {"a": optimum(), "b": optimum()})},
-        candidates=(
-            *(optimum, Later(lambda: {"a": optimum()}), {}, []),
-            Later(lambda: {"a": optimum(), "b": comparison()}),
-            Later(lambda: {1: optimum(), 2: optimum()}),
-        ),
+        candidates=(optimum, Later(lambda: {"a": optimum()}), {}),
     ),
     "Runs": Row(
         {"inputs": np.arange(9.0), "responses": np.arange(9.0) ** 2},
-        inputs=("a", None, np.arange(5.0), np.ones(9), [np.nan, *range(1, 9)], [0, *range(8)]),
-        responses=("a", None, np.arange(8.0), [-np.inf, *range(8)], np.full(9, np.nan)),
+        inputs=("a", None, np.arange(5.0)),
+        responses=("a", None, np.arange(8.0)),
     ),
     "Surrogate.fit": Row(
         {"inputs": {"x": (0.0, 1.0)}, "n": 20},
-        inputs=(
-            *({}, [], {"x": (1, 0)}, {"x": (1, 1)}, {"x": (0, np.inf)}, {"x": (0, np.nan)}),
-            *({"x": "ab"}, {"x": 3.0}, {"x": None}, {"x": (0, True)}, {"x": (0, 1, 2)}),
-            {3: (0, 1)},
-        ),
+        inputs=({}, [], {"x": (1, 0)}),
         n=(1,),
         model=("rbf", 3, prb.surrogate.RadialBasis),
         points=("halton",),
         outside=("nan", prb.response.Retry(), prb.response.Abort),
-        name=(b"text", [], True, ""),
+        name=(b"text", [], True),
         own="model",
     ),
-    "a surrogate": Row(
-        call=lambda x: surrogate()(x), x=("a", None, [True], 1j, [[1.0], [1.0, 2.0]])
-    ),
+    "a surrogate": Row(call=lambda x: surrogate()(x), x=("a", None, [True])),
     "Surrogate.local_error": Row(call=lambda x: surrogate().local_error(x), x=("a", None, [True])),
     "Surrogate.with_error": Row(call=lambda **given: surrogate().with_error(**given)),
     "Surrogate.save": Row(
@@ -605,7 +570,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         validity=({"a": 3}, comparison),
         comparison=(optimum, xr.Dataset()),
         decision=(xr.Dataset(), {"a": 3}, comparison),
-        validation=([1], {"a": 3}, {3: ([1.0], predicted)}, {"a": ([1.0], 3)}),
+        validation=([1], {"a": 3}, {3: ([1.0], predicted)}),
         own="optimum",
     ),
     "Report.to_html": Row(call=lambda path: sound_report().to_html(path), path=(True, "/")),
@@ -621,8 +586,8 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         {"title": "A", "picture": b"<svg/>", "alt": "a"},
         title=("", " "),
         text=([3], b"a"),
-        table=(3, "a", [1, 2], {"a": 1}),
-        picture=("x.png", 3, b"xx", b""),
+        table=(3, "a", [1, 2]),
+        picture=("x.png", 3, b"xx"),
         alt=("",),
         level=(1, 9, 2.5),
     ),
@@ -634,32 +599,32 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plots.plot_residuals": Row({"residuals": residuals}, residuals=(posterior, specimens)),
     "plots.plot_prediction": Row(
-        observed=("a", None, [], np.ones((3, 2)), {"a": [1.0]}),
-        predicted=(3, None, np.ones((2, 3)), {"a": 3}),
+        observed=("a", None, []),
+        predicted=(3, None, np.ones((2, 3))),
         own="observed predicted",
     ),
     "plots.plot_sensitivity": Row(
-        table=(*(xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0}), comparison, posterior),),
+        table=(xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0}), comparison),
     ),
     "calibrate_each": Row(
         {"data_sets": {"a": OBSERVED, "b": OBSERVED + 1}},
-        data_sets=([1.0, 2.0], {}, {"a": [1.0]}, {"a": ["x", "y"]}, {"a": np.ones((3, 2))}),
-        validation=([1.0], {"zz": [1.0]}, {"a": []}, {"a": np.ones((3, 2))}),
+        data_sets=([1.0, 2.0], {}, {"a": [1.0]}),
+        validation=([1.0], {"zz": [1.0]}, {"a": []}),
     ),
     "individuals": Row(
         {"result": at_optimum, "model": by_specimen},
-        result=(None, 3, "result", xr.DataTree(), []),
+        result=(None, 3, "result"),
         own="result",
     ),
     "residuals": Row(
         {"result": at_optimum, "model": by_specimen},
-        result=(None, 3, "result", xr.DataTree(), []),
+        result=(None, 3, "result"),
         own="result",
     ),
     "update": Row(
         {"result": posterior, "observed": OBSERVED, "model": by_specimen},
-        result=(None, 3, "result", xr.DataTree(), []),
-        observed=([], "a", [1j], None),
+        result=(None, 3, "result"),
+        observed=([], "a", [1j]),
         own="result observed",
     ),
     "plots.plot_landscape": Row(
@@ -668,7 +633,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plots.plot_outputs": Row(
         {"result": Later(of_two_outputs), "model": two_outputs},
-        result=(None, 3, "result", xr.DataTree(), []),
+        result=(None, 3, "result"),
         before=BEFORE,
         own="result",
     ),
@@ -702,16 +667,12 @@ def refused(name: str) -> dict[str, tuple[Any, ...]]:
     return {key: row.bad.get(key, ()) + bad.get(key, ()) for key in bad | row.bad}
 
 
-def cases() -> Iterator[Any]:
-    """Yield the first bad values of each argument, and the others, which are slow together."""
-    for name in TABLE:
-        for argument, values in refused(name).items():
-            for part, marks in ((values[:3], []), (values[3:], [pytest.mark.slow])):
-                if part:
-                    more = ", more" if marks else ""
-                    yield pytest.param(
-                        name, argument, part, id=f"{name} {argument}{more}", marks=marks
-                    )
+CASES = [
+    pytest.param(name, argument, values, id=f"{name} {argument}")
+    for name in TABLE
+    for argument, values in refused(name).items()
+    if values
+]
 
 
 # What an argument is called in a message, where that is not its name.
@@ -731,7 +692,7 @@ def _shared() -> None:
         shared()
 
 
-@pytest.mark.parametrize(("name", "argument", "values"), list(cases()))
+@pytest.mark.parametrize(("name", "argument", "values"), CASES)
 def test_a_bad_argument_is_refused_before_the_response_is_called(
     name: str, argument: str, values: tuple[Any, ...]
 ) -> None:

@@ -16,10 +16,8 @@ from typing import Any
 import arviz as az
 import numpy as np
 import pymc as pm
-import pytensor
 import pytensor.tensor as pt
 import pytest
-import xarray as xr
 from arviz_plots.plot_collection import PlotCollection
 from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.backends.base import MultiTrace
@@ -36,7 +34,6 @@ from pymc.model.fgraph import clone_model
 from pymc.printing import str_for_dist
 from pymc.pytensorf import join_nonshared_inputs
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
-from pymc.stats.convergence import log_warnings, run_convergence_checks
 from pytensor import shared
 from pytensor.compile import function
 from pytensor.compile.builders import OpFromGraph
@@ -164,15 +161,6 @@ def test_graphs_of_pymc_dims_are_lowered_to_tensors() -> None:
     assert isinstance(x.owner.op, XRV)
     assert not any(hasattr(v.type, "dims") for v in [drawn, *drawn.owner.inputs])
     assert model.rvs_to_values[model["mu"]].type.dims == ("part",)
-
-
-def test_convergence_checks_take_any_draws(caplog: pytest.LogCaptureFixture) -> None:
-    draws = np.random.default_rng(0).normal([[0.0], [9.0]], size=(2, 200))
-    groups = {"mu": (("chain", "draw"), draws), "sigma": (("chain", "draw"), draws)}
-    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(groups)})
-    warnings = run_convergence_checks(tree, two_normals())
-    log_warnings(warnings)
-    assert "rhat" in caplog.text
 
 
 def test_walk_and_ancestors() -> None:
@@ -448,10 +436,6 @@ def test_the_envelope_of_ranks_is_around_the_diagonal() -> None:
     x, ecdf, lower, upper = ecdf_pit(uniform, 0.95, n_simulations=200, rng=np.random.default_rng(0))
     assert ((lower <= ecdf) & (ecdf <= upper)).all()
     assert len(x) == len(lower) == len(upper)
-
-
-def test_numbers_are_of_double_precision() -> None:
-    assert pytensor.config.floatX == "float64"
 
 
 def test_pymc_models_have_no_plain_pickle() -> None:

@@ -37,14 +37,6 @@ def test_texts_are_escaped() -> None:
     assert "1 &lt; 2" in text
 
 
-def test_an_optimum_is_a_table() -> None:
-    text = optimum()._repr_html_()
-    assert ">mu</th>" in text
-    assert f"{optimum().search.n_evaluations} evaluations" in text
-    assert "standard error" in text
-    assert "0.0% of specimens fail" not in repr(optimum())
-
-
 def test_a_diagnosis_says_what_is_wrong_first() -> None:
     support = xr.Dataset()
     first, second, remark = (Finding("code", text) for text in ("do this", "do that", "by the way"))
@@ -260,13 +252,6 @@ def test_tables_have_the_numbers_of_their_results() -> None:
     assert ranks.to_dataframe().loc["mu", "mean rank"] == ranks["prior_sbc"]["mu"].mean()
 
     x = aleatory(build())
-    box = prb.decision.p_box(optimum(), np.positive, x, n_draws=50)
-    median = next(line for line in str(box).splitlines() if "50% quantile" in line)
-    mean, low, to, high = median.split()[2:6]
-    assert float(mean) == pytest.approx(optimum().point["mu"], abs=0.05)
-    assert float(low) < float(mean) < float(high)
-    assert to == "to"
-
     predicted = prb.predict(optimum(), two, x, n_samples=500)
     first, second = (line.split() for line in str(predicted).splitlines()[2:4])
     assert [first[0], second[0]] == ["two[first]", "two[second]"]

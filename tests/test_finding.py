@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import re
 from pathlib import Path
@@ -17,10 +16,6 @@ PAGE = "choose.md#the-metric"
 CODES = re.findall(r"^- `([\w-]+)`: .+\.$", prb.help(), re.MULTILINE)
 
 
-def test_text_without_a_page() -> None:
-    assert str(Finding("rounded-data", "the data are rounded")) == "the data are rounded"
-
-
 def test_the_page_ends_the_text_as_in_other_messages() -> None:
     finding = Finding("rounded-data", "the data are rounded", PAGE)
     assert str(finding) == 'the data are rounded; see prb.help("rounded-data")'
@@ -30,13 +25,6 @@ def test_the_page_comes_before_the_final_period() -> None:
     finding = Finding("rounded-data", "Data are rounded. Pass rounded=.", PAGE)
     expected = 'Data are rounded. Pass rounded=; see prb.help("rounded-data").'
     assert str(finding) == expected
-
-
-def test_findings_are_values() -> None:
-    assert Finding("a", "text") == Finding("a", "text")
-    assert len({Finding("a", "text"), Finding("a", "text"), Finding("b", "text")}) == 2
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Finding("a", "text").code = "b"  # type: ignore[misc]
 
 
 def test_report_logs_each_finding_as_a_warning(caplog: pytest.LogCaptureFixture) -> None:
@@ -72,11 +60,6 @@ def test_findings_are_stored_as_records() -> None:
 def test_an_attribute_that_is_no_list_of_records_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected a JSON list of records"):
         from_json(text)
-
-
-def test_no_findings_log_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    assert report() == ()
-    assert not caplog.records
 
 
 def test_help_lists_the_codes() -> None:

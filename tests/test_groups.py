@@ -11,7 +11,6 @@ import pytensor
 import pytest
 import xarray as xr
 from pymc.model.fgraph import clone_model
-from scipy import stats
 from suppliers import labelled
 
 import prbayes as prb
@@ -105,23 +104,6 @@ def test_each_group_is_compared_with_its_population(model: pm.Model) -> None:
     assert before[1] != after[1]
 
 
-@pytest.mark.long
-def test_groups_are_simulators_written_separately(optimum: prb.Optimum) -> None:
-    with pm.Model() as separate:
-        means = [pm.Normal(f"mu_{name}", 0, 1) for name in NAMES]
-        sigma = pm.HalfNormal("sigma", 0.5)
-        for name, mean in zip(NAMES, means, strict=True):
-            given = {"metric": prb.ProbabilityResidual(), "observed": DATA.values[name == WHO]}
-            prb.Simulator("y" + name, counting, pm.Normal.dist(mean, sigma), **given)
-    expected = prb.minimize(separate, starts=0, progressbar=False)
-    for i, name in enumerate(NAMES):
-        error = expected.stderr[f"mu_{name}"]
-        # Two designs, of 256 and 1024 points.
-        assert abs(optimum.point["mu"][i] - expected.point[f"mu_{name}"]) < 0.1 * error
-        assert abs(optimum.stderr["mu"][i] / error - 1) < 0.1
-    assert not optimum.findings
-
-
 def test_the_density_is_that_of_all_groups() -> None:
     model = build()
     prb.set_epsilon(model, {"y[Adler]": 0.5, "y[Busch]": 0.25})
@@ -172,13 +154,6 @@ def test_predictions_have_a_dimension_of_groups(
     # Three runs are computed again at most, and others show that the function has no state.
     assert 200 + 14 <= calls - before <= 200 + 3 + 14
     assert float(new.sel(supplier="Busch").mean() / new.sel(supplier="Adler").mean()) != 1
-    # New specimens of one supplier
-    mu, sigma = optimum.point["mu"][1], optimum.point["sigma"]
-    fresh = 2 * stats.norm.ppf((np.arange(25) + 0.5) / 25, mu, sigma)
-    assert not prb.area_test(fresh, found.sel(supplier="Busch")).rejected
-    assert prb.area_test(fresh, found.sel(supplier="Adler")).rejected
-    with pytest.raises(ValueError, match=r"got a DataArray with dims .* expected \(chain, draw"):
-        prb.area_test(fresh, found)
 
 
 def test_populations_of_inputs_have_the_names_of_groups(model: pm.Model) -> None:
@@ -197,26 +172,6 @@ def test_other_propagations_have_groups(propagation: Any) -> None:
     near_both, far_of_one = evaluator(np.stack([theta, far])).discrepancies
     assert far_of_one[1] > 5 * near_both[1]
     assert far_of_one[0] < 5 * near_both[0] + 1
-
-
-@pytest.mark.long
-def test_several_outputs_have_groups() -> None:
-    noise = np.random.default_rng(6).normal(0, 0.2, 50)
-    values = np.stack([DATA.values, DATA.values + noise], axis=1)
-    coords = {"supplier": ("specimen", WHO), "place": ["left", "right"]}
-    observed = xr.DataArray(values, coords, ["specimen", "place"])
-    model = build(
-        observed,
-        lambda x: np.stack([x, x + 0.2 * np.sin(9 * x)], axis=-1),
-        metric=prb.Joint(prb.AreaMetric()),
-    )
-    parts = list(nodes(model).values())
-    assert [(node.name, len(node.observed)) for node in parts] == [(PARTS[0], 20), (PARTS[1], 30)]
-    assert {node.outputs.labels for node in parts} == {("left", "right")}
-    optimum = prb.minimize(model, starts=0, progressbar=False)
-    function = parts[0].responses.function
-    predicted = prb.predict(optimum, function, specimen(model), n_samples=50)
-    assert predicted.dims == ("chain", "draw", "supplier", "sample", "place")
 
 
 def test_weights_and_labels_go_with_their_group() -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import structure
+from structure import parsed
 
 import prbayes
 
@@ -104,11 +105,6 @@ def public() -> dict[str, Any]:
 PUBLIC = public()
 
 
-@cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def dotted(path: Path) -> str:
     """Return the dotted name of a file of the package, without the package's own."""
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
@@ -117,7 +113,7 @@ def dotted(path: Path) -> str:
 def imported(path: Path) -> list[str]:
     """Return what a file imports, anywhere in it, as dotted names: `from a import b` is a.b."""
     names: list[str] = []
-    for node in ast.walk(tree(path)):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: a relative import"
             names += [f"{node.module}.{alias.name}" for alias in node.names]
@@ -191,7 +187,7 @@ def test_files_print_nothing_and_evaluate_nothing() -> None:
     violations = [
         f"{dotted(path)}:{node.lineno} calls {node.func.id}"
         for path in FILES
-        for node in ast.walk(tree(path))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id in forbidden
@@ -343,7 +339,7 @@ def test_design_shows_the_rooms_in_their_own_words() -> None:
     for name, (words, files) in shown.items():
         folder = PACKAGE / name
         path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
-        summary = (ast.get_docstring(tree(path)) or "").split("\n\n")[0].replace("\n", " ")
+        summary = (ast.get_docstring(parsed(path)) or "").split("\n\n")[0].replace("\n", " ")
         assert words == summary, f"DESIGN.md says of {name}: {words}; the module: {summary}"
         inside = sorted(p.stem for p in folder.glob("*.py") if p.stem != "__init__")
         assert files == (", ".join(inside) or ("-" if folder.is_dir() else ""))
@@ -409,7 +405,7 @@ def test_the_table_of_the_readme_is_what_its_example_prints(tmp_path: Path) -> N
 def negations_of_a_discrepancy(path: Path) -> list[str]:
     """Return the functions of a file that divide minus a discrepancy by epsilon, by their syntax trees."""
     found = []
-    for function in ast.walk(tree(path)):
+    for function in ast.walk(parsed(path)):
         if not isinstance(function, ast.FunctionDef):
             continue
         for node in ast.walk(function):
@@ -429,7 +425,7 @@ def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
 def constants(path: Path) -> list[tuple[str, ast.expr, ast.Assign]]:
     """Return the constants at the top of a file: names in capitals, their values, the statements."""
     found: list[tuple[str, ast.expr, ast.Assign]] = []
-    for statement in tree(path).body:
+    for statement in parsed(path).body:
         if not isinstance(statement, ast.Assign):
             continue
         (target,) = statement.targets
@@ -486,8 +482,8 @@ FOREIGN = ("pymc", "pytensor", "arviz", "arviz_base", "arviz_stats", "arviz_plot
 def inner(path: Path) -> set[str]:
     """Return names below the top of a foreign package that a file imports, or reaches as pm.distributions.x."""
     found = {name for name in imported(path) if name.split(".")[0] in FOREIGN}
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Attribute):
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute):
             whole = ast.unparse(node).split(".")
             if (
                 whole[0] == "pm"
@@ -509,7 +505,7 @@ def asked_of_executors() -> set[str]:
     """Return names that the package asks executors for: by `getattr`, and in the table of what a pool was made with."""
     path = PACKAGE / "response" / "executors.py"
     found: set[str] = set()
-    for node in ast.walk(tree(path)):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
             name = node.args[1]
             found |= {str(name.value)} if isinstance(name, ast.Constant) else set()
@@ -530,8 +526,9 @@ def test_inner_names_of_executors_have_contracts() -> None:
 
 
 def test_the_page_of_findings_has_every_code() -> None:
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in FILES]
-    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [
+        node for path in FILES for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)
+    ]
     findings = [call.args[0] for call in calls if getattr(call.func, "id", "") == "Finding"]
     codes = {code.value for code in findings if isinstance(code, ast.Constant)}
     page = (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -171,15 +170,6 @@ def test_failed_specimens_are_predicted(problem: Problem, optimum: prb.Optimum) 
     assert np.isinf(failing).mean() == pytest.approx(norm.sf(1), abs=0.05)
 
 
-def test_area_test(problem: Problem, posterior: xr.DataTree) -> None:
-    predicted = prb.predict(posterior, Growth(0.7), problem.x, model=problem.model, name="later")
-    assert not prb.area_test(problem.later, predicted).rejected
-    assert prb.area_test(3 * problem.later, predicted).rejected
-    own = prb.predict(posterior, problem.growth, problem.x, model=problem.model)
-    with pytest.raises(ValueError, match="the data of the calibration"):
-        prb.area_test(problem.observed, own)
-
-
 @pytest.mark.usefixtures("no_run")
 def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
     limit = float(np.exp(0.5 * (optimum.point["mu"] + optimum.point["sigma"])))
@@ -207,12 +197,6 @@ def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
     # Three times as many specimens again: half the standard deviation, but for what a prior adds.
     ratio = plan.sd.sel(candidate="same", k=3 * N, name="mu") / plan.now.sel(name="mu")
     assert float(ratio) == pytest.approx(0.5, abs=0.08)
-    with pytest.raises(ValueError, match="leave metric= out"):
-        prb.plan(
-            posterior,
-            {"area": prb.decision.Condition(problem.growth, problem.x, metric=prb.AreaMetric())},
-            model=problem.model,
-        )
 
 
 @pytest.mark.usefixtures("no_run")
@@ -277,18 +261,6 @@ def test_cross_validation_is_the_log_density_of_specimens_left_out(optimum: prb.
     assert table.sizes == {"fold": 5, "simulator": 1, "specimen": N}
     assert bool(table.converged.all())
     assert float(table.discrepancy.mean()) > float(table.calibrated.mean())
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_run")
-def test_simulation_based_calibration(problem: Problem) -> None:
-    ranks = prb.simulation_based_calibration(
-        20, model=problem.model, draws=100, progressbar=False
-    ).prior_sbc
-    assert ranks.attrs["failed"] == 0
-    # Twenty uniform ranks: a mean of .5 with a standard error of .065.
-    for name in ("mu", "sigma"):
-        assert float(ranks[name].mean()) == pytest.approx(0.5, abs=0.29)
 
 
 @pytest.mark.usefixtures("no_run")
@@ -383,14 +355,6 @@ def test_conflict_is_reported_with_censored_readings_too() -> None:
     assert "prior-conflict" in [finding.code for finding in diagnosis.findings]
     (untested,) = diagnosis.untested
     assert untested.startswith("The family of the population was not tested: readings of y are c")
-    # The power is that of complete readings.
-    with pm.Model() as agreeing:
-        x = pm.Normal.dist(pm.Normal("mu", 4.0, 0.5), pm.HalfNormal("sigma", 1.0))
-        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, observed=readings)
-    maximum = prb.minimize(agreeing, progressbar=False)
-    pulled = maximum.theta + np.sqrt(np.diag(maximum.covariance))
-    (remark,) = check_conflict(maximum, pulled[None]).remarks
-    assert str(remark).endswith("no hyperparameter is in conflict with its prior (p > .05).")
 
 
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:
@@ -450,42 +414,6 @@ def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
 
 
 @pytest.mark.usefixtures("no_run")
-def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    shown: list[Any] = [
-        prb.plots.plot_population(optimum),
-        prb.plots.plot_population(posterior, model=problem.model),
-        prb.plots.plot_responses(optimum),
-        prb.plots.plot_responses(posterior, model=problem.model, n_draws=20),
-        prb.plots.plot_posterior(posterior, optimum=optimum, model=problem.model),
-        prb.plots.plot_optimizer(optimum),
-        prb.plots.plot_stages(posterior),
-        prb.plots.plot_comparison(prb.compare({"a": optimum, "b": posterior})),
-        prb.plots.plot_landscape(optimum, points=9),
-    ]
-    assert all(getattr(picture, "axes", None) or picture.viz.children for picture in shown)
-    # The path is that of the descent that found the optimum.
-    assert np.isfinite(optimum.search.trace["discrepancy"][-1])
-    np.testing.assert_allclose(optimum.search.trace["theta"][-1], optimum.theta, atol=1e-3)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_run")
-def test_report(
-    problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree, tmp_path: Path
-) -> None:
-    report = prb.Report("Growth", model=problem.model, optimum=optimum, posterior=posterior)
-    text = report.to_html(tmp_path / "report.html").read_text(encoding="utf-8")
-    titles = [section.title for section in report.sections]
-    assert "Log-likelihood" in titles
-    assert "Metric and epsilon" not in titles
-    assert re.search(r"emulator of [3-6]\d runs", text)
-    assert "width is that of epsilon" not in text
-    assert "could not be made" not in text
-    assert "no problem was found." in text
-    assert "was not tested" not in text
-
-
-@pytest.mark.usefixtures("no_run")
 def test_files_answer_without_a_run(
     problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree, tmp_path: Path
 ) -> None:
@@ -499,74 +427,6 @@ def test_files_answer_without_a_run(
     np.testing.assert_allclose(predicted, direct)
     table = prb.compare({"a": xr.load_datatree(tmp_path / "optimum.nc"), "b": stored})
     assert table.sizes["result"] == 2
-
-
-def test_fresh_model_computes_its_emulator_and_says_so(
-    problem: Problem, posterior: xr.DataTree
-) -> None:
-    fresh = build(problem.observed)
-    predicted = prb.predict(posterior, fresh.growth, fresh.x, model=fresh.model)
-    runs = predicted.attrs["responses"]
-    assert 0 < runs <= 60
-    assert f"({runs} runs)" in predicted.attrs["source"]
-
-
-@pytest.mark.long
-def test_two_inputs_and_outputs() -> None:
-    rng = np.random.default_rng(2)
-
-    def response(a: Any, b: Any) -> Any:
-        a, b = np.broadcast_arrays(a, b)
-        return np.stack([a * b, a + b**2], axis=-1)
-
-    observed = response(rng.normal(1, 0.3, N), np.exp(rng.normal(0, 0.2, N)))
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 0.5))
-        b = pm.LogNormal.dist(0.0, pm.HalfNormal("tau", 0.5))
-        prb.Simulator("y", response, a, b, observed=observed)
-    optimum = prb.minimize(model)
-    predicted = prb.predict(optimum, response, a, b)
-    assert predicted.dims[-1] == "output"
-    of_one = prb.predict(optimum, lambda a: 2 * a, a, name="double")
-    assert float(of_one.mean()) == pytest.approx(2 * optimum.point["mu"], abs=0.01)
-    prb.plots.plot_outputs(optimum)
-    assert prb.diagnose(optimum).ok
-    table = prb.compare({"optimum": optimum}, model=model)
-    assert "Joint(AreaMetric)" in table
-    idata = prb.sample(200, model=model, optimum=optimum, progressbar=False)
-    for output in range(2):
-        pit = az.loo_pit(idata.isel(output=output))["y"]
-        assert pit.shape == (N,)
-        assert 0.2 < float(pit.mean()) < 0.8
-
-
-@pytest.mark.long
-def test_groups() -> None:
-    rng = np.random.default_rng(3)
-    suppliers = np.repeat(["a", "b", "c"], 8)
-    x = rng.normal(np.repeat([0.8, 1.0, 1.3], 8), 0.4)
-    data = xr.DataArray(np.exp(0.5 * x), {"supplier": ("specimen", suppliers)}, "specimen")
-    with pm.Model(coords={"supplier": ["a", "b", "c"]}) as model:
-        mu = pm.Normal("mu", 1.0, 1.0, dims="supplier")
-        supplier = prb.response.group("supplier")
-        inputs = pm.Normal.dist(mu[supplier], pm.HalfNormal("sigma", 1.0))
-        growth = Growth(0.5)
-        prb.Simulator("y", growth, inputs, observed=data)
-    optimum = prb.minimize(model)
-    np.testing.assert_allclose(optimum.point["mu"], x.reshape(3, 8).mean(axis=1), atol=0.01)
-    predicted = prb.predict(optimum, growth, inputs)
-    assert predicted.sizes["supplier"] == 3
-    medians = predicted.median("sample").values.ravel()
-    np.testing.assert_allclose(medians, np.exp(0.5 * optimum.point["mu"]), rtol=0.01)
-    names = [simulator.name for simulator in optimum.evaluator.simulators]
-    assert names == ["y[a]", "y[b]", "y[c]"]
-    prb.plots.plot_responses(optimum)
-    prb.plots.plot_population(optimum)
-    # The population is tested with the refits of all groups; its p-value is uniform.
-    assert any("root" in note for note in prb.diagnose(optimum).notes)
-    assert prb.cross_validate(optimum).sizes["simulator"] == 3
-    with pytest.raises(TypeError, match="group"):
-        prb.exceedance(optimum, growth, 2.0, inputs)
 
 
 def test_tests_without_standard_errors_name_what_to_fix(optimum: prb.Optimum) -> None:
@@ -618,9 +478,6 @@ def test_mixed_model() -> None:
     assert tree["calibration"]["is_likelihood"].values.tolist() == [0, 1]
     posterior = prb.sample_smc(model=model, draws=100, chains=2, random_seed=1, progressbar=False)
     assert posterior["calibration"].sizes["simulator"] == 2
-    prb.plots.plot_responses(posterior, model=model)
-    prb.diagnose(posterior, model=model)
-    prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
     own = prb.predict(posterior, growth, x, model=model)
     assert "emulator of y" in own.attrs["source"]
     with pytest.raises(ValueError, match=r"prb\.sample_smc"):

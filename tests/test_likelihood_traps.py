@@ -1,7 +1,7 @@
 """Traps of the log-likelihood by specimen: each is refused, repaired or reported.
 
 Beside each trap are clean data of the same kind, which are not flagged. Numbers of specimens are
-such that a trap is seen in at least .95 of the data sets; the slow tests count 20 of them.
+such that a trap is seen in at least .95 of the data sets; the slow test counts 20 of them.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import pytest
 from scipy.stats import beta, gamma, norm
 
 import prbayes as prb
-from benchmarks.scoreboard.problems import frame
 from prbayes._finding import Finding
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
+from prbayes.response.compile import PLAIN
 from prbayes.response.failures import ResponseError
 from prbayes.results.likelihood_checks import check_population
 from prbayes.specimens.points import SpecimenOptions
@@ -57,15 +57,6 @@ def two_inputs() -> list[Any]:
     a, b = pm.Normal("a", 1, 0.5), pm.Normal("b", 1, 0.5)
     s, t = pm.HalfNormal("s", 0.5), pm.HalfNormal("t", 0.5)
     return [pm.Normal.dist(a, s), pm.Normal.dist(b, t)]
-
-
-def uniform_input() -> list[Any]:
-    low, width = pm.Normal("low", 0, 1), pm.HalfNormal("width", 2)
-    return [pm.Uniform.dist(low, low + width)]
-
-
-def bounded_input() -> list[Any]:
-    return [pm.Normal.dist(pm.Normal("mu", 0, 2), pm.Uniform("sigma", 0.5, 2))]
 
 
 def line(x: Any) -> Any:
@@ -157,10 +148,6 @@ def clean_line(rng: np.random.Generator, n: int = 50) -> pm.Model:
     return model_of(line, normal_input, line(sample(rng, n)))
 
 
-def clean_fold(rng: np.random.Generator) -> pm.Model:
-    return model_of(fold, normal_input, fold(sample(rng)))
-
-
 def capped(rng: np.random.Generator, limit: float) -> pm.Model:
     def response(x: Any) -> Any:
         return np.minimum(x, limit)
@@ -175,26 +162,15 @@ def with_pole(rng: np.random.Generator, pole: float) -> pm.Model:
     return model_of(response, normal_input, response(sample(rng)))
 
 
-def with_ends(rng: np.random.Generator, *, known: bool = False) -> pm.Model:
-    if known:
-        return clean_line(rng)
-    return model_of(line, uniform_input, line(rng.uniform(-0.5, 1.5, 50)))
-
-
 def censored(rng: np.random.Generator) -> pm.Model:
     y = line(sample(rng))
     return model_of(line, normal_input, np.minimum(y, np.quantile(y, 0.7)))
 
 
-def rounded(rng: np.random.Generator, response: Any) -> pm.Model:
-    y = response(sample(rng))
+def rounded(rng: np.random.Generator) -> pm.Model:
+    y = line(sample(rng))
     step = 0.5 * y.std()
-    return model_of(response, normal_input, np.round(y / step) * step)
-
-
-def copied(rng: np.random.Generator) -> pm.Model:
-    y = line(sample(rng, 40))
-    return model_of(line, normal_input, np.concatenate([y, y[:10]]))
+    return model_of(line, normal_input, np.round(y / step) * step)
 
 
 def failing(rng: np.random.Generator, above: float) -> pm.Model:
@@ -208,23 +184,13 @@ def failing(rng: np.random.Generator, above: float) -> pm.Model:
     return model_of(response, normal_input, response(x), prb.Reweighted(64, max_lost=0.9))
 
 
-def at_end(rng: np.random.Generator, sd: float) -> pm.Model:
-    return model_of(line, bounded_input, line(sample(rng, 50, sd=sd)))
-
-
-def two_outputs(rng: np.random.Generator, response: Any, shift: float = 0.0) -> pm.Model:
+def two_outputs(rng: np.random.Generator, response: Any) -> pm.Model:
     first, second = sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3)
-    y = response(first, second)
-    y[:, -1] += shift
-    return model_of(response, two_inputs, y)
+    return model_of(response, two_inputs, response(first, second))
 
 
 def sums(a: Any, b: Any) -> Any:
     return np.stack([a + b, (a + b) ** 2], axis=-1)
-
-
-def of_first(a: Any, b: Any) -> Any:
-    return np.stack([a, np.exp(a) + 0 * b], axis=-1)
 
 
 def three_outputs(a: Any, b: Any) -> Any:
@@ -237,12 +203,8 @@ def two_frequencies(a: Any, b: Any) -> Any:
 
 
 def in_order(rng: np.random.Generator, outputs: slice) -> pm.Model:
-    y = two_frequencies(sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3))
+    y = two_frequencies(sample(rng, 12, 1.0, 0.3), sample(rng, 12, 1.3, 0.3))
     return model_of(two_frequencies, two_inputs, y[:, outputs])
-
-
-def bell(x: Any) -> Any:
-    return np.exp(-(np.asarray(x) ** 2))
 
 
 def of_response(rng: np.random.Generator, response: Any) -> pm.Model:
@@ -253,7 +215,6 @@ def of_data(rng: np.random.Generator, response: Any, change: Callable[[Floats], 
     return model_of(response, normal_input, change(response(sample(rng, 20))))
 
 
-clean_outputs = partial(two_outputs, response=three_outputs)
 TRAPS = {
     "cap": Trap(
         "censored-data|limit of measurement",
@@ -265,16 +226,11 @@ TRAPS = {
         partial(with_pole, pole=1.0),
         partial(with_pole, pole=-30.0),
     ),
-    "moving ends": Trap("support-edge", with_ends, partial(with_ends, known=True), True),
     "censored": Trap("censored-data", censored, clean_line),
-    "rounded": Trap("rounded-data", partial(rounded, response=line), clean_line),
-    "rounded, folded": Trap("rounded-data", partial(rounded, response=fold), clean_fold),
-    "copies": Trap("identical-specimens", copied, clean_line),
-    "noise": Trap("it is random", lambda rng: of_response(rng, noisy(0.3)), clean_line),
+    "rounded": Trap("rounded-data", rounded, clean_line),
     "noise of a thousandth": Trap(
         "it is random", lambda rng: of_response(rng, noisy(0.001)), clean_line
     ),
-    "state": Trap("it is random", lambda rng: of_response(rng, Memory()), clean_line),
     "state of one by one": Trap(
         "it is random",
         lambda rng: of_response(rng, prb.scalar(Memory().of_number)),
@@ -283,26 +239,10 @@ TRAPS = {
     "failing region": Trap(
         "failing-region", partial(failing, above=1.2), partial(failing, above=4.0), True
     ),
-    "end of a prior": Trap("prior-end", partial(at_end, sd=0.3), partial(at_end, sd=0.9), True),
     "sum of inputs alone": Trap(
         "not determine a direction of a, b",
         partial(two_outputs, response=sums),
-        clean_outputs,
-    ),
-    "no influence": Trap(
-        "not determine a direction of b",
-        partial(two_outputs, response=of_first),
-        clean_outputs,
-    ),
-    "readings that no inputs reproduce": Trap(
-        "readings-misfit",
-        partial(two_outputs, response=three_outputs, shift=0.5),
-        clean_outputs,
-    ),
-    "readings above all responses": Trap(
-        "outside the range of all runs|readings-misfit",
-        partial(of_data, response=bell, change=lambda y: y + 1.1),
-        partial(of_data, response=fold, change=lambda y: y),
+        partial(two_outputs, response=three_outputs),
     ),
     "swapped outputs": Trap(
         "check the order of the outputs|readings-misfit",
@@ -313,9 +253,6 @@ TRAPS = {
         "check the units",
         partial(of_data, response=line, change=lambda y: 1000 * y),
         partial(of_data, response=line, change=lambda y: y),
-    ),
-    "constant response": Trap(
-        "depends on its inputs", lambda rng: of_response(rng, lambda x: 0 * x + 3), clean_line
     ),
 }
 # Two modes of a folded response are no trap, but a result.
@@ -494,42 +431,6 @@ def test_a_start_in_each_basin_finds_nearly_all_roots() -> None:
     np.testing.assert_array_equal(np.bincount(modes.specimen), 1)
 
 
-@pytest.mark.slow
-def test_all_roots_are_found_in_twenty_data_sets() -> None:
-    results = [folded_shift(seed, SpecimenOptions().starts) for seed in SEEDS]
-    assert all(count == 100 for _, count in results)
-    assert np.sum([shifted <= 0.1 for shifted, _ in results]) >= 19
-
-
-def frame_response(lower: Any, upper: Any) -> Any:
-    return np.stack(frame.formula(np, lower, upper), axis=-1)
-
-
-def frame_inputs() -> list[Any]:
-    mu1, sd1 = pm.Uniform("mu1", 400, 1600), pm.Uniform("sd1", 0, 600)
-    mu2, sd2 = pm.Uniform("mu2", 300, 1300), pm.Uniform("sd2", 0, 450)
-    return [pm.Normal.dist(mu1, sd1), pm.Normal.dist(mu2, sd2)]
-
-
-def frame_shift(seed: int) -> float:
-    x = frame.stiffnesses(20, seed)
-    y = frame_response(*x.T)
-    model = model_of(frame_response, frame_inputs, y)
-
-    def exact(at: dict[str, Floats]) -> Floats:
-        return sum(normal_log(x[:, k], at[f"mu{k + 1}"], at[f"sd{k + 1}"]) for k in range(2))
-
-    return shift(model, *around_optimum(model), exact)
-
-
-@pytest.mark.long
-def test_a_mirror_root_is_kept_without_the_third_output() -> None:
-    y = frame.data(20, 0)[:, :2]
-    model = model_of(lambda a, b: frame_response(a, b)[..., :2], frame_inputs, y)
-    modes = prepared(likelihood_of(model)).proposals.modes
-    assert np.mean(np.bincount(modes.specimen) >= 2) >= 0.9
-
-
 def crossing_model(seed: int) -> tuple[pm.Model, Floats]:
     rng = np.random.default_rng([seed, 5])
     x = np.stack([sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3)])
@@ -547,7 +448,7 @@ def crossing_shift(seed: int) -> float:
         return np.logaddexp(log_density(*x), log_density(*x[::-1])).sum(axis=1)
 
     # Two modes that overlap: the proposal at one of them is wide.
-    return shift(model, *around_optimum(model, n=4000, wide=2.0), exact)
+    return shift(model, *around_optimum(model, n=1000, wide=2.0), exact)
 
 
 def is_repaired_or_reported(
@@ -578,60 +479,12 @@ def test_a_rough_response_is_repaired_or_reported(name: str, outcome: Any) -> No
     assert is_repaired_or_reported(outcome, model(1)[0], shift_of, 1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROUGH)
-def test_a_rough_response_is_repaired_or_reported_in_twenty_data_sets(
-    name: str, outcome: Any
-) -> None:
-    model, shift_of = ROUGH[name]
-    good = [is_repaired_or_reported(outcome, model(seed)[0], shift_of, seed) for seed in SEEDS]
-    assert np.sum(good) >= 19
-
-
-def ends_shift(seed: int) -> float:
-    """Return the shift of a uniform population, whose likelihood jumps at its ends."""
-    x = np.random.default_rng([seed, 6]).uniform(-0.5, 1.5, 50)
-    model = model_of(line, uniform_input, line(x))
-    # The exact posterior has a width of a fiftieth of the range at either end.
-    low, log_width = x.min() - np.linspace(1e-4, 0.3, 60), np.log(np.ptp(x))
-    log_widths = log_width + np.linspace(1e-3, 0.35, 60)
-    thetas = np.stack([each.ravel() for each in np.meshgrid(low, log_widths)], axis=1)
-
-    def exact(at: dict[str, Floats]) -> Floats:
-        is_inside = at["low"] + at["width"] >= x.max()
-        return np.where(is_inside, -len(x) * np.log(at["width"]), -np.inf)
-
-    return shift(model, thetas, np.zeros(len(thetas)), exact)
-
-
-def bounded_shift(seed: int) -> float:
-    """Return the shift of a population whose standard deviation is at the end of its prior."""
-    x = sample(np.random.default_rng([seed, 7]), 50)
-    model = model_of(line, bounded_input, line(x))
-    bounds = np.array([[0.6, -7.0], [1.4, 0.0]])
-    return shift(model, *over_box(bounds), lambda at: normal_log(x, at["mu"], at["sigma"]))
-
-
-def truncated_shift(seed: int) -> float:
-    """Return the shift of a population without response above a limit: a truncated normal."""
-    x = sample(np.random.default_rng([seed, 17]), 100)
-    x = x[x < 1.2]
-    model = failing(np.random.default_rng([seed, 17]), 1.2)
-
-    def exact(at: dict[str, Floats]) -> Floats:
-        share = norm.logcdf(1.2, at["mu"], at["sigma"])
-        return normal_log(x, at["mu"], at["sigma"]) - len(x) * share
-
-    bounds = np.array([[-1.0, np.log(0.15)], [4.0, np.log(2.5)]])
-    return shift(model, *over_box(bounds, 4000), exact)
-
-
 def sum_shift(seed: int) -> float:
     """Return the shift of two inputs that enter only through their sum."""
     rng = np.random.default_rng([seed, 8])
     y = sample(rng, 50, 1.0, 0.3) + sample(rng, 50, 1.3, 0.3)
     model = model_of(lambda a, b: a + b, two_inputs, y)
-    thetas = Evaluator.of(model).hyperparameters.prior_points(4096, 3)
+    thetas = Evaluator.of(model).hyperparameters.prior_points(1024, 3)
     log_proposal = Evaluator.of(model).hyperparameters.log_prior(thetas)
     return shift(
         model,
@@ -644,10 +497,6 @@ def sum_shift(seed: int) -> float:
 SHIFTS: dict[str, Callable[[int], float]] = {
     "three specimens": partial(one_input, "three specimens"),
     "pole outside": partial(one_input, "pole outside"),
-    "mirror root": frame_shift,
-    "moving ends": ends_shift,
-    "end of a prior": bounded_shift,
-    "failing region": truncated_shift,
     "ridge": sum_shift,
 }
 
@@ -656,24 +505,6 @@ SHIFTS: dict[str, Callable[[int], float]] = {
 @pytest.mark.parametrize("name", SHIFTS)
 def test_the_posterior_is_exact(name: str) -> None:
     assert SHIFTS[name](0) <= 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SHIFTS)
-def test_the_posterior_is_exact_in_twenty_data_sets(name: str) -> None:
-    shifts = [SHIFTS[name](seed) for seed in SEEDS]
-    assert np.sum(np.array(shifts) <= 0.1) >= 19, np.sort(shifts)[-3:]
-
-
-def two_modes(rng: np.random.Generator, n: int) -> Floats:
-    return rng.choice([-1.0, 1.0], n) + 0.5 * rng.standard_normal(n)
-
-
-@pytest.mark.long
-def test_the_optimum_reports_another_family() -> None:
-    x = 1 + 0.5 * two_modes(np.random.default_rng(4), 100)
-    optimum = prb.minimize(model_of(line, normal_input, line(x)), progressbar=False)
-    assert [each.code for each in check_population(optimum).findings] == ["population-misfit"]
 
 
 @pytest.mark.long
@@ -686,37 +517,23 @@ def test_rounding_is_named_alone_before_the_family() -> None:
     assert "pass rounded= to y first" in checked.untested[0]
 
 
-@pytest.mark.slow
-def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
-    data = [line(sample(np.random.default_rng([seed, 16]))) for seed in range(200)]
-    # One model, whose runs serve all data sets.
-    base = likelihood_of(model_of(line, normal_input, data[0]))
-    _ = prepared(base).points
-    flagged = [bool(prepared(base.observing({base.name: y})).findings) for y in data]
-    assert np.mean(flagged) <= 0.07
+def errors_at(
+    model: pm.Model,
+    populations: list[tuple[float, float]],
+    log_density: Callable[[float, float], Floats],
+    **others: float,
+) -> Floats:
+    """Return the errors of the log-likelihood at values of a and b, less their mean.
 
-
-@pytest.mark.long
-def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
-    x, observed = frame.stiffnesses(20, 0), frame.data(20, 0)
-    error = np.array([0.002, 0.002, 0.2])
-    model = model_of(frame_response, frame_inputs, observed, error=error)
-    mirror = np.stack([2 * x[:, 1], x[:, 0] / 2], axis=1)
-    away = (frame_response(*mirror.T) - observed) / error
-    assert np.abs(away[:, :2]).max() < 1e-6
-    assert np.abs(away[:, 2]).max() < 1
-
-    def exact(at: dict[str, Floats]) -> Floats:
-        def log_density(inputs: Floats) -> Floats:
-            logs = (
-                norm.logpdf(inputs[:, k], at[f"mu{k + 1}"][:, None], at[f"sd{k + 1}"][:, None])
-                for k in range(2)
-            )
-            return sum(logs)
-
-        return np.logaddexp(log_density(x), log_density(mirror) - away[:, 2] ** 2 / 2).sum(axis=1)
-
-    assert shift(model, *around_optimum(model), exact) <= 0.1
+    The Jacobian of the response is common to all populations.
+    """
+    function = model.compile_logp(vars=model.observed_RVs, jacobian=False, mode=PLAIN)
+    errors = [
+        float(function({"a_log__": np.log(a), "b_log__": np.log(b), **others}))
+        - log_density(a, b).sum()
+        for a, b in populations
+    ]
+    return np.array(errors) - np.mean(errors)
 
 
 @pytest.mark.parametrize("response", [np.positive, lambda x: x + 0.3 * np.sin(3 * x)])
@@ -725,26 +542,19 @@ def test_specimens_beside_the_ends_of_a_range(response: Callable[[Any], Any]) ->
     x = np.random.default_rng(70).beta(0.3, 0.3, 10)
     with pm.Model() as model:
         population = pm.Beta.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5))
-        y = prb.Simulator("y", response, population, observed=response(x))
-    function = model.compile_logp(vars=[y], jacobian=False)
-    points = [(0.2, 0.2), (0.3, 0.3), (0.5, 0.3), (0.3, 0.15), (1.0, 1.0)]
-    right = [beta.logpdf(x, a, b).sum() for a, b in points]
-    log_l = [float(function({"a_log__": np.log(a), "b_log__": np.log(b)})) for a, b in points]
-    # The Jacobian of the response is common to all populations. An error of 3 % of the distance from
-    # the end is not reported: .03 (1 - .15) nats for each of the two specimens.
-    error = np.subtract(log_l, right)
-    assert error - error.mean() == pytest.approx(np.zeros(5), abs=0.05)
+        prb.Simulator("y", response, population, observed=response(x))
+    populations = [(0.2, 0.2), (0.3, 0.3), (0.5, 0.3), (0.3, 0.15), (1.0, 1.0)]
+    # An error of 3 % of the distance from the end is not reported: .03 (1 - .15) nats for each of
+    # the two specimens.
+    errors = errors_at(model, populations, lambda a, b: beta.logpdf(x, a, b))
+    assert errors == pytest.approx(np.zeros(5), abs=0.05)
 
 
 BESIDE = np.random.default_rng(1).beta(2, 2, 12)
 ENDED: dict[str, Callable[[], Any]] = {
     "beta": lambda: pm.Beta.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
-    "kumaraswamy": lambda: pm.Kumaraswamy.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
     "gamma": lambda: pm.Gamma.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
     "weibull": lambda: pm.Weibull.dist(pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)),
-    "truncated": lambda: pm.TruncatedNormal.dist(
-        pm.Normal("mu", 0.5, 0.5), pm.HalfNormal("s", 0.5), lower=0, upper=1
-    ),
     "exponential": lambda: pm.Exponential.dist(pm.HalfNormal("rate", 5)),
 }
 
@@ -772,14 +582,14 @@ def refusal_or_report(model: pm.Model, caplog: pytest.LogCaptureFixture) -> str:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "end"),
-    [("beta", 0.0), ("beta", 1.0), ("kumaraswamy", 0.0), ("kumaraswamy", 1.0), ("gamma", 0.0)],
+    [("beta", 1.0), ("gamma", 0.0)],
 )
 def test_an_exact_reading_at_an_end_is_refused_or_reported_by_its_row(
     family: str, end: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert "specimen 12" in refusal_or_report(model_with_end(family, end), caplog)
     metric = prb.LogLikelihood(error=0.01)
-    posterior = prb.sample(model=model_with_end(family, end, metric=metric), progressbar=False)
+    posterior = prb.sample(50, model=model_with_end(family, end, metric=metric), progressbar=False)
     assert posterior.posterior["a"].std() < 1.0
 
 
@@ -795,26 +605,20 @@ def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: floa
             observed=np.stack([x, c + 0.1 * x], -1),
         )  # fmt: skip
     if end > 0:
-        right = [beta.logpdf(x, a, b).sum() for a, b in ((0.5, 1.0), (1.0, 1.0), (0.7, 0.7))]
-        function = model.compile_logp(vars=model.observed_RVs, jacobian=False)
-        at = {"mu": 0.0, "s_log__": np.log(0.5)}
-        log_l = [
-            float(function(at | {"a_log__": np.log(a), "b_log__": np.log(b)}))
-            for a, b in ((0.5, 1.0), (1.0, 1.0), (0.7, 0.7))
-        ]
-        error = np.subtract(log_l, right)
-        assert error - error[1] == pytest.approx(np.zeros(3), abs=0.1)
+        populations = [(0.5, 1.0), (1.0, 1.0), (0.7, 0.7)]
+        others = {"mu": 0.0, "s_log__": np.log(0.5)}
+        errors = errors_at(model, populations, lambda a, b: beta.logpdf(x, a, b), **others)
+        assert errors == pytest.approx(np.zeros(3), abs=0.05)
         return
     with pytest.raises(prb.propagation.DesignError, match="exact reading of specimen 12 whose in"):
         prb.sample(model=model, progressbar=False)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("family", ["truncated", "exponential"])
-def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None:
+def test_a_density_that_is_finite_at_the_end_needs_no_error() -> None:
+    models = [model_with_end("exponential", end) for end in (0.0, 1e-4)]
     posteriors = [
-        prb.sample(model=model_with_end(family, end), random_seed=1, progressbar=False).posterior
-        for end in (0.0, 1e-4)
+        prb.sample(model=model, random_seed=1, progressbar=False).posterior for model in models
     ]
     for name in posteriors[0].data_vars:
         means = [float(posterior[name].mean()) for posterior in posteriors]
@@ -822,7 +626,7 @@ def test_a_density_that_is_finite_at_the_end_needs_no_error(family: str) -> None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("weibull", 1e-7), ("gamma", 1e-7)])
+@pytest.mark.parametrize(("family", "end"), [("weibull", 1e-5), ("gamma", 1e-7)])
 def test_readings_as_small_as_the_error_of_the_emulator_are_no_secret(
     family: str, end: float, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -832,18 +636,14 @@ def test_readings_as_small_as_the_error_of_the_emulator_are_no_secret(
 @pytest.mark.parametrize("end", [1e-5, 1e-7])
 def test_the_logarithm_of_a_response_resolves_small_readings(end: float) -> None:
     model = model_with_end("gamma", end, response=np.log)
-    function = model.compile_logp(vars=model.observed_RVs, jacobian=False)
     x = np.append(BESIDE, end)
-    points = [(0.4, 1.0), (0.8, 2.0), (1.5, 3.0)]
-    right = [gamma.logpdf(x, a, scale=1 / b).sum() for a, b in points]
-    log_l = [float(function({"a_log__": np.log(a), "b_log__": np.log(b)})) for a, b in points]
-    error = np.subtract(log_l, right)
-    assert error - error[0] == pytest.approx(np.zeros(3), abs=0.02)
+    populations = [(0.4, 1.0), (0.8, 2.0), (1.5, 3.0)]
+    errors = errors_at(model, populations, lambda a, b: gamma.logpdf(x, a, scale=1 / b))
+    assert errors == pytest.approx(np.zeros(3), abs=0.01)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("population", ["beta", "uniform"])
-def test_readings_with_an_error_beside_the_ends_of_a_range(population: str) -> None:
+def test_readings_with_an_error_beside_the_ends_of_a_range() -> None:
     # Some readings are beyond the ends, where the emulator's error is small beside theirs.
     rng = np.random.default_rng(2)
     x = rng.beta(0.5, 0.5, 30)
@@ -856,15 +656,14 @@ def test_readings_with_an_error_beside_the_ends_of_a_range(population: str) -> N
 
     with pm.Model() as model:
         a, b = pm.HalfNormal("a", 5), pm.HalfNormal("b", 5)
-        known = pm.Uniform.dist(0, 1 - 1e-9 * a)
-        inputs = pm.Beta.dist(a, b) if population == "beta" else known
+        inputs = pm.Beta.dist(a, b)
         metric = prb.LogLikelihood(error=0.2)
         node = prb.Simulator("y", response, inputs, observed=y, metric=metric)
-    function = model.compile_logp(vars=[node], jacobian=False)
+    function = model.compile_logp(vars=[node], jacobian=False, mode=PLAIN)
     nodes = (np.arange(200_000) + 0.5) / 200_000
     for a_value, b_value in ((1.3, 1.0), (2.0, 2.0)):
         point = {"a_log__": np.log(a_value), "b_log__": np.log(b_value)}
-        at = beta.ppf(nodes, a_value, b_value) if population == "beta" else nodes
+        at = beta.ppf(nodes, a_value, b_value)
         density = norm.pdf(y[:, None], np.sin(at), 0.2).mean(axis=1)
         assert float(function(point)) == pytest.approx(np.log(density).sum(), abs=0.05)
     assert sum(runs) <= 60

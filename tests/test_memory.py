@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
-import subprocess
-import sys
 import tracemalloc
 import weakref
 from typing import Any
@@ -19,28 +16,10 @@ import prbayes as prb
 from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_likelihood import arrays, specimen_likelihoods
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 
 MIB = 1 << 20
-GROWTH = """
-import gc, os, sys
-import test_memory
-
-def resident():
-    gc.collect()
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
-
-call = getattr(test_memory, sys.argv[1])
-for _ in range(5):
-    call()
-before = resident()
-for _ in range(int(sys.argv[2])):
-    call()
-print(resident() - before)
-"""
-linux = pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc here")
 
 
 def build(n: int = 128) -> pm.Model:
@@ -53,24 +32,6 @@ def build(n: int = 128) -> pm.Model:
         }
         prb.Simulator("y", line, x, propagation=prb.Reweighted(n), **keywords)
     return model
-
-
-def minimize_one(made: list[pm.Model] = []) -> None:  # noqa: B006 (one model for all calls)
-    if not made:
-        made.append(build())
-    prb.minimize(made[0], progressbar=False)
-
-
-def grown(what: str, calls: int) -> float:
-    """Return by how many MiB a process grows in so many calls, after a few that fill what is kept."""
-    here = os.path.dirname(__file__)
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([here, os.path.join(here, "helpers")]),
-    }
-    command = [sys.executable, "-c", GROWTH, what, str(calls)]
-    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    return float(found.stdout.split()[-1])
 
 
 def alive() -> int:
@@ -104,19 +65,6 @@ def test_a_design_goes_with_its_model_and_stays_with_what_was_compiled() -> None
     del drawn
     gc.collect()
     assert bound() is None
-
-
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("what", "calls"),
-    [
-        *(("build", 500), ("minimize_one", 500)),
-        *(("build_by_specimen", 100), ("minimize_by_specimen", 100)),
-    ],
-)
-def test_many_calls_grow_by_less_than_twenty_mib(what: str, calls: int) -> None:
-    assert grown(what, calls) < 20
 
 
 def test_the_support_of_many_populations_is_looked_at_in_parts(
@@ -163,17 +111,6 @@ def by_specimen() -> pm.Model:
     return model
 
 
-def minimize_by_specimen(made: list[pm.Model] = []) -> None:  # noqa: B006 (one model for all calls)
-    if not made:
-        made.append(by_specimen())
-    prb.minimize(made[0], progressbar=False)
-
-
-def build_by_specimen() -> None:
-    model = by_specimen()
-    arrays(specimen_likelihoods(model)[model["y"]])  # draws the points
-
-
 @pytest.mark.long
 def test_points_go_with_their_model_and_stay_with_what_was_compiled() -> None:
     model = by_specimen()
@@ -189,19 +126,6 @@ def test_points_go_with_their_model_and_stay_with_what_was_compiled() -> None:
     gc.collect()
     # Not the shared variables: Numba keeps the graphs that PyTensor compiles for it.
     assert points() is None
-
-
-@pytest.mark.long
-def test_shared_variables_of_points_go_with_their_optimum() -> None:
-    model = by_specimen()
-    prb.minimize(model, progressbar=False)
-    (likelihood,) = specimen_likelihoods(model).values()
-    points, log_a = arrays(likelihood)
-    references = [weakref.ref(array) for array in (*points, log_a)]
-    del points, log_a
-    del model, likelihood
-    gc.collect()
-    assert [array() for array in references] == [None, None]
 
 
 @pytest.mark.long

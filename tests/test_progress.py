@@ -170,19 +170,6 @@ def build(**settings: Any) -> pm.Model:
     return model
 
 
-@pytest.mark.long
-def test_a_design_that_grows_shows_its_error(impatient: io.StringIO) -> None:
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        b = pm.Normal.dist(1, pm.HalfNormal("sigma", 0.5))
-        data = {"metric": prb.AreaMetric(), "observed": np.linspace(-1, 3, 20)}
-        propagation = prb.Reweighted(64, emulator=None)
-        prb.Simulator("y", lambda a, b: a * b, a, b, **data, propagation=propagation)
-    assert prb.minimize(model, starts=0).n_responses > 64
-    text = " ".join(impatient.getvalue().split())
-    assert "0.1 are wanted" in text
-
-
 @pytest.mark.parametrize("visible", [True, False])
 def test_everything_inside_the_sampler_follows_its_keyword(
     impatient: io.StringIO, visible: bool

@@ -6,11 +6,7 @@ Examples are the same in every run. PRBAYES_EXAMPLES=500 makes more of them.
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-from dataclasses import dataclass
 from itertools import pairwise
-from math import fsum
 from typing import Any
 
 import numpy as np
@@ -18,13 +14,11 @@ import pymc as pm
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from scipy.special import ndtr
 from scipy.stats import wasserstein_distance
 
 import prbayes as prb
-from prbayes._stats import distribution_function, quantile, reached
+from prbayes._stats import quantile, reached
 from prbayes._validate import Floats
-from prbayes.metrics.density import likelihood_bandwidth, twice_silverman
 from prbayes.model.evaluator import Evaluator, compiled_objective
 from prbayes.model.parameters import unconstrained
 from prbayes.propagation.base import discrepancy_error
@@ -58,87 +52,7 @@ def samples(draw: st.DrawFn, smallest: int = 1) -> tuple[Floats, Floats]:
     return values, raw / raw.sum()
 
 
-@st.composite
-def spread_samples(draw: st.DrawFn) -> tuple[Floats, Floats]:
-    """Draw values of which some differ, and have weight."""
-    values, weights = draw(
-        samples(smallest=2).filter(lambda drawn: np.ptp(drawn[0][drawn[1] > 0]) > 0)
-    )
-    return values, weights
-
-
 # -- Plain sums ------------------------------------------------------------------------------------
-
-
-def below(values: Floats, weights: Floats, z: float) -> float:
-    return fsum(w for x, w in zip(values, weights, strict=True) if x <= z)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Nodes at a quarter of a bandwidth over the observed values and their margins."""
-
-    h: float
-    low: float
-    n: int
-
-    @classmethod
-    def over(cls, observed: Floats, weights: Floats, rule: Any) -> Grid:
-        observed, weights = observed[weights > 0], weights[weights > 0]
-        h = rule(observed, weights)
-        margin = max(6 * h, np.ptp(observed) / 2)
-        low = observed.min() - margin
-        return cls(h, low, int(np.ceil((observed.max() + margin - low) / (h / 4))) + 1)
-
-    def density(self, x: Floats, w: Floats) -> tuple[Floats, Floats]:
-        """Return the sum of kernels at the nodes, and what of them is below and above their cells."""
-        step = self.h / 4
-        nodes = self.low + step * np.arange(self.n)
-        u = (nodes[:, None] - x) / self.h
-        kernels = np.exp(-0.5 * u**2) / (self.h * np.sqrt(2 * np.pi))
-        below = ndtr((nodes[0] - step / 2 - x) / self.h)
-        above = ndtr((x - nodes[-1] - step / 2) / self.h)
-        return kernels @ w, np.array([below @ w, above @ w])
-
-    def holds(self, x: Floats) -> Any:
-        """Return which values have four nodes around them."""
-        step = self.h / 4
-        return (x >= self.low + step) & (x < self.low + step * (self.n - 2))
-
-    def both(self, x: Floats, w: Floats) -> tuple[Floats, Floats]:
-        """Return densities on all cells, the mass outside as one kernel's, and the widths."""
-        cluster = 2 * np.sqrt(np.pi) * self.h
-        inner, outer = self.density(x, w)
-        widths = np.r_[np.full(self.n, self.h / 4), cluster, cluster]
-        return np.r_[inner, outer / cluster], widths
-
-
-def floored(p: Floats, widths: Floats) -> Floats:
-    return (1 - 1e-9) * p + 1e-9 / widths.sum()
-
-
-def plain_residual(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
-    grid = Grid.over(y, v, twice_silverman)
-    p, widths = grid.both(x, w)
-    q, _ = grid.both(y, v)
-    return float(((p - q) ** 2 * widths).sum())
-
-
-def plain_divergence(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
-    grid = Grid.over(y, v, twice_silverman)
-    p, widths = grid.both(x, w)
-    q, _ = grid.both(y, v)
-    p, q = floored(p, widths), floored(q, widths)
-    return float((q * np.log(q / p) * widths).sum())
-
-
-def plain_likelihood(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
-    grid = Grid.over(y, v, likelihood_bandwidth)
-    h, (_, widths) = grid.h, grid.both(x, w)
-    inside = grid.holds(x)
-    u = (y[:, None] - x[inside]) / h
-    p = np.exp(-0.5 * u**2) @ w[inside] / (h * np.sqrt(2 * np.pi))
-    return float(-(v @ np.log(floored(p, widths))))
 
 
 METRICS = {
@@ -166,34 +80,7 @@ def test_the_area_is_the_first_wasserstein_distance(
     assert float(stored) / scale == pytest.approx(found / scale, rel=1e-12, abs=1e-13)
 
 
-@many
-@given(samples(), spread_samples(), scales)
-def test_metrics_of_densities_are_plain_sums(simulated: Any, observed: Any, scale: float) -> None:
-    (x, w), (y, v) = simulated, observed
-    residual, divergence, likelihood = (
-        METRICS[kind].against(scale * y, v) for kind in ("PR", "KLD", "log-likelihood")
-    )
-    h = Grid.over(y, v, twice_silverman).h
-    # The density is right to 3e-5 of a kernel's peak, on a range of some bandwidths.
-    found = residual(scale * x, w) / residual.scale_factor * scale  # type: ignore[attr-defined]
-    assert found == pytest.approx(plain_residual(x, w, y, v), rel=1e-3, abs=1e-6 / h)
-    # Of densities down to the floor, where an error of 3e-5 of a peak is large.
-    found = divergence(scale * x, w)
-    assert found == pytest.approx(plain_divergence(x, w, y, v), rel=0.02, abs=2e-3)
-    found = likelihood(scale * x, w) - np.log(scale)
-    assert found == pytest.approx(plain_likelihood(x, w, y, v), rel=0.02, abs=0.02)
-
-
 # -- Weighted samples ------------------------------------------------------------------------------
-
-
-@many
-@given(samples(), st.lists(numbers, min_size=1, max_size=5), scales)
-def test_distribution_functions_are_plain_sums(sample: Any, points: Any, scale: float) -> None:
-    values, weights = sample
-    found = distribution_function(scale * values, weights, scale * np.array(points))
-    expected = [below(scale * values, weights, scale * z) for z in points]
-    assert found == pytest.approx(expected, abs=1e-14)
 
 
 @many
@@ -320,11 +207,3 @@ def test_three_propagations_agree_and_gradients_are_differences(problem: dict[st
     for i, k in ((0, 1), (0, 2), (1, 2)):
         allowed = 5 * np.hypot(errors[i], errors[k]) + 0.002 * scale
         assert abs(found[i] - found[k]) < allowed, (found, errors)
-
-
-@pytest.mark.slow
-def test_all_of_this_holds_for_many_examples() -> None:
-    more = os.environ | {"PRBAYES_EXAMPLES": "100"}
-    here = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-x", "-m", "not slow", __file__]
-    done = subprocess.run(here, env=more, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout

@@ -69,16 +69,6 @@ def test_a_named_model_has_named_results() -> None:
     assert set(prb.minimize(named(), starts=0, progressbar=False).point) == names
 
 
-def test_a_potential_bounds_the_draws() -> None:
-    model = build()
-    with model:
-        pm.Potential("above", pm.math.switch(model["a"] > 0.95, 0.0, -np.inf))
-    found = draws(model)["a"].values
-    assert found.min() > 0.95
-    # Without it, about a third of 40 draws are below: four standard errors.
-    assert np.mean(draws(named())["outer::a"].values < 0.95) > 0.05
-
-
 def test_global_random_states_are_left_alone() -> None:
     before = np.random.get_state()[1].tolist(), random.getstate()  # noqa: NPY002
     draws(build())
@@ -93,13 +83,6 @@ def test_starting_values_are_the_users_and_cost_no_response() -> None:
     assert len(CALLS) == before
     assert point["a"] == 0.75
     assert np.exp(point["b_log__"]) == pytest.approx(0.5)
-
-
-def test_one_number_is_no_sample() -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("a", 0, 1), 1.0)
-        with pytest.raises(ValueError, match=r"s: observed: got an array of shape \(\), expected"):
-            prb.Simulator("s", response, x, metric=prb.AreaMetric(), observed=5.0)
 
 
 def test_a_simulator_above_another_is_refused_before_its_response_is_computed() -> None:

@@ -76,7 +76,7 @@ def test_chunks_of_any_size_on_threads_give_the_same_bits(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["processes", "loky", "dask"])
-@pytest.mark.parametrize("response", [prb.scalar(one), many, uneven], ids=["one", "many", "uneven"])
+@pytest.mark.parametrize("response", [prb.scalar(one), uneven], ids=["one", "uneven"])
 @pytest.mark.parametrize("name", PROPAGATIONS)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_executors_give_the_same_bits(name: str, response: Any, where: str, tmp_path: Path) -> None:

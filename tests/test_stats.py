@@ -61,13 +61,6 @@ def test_infinite_values_are_above_all_points_and_nan_above_them() -> None:
     np.testing.assert_allclose(found, [0.1, 0.4, 0.4, 0.6, 1.0], rtol=1e-14)
 
 
-def test_a_value_of_weight_zero_changes_nothing() -> None:
-    x, w = sample(3)
-    at = np.linspace(-2, 2, 9)
-    found = distribution_function(np.append(x, at), np.append(w, np.zeros(9)), at)
-    np.testing.assert_array_equal(found, distribution_function(x, w, at))
-
-
 def test_both_steps_work_on_symbols_too() -> None:
     x, w = sample(6, 2)
     w = w + 0.01  # the smallest value's too
@@ -83,7 +76,6 @@ def test_both_steps_work_on_symbols_too() -> None:
     assert (cumulated(w, order)[:, 0] == 0).all()
 
 
-# -- quantiles
 # --------------------------------------------------------------------------------------
 
 
@@ -94,13 +86,6 @@ def test_with_equal_weights_quantiles_are_hazens(n: int) -> None:
     expected = np.quantile(x, levels, method="hazen")
     found = quantile(x, np.full(n, 1 / n), levels)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
-
-
-def test_quantiles_by_hand() -> None:
-    # Steps at 0, 1, 3 of heights .2, .6, .2 have their middles at .1, .5, .9.
-    x, w = np.array([3.0, 0.0, 1.0]), np.array([0.2, 0.2, 0.6])
-    levels = [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
-    np.testing.assert_allclose(quantile(x, w, levels), [0, 0, 0.5, 1, 2, 3, 3], atol=1e-12)
 
 
 def test_quantiles_of_batches_are_those_of_each_row() -> None:
@@ -126,15 +111,7 @@ def test_quantiles_of_infinite_values_and_of_nan() -> None:
     assert np.isnan(quantile(np.array([NAN, 0, 1]), third, 0.6))
 
 
-# -- where a running sum reaches a level
 # ------------------------------------------------------------
-
-
-def test_the_first_index_at_which_the_sum_reaches_a_level() -> None:
-    w = np.array([0.25, 0.0, 0.25, 0.5])
-    found = reached(w, np.array([0.0, 0.25, 0.26, 0.5, 0.51, 1.0, 1.1]))
-    np.testing.assert_array_equal(found, [0, 0, 2, 2, 3, 3, 3])
-    assert found.dtype == np.intp
 
 
 def test_levels_are_shares_of_the_sum_if_asked() -> None:

@@ -78,15 +78,7 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("factor", [1e-6])
-@pytest.mark.parametrize(
-    "kind",
-    [
-        # Derivatives, and none: the others are slow.
-        kind if kind in ("PR", "area") else pytest.param(kind, marks=pytest.mark.slow)
-        for kind in METRICS
-        if kind != "one's own"
-    ],
-)
+@pytest.mark.parametrize("kind", ["PR", "area"])  # with derivatives, and without
 def test_answers_do_not_depend_on_the_unit_of_the_response(kind: str, factor: float) -> None:
     expected, found = answers(kind, 1.0), answers(kind, factor)
     for name, value in expected.items():

@@ -18,12 +18,3 @@ def test_a_few_of_each_attack_are_survived(name: str, tmp_path: Path) -> None:
     found = Counter(attack(tmp_path, np.random.default_rng(3), n))
     assert found.total() == n
     assert set(found) <= allowed(name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ATTACKS)
-def test_many_of_each_attack_are_survived(name: str, tmp_path: Path) -> None:
-    attack, n = ATTACKS[name]
-    found = Counter(attack(tmp_path, np.random.default_rng(4), 20 * n))
-    assert found.total() == 20 * n
-    assert set(found) <= allowed(name)

@@ -102,15 +102,6 @@ def losing_a_worker(seconds: float) -> Iterator[Executor]:
         assert pids[0] not in client.run(os.getpid).values()
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
-def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
-    with losing_a_worker(0.6) as executor:
-        assert capacity(executor) == (2, 4)  # of the cluster, not of this machine
-        model = build(executor=executor, store=tmp_path)
-    all_there(model, tmp_path)
-
-
 # -- models of other programs ----------------------------------------------------------------------
 
 

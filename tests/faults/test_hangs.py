@@ -46,9 +46,13 @@ def by_fmu(folder: Path) -> Iterator[prb.scalar]:
     yield prb.scalar(lambda x: unit.function(1000.0 if x == 3 else x) / 1.5 * 2)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
-    "adapter", [by_command, by_umbridge, pytest.param(by_fmu, marks=pytest.mark.slow)]
+    "adapter",
+    [
+        pytest.param(by_command, marks=pytest.mark.long),
+        pytest.param(by_umbridge, marks=pytest.mark.long),
+        pytest.param(by_fmu, marks=pytest.mark.slow),
+    ],
 )
 def test_a_model_that_never_returns_costs_its_specimen_without_workers_in_processes(
     adapter: object, tmp_path: Path

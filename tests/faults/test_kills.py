@@ -72,11 +72,11 @@ def killed(folder: Path, kind: str, at: int) -> str:
     return out
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "at"),
     [
-        ("refined", 60),  # in the second stage, after the design grew from 32 responses
+        # In the second stage, after the design grew from 32 responses.
+        pytest.param("refined", 60, marks=pytest.mark.long),
         pytest.param("reweighted", 40, marks=pytest.mark.slow),
         pytest.param("resimulated", 200, marks=pytest.mark.slow),
     ],

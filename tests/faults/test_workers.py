@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from concurrent.futures import (
     BrokenExecutor,
@@ -34,20 +33,27 @@ def by_input(tally: Tally) -> dict[float, str]:
 
 # -- hostile responses -----------------------------------------------------------------------------
 
-SLOW = pytest.mark.slow
+
+def long(where: str) -> Any:
+    return pytest.param(where, marks=pytest.mark.long)
+
+
+def slow(where: str) -> Any:
+    """Return an executor whose losses are those of processes; by hand alone."""
+    return pytest.param(where, marks=pytest.mark.slow)
+
+
 NEEDED = {"loky": "joblib.externals.loky", "dask": "distributed"}
 
 
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 @pytest.mark.parametrize(
-    "where",
-    ["nothing", "threads", "processes", pytest.param("loky", marks=SLOW), pytest.param("dask", marks=SLOW)],
-)  # fmt: skip
+    "where", [*map(long, ("nothing", "processes")), *map(slow, ("loky", "dask"))]
+)
 def test_hostile_responses_cost_their_points(
     where: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    safe = where in ("nothing", "threads")
+    safe = where == "nothing"
     limit = 6.0 if where == "dask" else 0.4
     if where in NEEDED:
         pytest.importorskip(NEEDED[where])
@@ -86,16 +92,6 @@ def test_hostile_responses_cost_their_points(
     assert len(caplog.text) < 20_000
 
 
-@pytest.mark.parametrize("result", [[[1], [1, 2]], object(), 1j, np.ones((3, 2000, 1000))])
-@pytest.mark.parametrize("where", ["nothing", "threads"])
-def test_what_is_no_response_ends_the_run_with_a_sentence(where: str, result: Any) -> None:
-    with (
-        EXECUTORS[where]() as executor,
-        pytest.raises(ResponseError, match=r"^y: the response returned .*expected"),
-    ):
-        respond(CallSettings("y", lambda x: result, executor, None, Replace()), line(3), Tally())
-
-
 def test_a_failure_that_cannot_say_what_it_is_is_told() -> None:
     class Mute(Exception):  # noqa: N818
         def __str__(self) -> str:
@@ -131,9 +127,8 @@ def test_a_response_that_changes_its_arguments_changes_nothing_else(where: str, 
         np.testing.assert_array_equal(respond(calling, points, Tally()), expected)
 
 
-@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
-@pytest.mark.parametrize("where", ["processes", pytest.param("loky", marks=SLOW)])
+@pytest.mark.parametrize("where", [long("processes"), slow("loky")])
 def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so(
     where: str, tmp_path: Path
 ) -> None:
@@ -243,25 +238,3 @@ def test_an_executor_that_is_closed_meanwhile_is_reported_and_nothing_finished_i
     # It is closed for good.
     with pytest.raises(ResponseError, match=r"y: the executor failed \(RuntimeError: cannot sche"):
         respond(CallSettings("y", twice, pool, store, Replace()), points, Tally())
-
-
-# -- Dask on the loopback interface ------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
-@pytest.mark.parametrize("what", ["client", "cluster"])
-def test_a_cluster_that_is_closed_is_an_error_and_no_hang(what: str) -> None:
-    def slow(x: float) -> float:
-        time.sleep(0.2)
-        return 2 * x
-
-    with EXECUTORS["dask"]() as executor:
-        client = executor._client  # type: ignore[attr-defined]
-        closing = threading.Timer(1.0, getattr(client, what, client).close)
-        closing.start()
-        with pytest.raises(
-            ResponseError, match=r"y: (the executor (was closed|failed)|a worker was lost) "
-        ):
-            respond(CallSettings("y", prb.scalar(slow), executor), line(600), Tally())
-        closing.join()

@@ -15,6 +15,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -43,6 +44,7 @@ class Module:
     name: str
     path: str
     tree: ast.Module
+    nodes: tuple[ast.AST, ...]  # of the tree, in the order of `ast.walk`
 
 
 @dataclass(frozen=True)
@@ -53,20 +55,26 @@ class Figure:
     places: tuple[str, ...] = ()
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a file, which several tests read."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def read(package: Path) -> list[Module]:
     """Return the modules of a package, sorted by path."""
     modules = []
     for path in sorted(package.rglob("*.py")):
         relative = path.relative_to(package.parent)
         name = ".".join(relative.with_suffix("").parts).removesuffix(".__init__")
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        modules.append(Module(name, relative.as_posix(), tree))
+        tree = parsed(path)
+        modules.append(Module(name, relative.as_posix(), tree, tuple(ast.walk(tree))))
     return modules
 
 
-def functions(tree: ast.AST) -> Iterator[Function]:
-    """Yield all functions and methods of a syntax tree, nested ones included."""
-    for node in ast.walk(tree):
+def functions(module: Module) -> Iterator[Function]:
+    """Yield all functions and methods of a module, nested ones included."""
+    for node in module.nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node
 
@@ -83,7 +91,7 @@ def vague_names(modules: Sequence[Module]) -> Figure:
     by_name: Counter[str] = Counter()
     by_file: Counter[str] = Counter()
     for module in modules:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
                 n_assigned += 1
                 if node.id in VAGUE_NAMES:
@@ -111,7 +119,7 @@ def longest_call_chain(modules: Sequence[Module]) -> Figure:
     n_definitions: Counter[str] = Counter()
     calls: dict[str, set[str]] = defaultdict(set)
     for module in modules:
-        for function in functions(module.tree):
+        for function in functions(module):
             n_definitions[function.name] += 1
             calls[function.name] |= called_names(function)
     unique = {n for n, count in n_definitions.items() if count == 1 and not n.startswith("__")}
@@ -156,7 +164,7 @@ def largest_class(modules: Sequence[Module]) -> Figure:
     """Return the number of methods, properties and fields of the largest class."""
     sizes = []
     for module in modules:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.ClassDef):
                 names = {
                     member.name
@@ -198,7 +206,7 @@ def density(modules: Sequence[Module]) -> Figure:
     n_nodes = n_lines = 0
     by_file = []
     for module in modules:
-        counts = [nodes_and_lines(function) for function in functions(module.tree)]
+        counts = [nodes_and_lines(function) for function in functions(module)]
         nodes = sum(count for count, _ in counts)
         lines = sum(count for _, count in counts)
         n_nodes += nodes
@@ -211,7 +219,7 @@ def longest_function(modules: Sequence[Module]) -> Figure:
     """Return the number of lines of the longest function body, its docstring excluded."""
     sizes = []
     for module in modules:
-        for function in functions(module.tree):
+        for function in functions(module):
             body = body_without_docstring(function)
             if body:
                 n_lines = (body[-1].end_lineno or 0) - body[0].lineno + 1
@@ -223,7 +231,7 @@ def most_parameters(modules: Sequence[Module]) -> Figure:
     """Return the largest number of parameters of a function, ``*args`` and ``**kwargs`` excluded."""
     sizes = []
     for module in modules:
-        for function in functions(module.tree):
+        for function in functions(module):
             arguments = function.args
             parameters = arguments.posonlyargs + arguments.args + arguments.kwonlyargs
             sizes.append((len(parameters), f"{module.path}:{function.name}"))
@@ -235,7 +243,7 @@ def private_functions(modules: Sequence[Module]) -> Figure:
     n_private = n_public = 0
     by_file = []
     for module in modules:
-        names = [f.name for f in functions(module.tree) if not f.name.startswith("__")]
+        names = [f.name for f in functions(module) if not f.name.startswith("__")]
         private = sum(name.startswith("_") for name in names)
         n_private += private
         n_public += len(names) - private
@@ -246,7 +254,7 @@ def private_functions(modules: Sequence[Module]) -> Figure:
 def imported_modules(module: Module, names: set[str]) -> set[str]:
     """Return the modules of the package, out of ``names``, that a module imports."""
     imported: set[str] = set()
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 submodule = f"{node.module}.{alias.name}"
@@ -288,7 +296,7 @@ def type_switches(modules: Sequence[Module]) -> Figure:
     places = []
     for module in modules:
         defined = {node.name for node in module.tree.body if isinstance(node, ast.ClassDef)}
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
                 continue
             if node.func.id == "isinstance" and len(node.args) > 1:

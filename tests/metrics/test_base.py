@@ -12,7 +12,6 @@ from scipy.stats import norm
 
 from prbayes._validate import Floats
 from prbayes.metrics import density
-from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.density import GaussianKDE, overlap
 from prbayes.metrics.divergence import KullbackLeibler
@@ -114,14 +113,6 @@ def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric) 
     np.testing.assert_allclose(by_basis(d, failed, rows), d(failed, rows), rtol=1e-9, atol=1e-12)
     other = d.with_observed(np.append(x, INF), np.append(0.8 * w, 0.2))
     assert np.isfinite(other(failed, rows)).all()
-
-
-OK = [0.0, 1.0, 3.0]
-
-
-def test_bad_weights_of_observed_values_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^observed weights: got"):
-        AreaMetric()(OK, OK, observed_weights=[OK, OK])
 
 
 # -- the floor of logarithms -----------------------------------------------------------------------

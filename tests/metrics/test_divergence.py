@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from metric_samples import draw, normal
+from metric_samples import normal
 from scipy.stats import norm
 
 from prbayes._validate import Floats
@@ -45,16 +45,6 @@ def test_normal_densities(m: float, s: float, mu: float, sd: float, a: float, h:
         np.log(2 * np.pi * vp) / 2 + (a**2 * sd**2 + d**2) / (2 * vp),
     ]
     np.testing.assert_allclose(found, expected, rtol=3e-3)
-
-
-@pytest.mark.parametrize(("seed", "h"), [(0, 0.2), (1, 1.0), (3, 0.2)])
-def test_residual_is_a_squared_maximum_mean_discrepancy(seed: int, h: float) -> None:
-    x, w, z, u = draw(seed, 5 + 3 * seed, 9)
-    x = np.clip(x, z.min() - h / 2, z.max() + h / 2)  # well inside the grid
-    y, v = np.r_[x, z], np.r_[w, -u]
-    d = prepared(ProbabilityResidual(GaussianKDE(h)), z, u)
-    expected = d.scale_factor * v @ norm.pdf(y, y[:, None], np.sqrt(2) * h) @ v
-    np.testing.assert_allclose(d(x, w), expected, rtol=1e-4)
 
 
 def test_with_a_histogram_they_are_sums_over_bins() -> None:

@@ -43,17 +43,6 @@ def test_kde_is_the_exact_sum_of_gaussians_to_a_few_parts_in_1e5(n: int, bandwid
     np.testing.assert_allclose(cells.density(x, w)[:-2], exact, rtol=0, atol=3e-5 * exact.max())
 
 
-def test_kde_has_the_exact_mass_mean_and_variance() -> None:
-    x, w = draw(0, 9)
-    cells = kernel_cells(observed=np.array([-5.0, 5.0]))
-    mass = cells.density(x, w) * cells.widths
-    mean = w @ x
-    np.testing.assert_allclose(mass.sum(), 1, rtol=1e-10)
-    np.testing.assert_allclose(mass[:-2] @ cells.centers, mean, rtol=1e-10, atol=1e-10)
-    variance = mass[:-2] @ (cells.centers - mean) ** 2
-    np.testing.assert_allclose(variance, w @ (x - mean) ** 2 + H**2, rtol=1e-9)
-
-
 @both
 def test_mass_outside_goes_to_the_last_two_cells_and_nan_nowhere(estimator: Any) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
@@ -179,17 +168,6 @@ def test_kernel_reading_is_exact_up_to_parabolas(function: Callable[[Floats], Fl
     outside = cells.reading(np.array([-99.0, 99.0]), np.array([0.2, 0.8]))
     np.testing.assert_array_equal(outside[-2:], [0.2, 0.8])
     assert (outside[:-2] == 0).all()
-
-
-def test_histogram_reading_is_the_mass_in_each_bin() -> None:
-    cells = Histogram(6).cells(OBSERVED, EQUAL)
-    points, w = draw(3, 12)
-    cell = np.clip(np.floor((points + 2.0) / (4.1 / 6)), -1, 6).astype(int)
-    values = np.random.default_rng(4).normal(size=8)  # below is cell 6, above is cell 7
-    expected = w @ values[np.where(cell < 0, 6, np.where(cell == 6, 7, cell))]
-    np.testing.assert_allclose(cells.reading(points, w) @ values, expected, rtol=1e-12)
-    rows = np.stack([w, w[::-1]])
-    np.testing.assert_allclose(cells.reading(points, rows)[0] @ values, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("bins", [1, 7, 50])

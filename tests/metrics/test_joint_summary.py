@@ -125,19 +125,6 @@ def test_outputs_that_are_independent_have_the_sum_of_their_likelihoods() -> Non
         assert target(y) == pytest.approx(sum(members), abs=1e-5)
 
 
-def test_one_output_has_the_likelihood_of_its_sheet() -> None:
-    target = target_of(ALL[0])
-    assert target(POINTS[:, :1]) == pytest.approx(float(target.members[0](POINTS[:, 0])))
-
-
-def test_high_quantiles_go_with_a_high_mean_of_a_correlated_output() -> None:
-    quartiles = prb.Summary(n=20, quantiles={0.25: -0.37, 0.75: 0.97})
-    target = target_of(prb.Summary(n=20, mean=0.3), quartiles)
-    second = 0.9 * POINTS[:, 0] + np.sqrt(0.19) * POINTS[:, 1]
-    along = np.stack([POINTS[:, 0], second], axis=-1)
-    assert target(along) < target(along * [1, -1]) - 0.02
-
-
 def test_scores_of_order_statistics_are_standard_normal() -> None:
     """For 200 data sets of the population, within five standard errors and the kernel's effect."""
     rng = np.random.default_rng(2)

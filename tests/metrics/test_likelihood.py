@@ -57,24 +57,6 @@ def test_the_kernel_form_needs_a_density() -> None:
             metric.against(observed)
 
 
-@pytest.mark.parametrize("far", [-12.0, 60.0])
-def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(far: float) -> None:
-    rng = np.random.default_rng(3)
-    observed, simulated = rng.normal(size=30), rng.normal(size=2000)
-    with_outlier = np.append(observed, far)
-    inner, direct = prepared(GaussianKDE(0.3), observed), prepared(GaussianKDE(0.3), with_outlier)
-    refitted = inner.with_observed(with_outlier)
-    # The floor is spread over grids of two lengths.
-    lengths = [d.cells.widths.sum() for d in (inner, direct)]
-    per_value = abs(np.log(lengths[1] / lengths[0])) / with_outlier.size
-    assert abs(refitted(simulated) - direct(simulated)) < per_value + 1e-4
-    # And not better than without it.
-    assert refitted(simulated) > inner(simulated) + 0.5
-    # From weights of stored values just the same.
-    features = refitted.basis(simulated).features(np.full(2000, 1 / 2000))
-    np.testing.assert_allclose(refitted.outer(*features, xp=np), refitted(simulated), rtol=1e-9)
-
-
 @pytest.mark.parametrize("spread", [0.7, 2.0])
 def test_no_value_beyond_the_grid_improves_the_likelihood(spread: float) -> None:
     simulated = spread * norm.ppf((np.arange(2000) + 0.5) / 2000)

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
-from scipy.stats import norm, qmc
 
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric, is_additive, is_likelihood
-from prbayes.metrics.custom import FunctionMetric
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
@@ -154,48 +150,6 @@ def test_a_wrong_correlation_counts_where_marginals_are_right(metric: Metric) ->
     if metric.distance:
         assert d(d.observed) == pytest.approx(0, abs=1e-12)
         assert right > 1e-3
-
-
-def test_gross_outliers_move_the_minimiser_under_the_residual_and_more_under_the_area() -> None:
-    points = norm.ppf(qmc.Sobol(2, seed=0).random_base2(7))
-    y = sample(200, rho=0.6)
-    spoiled = y.copy()
-    spoiled[:10] = 40.0
-
-    def fitted(metric: Metric, observed: Floats) -> Floats:
-        d = Joint(metric).against(observed)
-
-        def population(t: Floats) -> Floats:
-            factor = np.array([[np.exp(t[2]), 0.0], [t[4], np.exp(t[3])]])
-            return np.asarray(t[:2] + points @ factor.T)
-
-        start = [0.0, 0.0, 0.0, np.log(0.8), 0.6]
-        return np.asarray(minimize(lambda t: d(population(t)), start, method="BFGS").x)
-
-    residual, area = (fitted(LIFTED[k], spoiled) - fitted(LIFTED[k], y) for k in ("pr", "area"))
-    # In standard deviations; a twentieth of the sample would move the mean by two.
-    assert np.abs(residual[:2]).max() < 0.05 < 0.1 < np.abs(area[:2]).min()
-    assert np.abs(residual).max() < 0.1
-    assert 2 * np.linalg.norm(residual) < np.linalg.norm(area) < 0.4
-
-
-def energy(x: Floats, y: Floats, size: Callable[[Floats], Floats] = np.abs) -> Floats:
-    """The energy distance of samples (..., n) or, with a norm, (n, m)."""
-
-    def apart(a: Floats, b: Floats) -> Any:
-        return size(a[..., :, None] - b[..., None, :]).mean(axis=(-1, -2))
-
-    return np.asarray(2 * apart(x, y) - apart(x, x) - apart(y, y))
-
-
-def test_the_mean_energy_distance_of_projections_is_that_of_the_outputs() -> None:
-    x, y = sample(40), sample(30, rho=0.5, seed=1)
-    d = Joint(FunctionMetric(energy), directions=200).against(y)
-    # In two whitened outputs: two projections at right angles are all of them.
-    first, last = d.parts[0], d.parts[100]
-    a, b = (np.stack([first.of(v), last.of(v)]) for v in (x, y))
-    whole = energy(a, b, lambda difference: np.asarray(np.hypot(*difference)))
-    assert d(x) == pytest.approx(2 / np.pi * float(whole), rel=1e-4)
 
 
 def test_projections_of_the_residual_have_one_factor() -> None:

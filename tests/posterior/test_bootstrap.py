@@ -33,18 +33,17 @@ def fit(name: str, propagation: Any = R256) -> prb.Optimum:
     )
 
 
-@pytest.mark.parametrize("name", [pytest.param("ll", marks=pytest.mark.slow), "kl"])
 @pytest.mark.parametrize("parametric", [False, True])
-def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> None:
+def test_standard_deviations_of_a_normal_mean(parametric: bool) -> None:
     """The Dirichlet weighted variance is s^2 / (N + 1), the sampling variance 0.5^2 / N."""
-    result = prb.bootstrap(fit(name), 1000, parametric=parametric)
+    result = prb.bootstrap(fit("kl"), 1000, parametric=parametric)
     draws = result.posterior["mu"]
     assert draws.shape == (1, 1000)
     # 1000 draws: 2.2%; the mean is not quite the minimiser, nor these data normal: 6%.
     expected = 0.5 / N**0.5 if parametric else SD / (N + 1) ** 0.5
     np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.022 + 0.06)
     assert abs(0.5 / SD - 1) > 0.1  # the two are different
-    offset = abs(float(draws.mean()) - fit(name).point["mu"])
+    offset = abs(float(draws.mean()) - fit("kl").point["mu"])
     assert offset < (4 / 1000**0.5 + 0.05) * expected
     assert result.posterior.attrs["converged"] == 1.0
     kind = "parametric" if parametric else "loss-likelihood"
@@ -62,19 +61,12 @@ def test_few_specimens_are_a_finding_of_the_draws() -> None:
     assert prb.bootstrap(fit("kl"), 10).posterior.attrs["findings"] == "[]"
 
 
-@pytest.mark.parametrize("name", ["pr", "area"])
-def test_the_parametric_bootstrap_agrees_with_the_standard_error(name: str) -> None:
-    # One by refitting, one to first order: 2.2% and 5% of sampling error, and curvature.
-    draws = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=3).posterior["mu"]
-    np.testing.assert_allclose(float(draws.std()), fit(name).stderr["mu"], rtol=0.2)
-
-
 def breaking(x: Any) -> Any:
     """Return the load at which a specimen was measured; the strong ones break the machine."""
     return np.where(x > 1.6, np.inf, x)
 
 
-@pytest.mark.parametrize("name", sorted(METRICS))
+@pytest.mark.parametrize("name", ["area", "ll"])
 def test_where_specimens_fail_the_refits_are_around_the_optimum(name: str) -> None:
     specimens = breaking(1 + 0.5 * norm.ppf((np.arange(40) + 0.5) / 40))
     assert np.isinf(specimens).sum() == 5

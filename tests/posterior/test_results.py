@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import arviz as az
-import matplotlib as mpl
 import numpy as np
 import pymc as pm
 import pytest
@@ -144,20 +143,6 @@ def test_trees_survive_storage(make: Any, tmp_path: Path) -> None:
         loaded.close()
 
 
-def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
-    best = optimum()
-    heading, *lines = repr(best).splitlines()
-    assert heading.startswith(f"Optimum: discrepancy {best.discrepancy:.4g} after ")
-    assert heading.endswith("converged")
-    shown = [line.strip().partition(" = ") for line in lines if " ± " in line]
-    assert [name for name, _, _ in shown] == ["mean[north]", "mean[south]", "sigma", "variance"]
-    assert len(lines) == len(shown) + len(best.findings)
-    numbers = np.concatenate([np.ravel(value) for value in best.point.values()])
-    errors = np.concatenate([np.ravel(best.stderr[name]) for name in best.point])
-    expected = [f"{x:.4g} ± {error:.4g}" for x, error in zip(numbers, errors, strict=True)]
-    assert [text for _, _, text in shown] == expected
-
-
 # -- groups for ArviZ
 
 
@@ -204,33 +189,18 @@ def test_the_likelihood_of_the_draws_times_the_prior_is_their_density() -> None:
     assert abs(centre - optimum.point["mu"]) < sd
 
 
-def labelled_and_two() -> xr.DataTree:
-    """Return draws of a simulator of two outputs with labels, and of one of other specimens."""
-    coords = {"plate": [f"S{i}" for i in range(20)], "out": ["a", "b"]}
-    with pm.Model(coords=coords) as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 0.2), 0.5)
-        both = np.column_stack([DATA[:20, 0], DATA[:20, 0] ** 2])
-        prb.Simulator(
-            "two", lambda x: np.stack([x, x**2], axis=-1), x,
-            metric=prb.Joint(AREA), observed=both, dims=("plate", "out"), epsilon=0.1,
-        )  # fmt: skip
-        prb.Simulator("y", lambda x: x, x, metric=AREA, observed=DATA[:, 0], epsilon=0.1)
-    return prb.sample_smc(20, chains=2, model=model, adjustment=None, **QUIET)
-
-
 def test_one_number_is_not_taken_for_that_of_each_specimen() -> None:
     """It has one place along the specimens, which ArviZ does not align with all of them."""
-    for tree, names in ((sampled()[2], ["y"]), (labelled_and_two(), ["two", "y"])):
-        places = {tree.observed_data[name].dims[0]: 1 for name in names}
-        for group in tree.log_likelihood.data_vars.values():
-            assert group.sizes == {"chain": 2, "draw": tree.posterior.sizes["draw"]} | places
-        for name in names:
-            with pytest.raises(ValueError, match="conflicting dimension sizes"):
-                az.loo_expectations(tree, var_name=name)
-        for function in (az.loo, az.loo_metrics, az.loo_influence):
-            with pytest.raises((TypeError, ValueError)):
-                function(tree)
-        assert "power-scaling" in tree.log_likelihood.attrs["note"]
+    tree = sampled()[2]
+    places = {tree.observed_data["y"].dims[0]: 1}
+    for group in tree.log_likelihood.data_vars.values():
+        assert group.sizes == {"chain": 2, "draw": tree.posterior.sizes["draw"]} | places
+    with pytest.raises(ValueError, match="conflicting dimension sizes"):
+        az.loo_expectations(tree, var_name="y")
+    for function in (az.loo, az.loo_metrics, az.loo_influence):
+        with pytest.raises((TypeError, ValueError)):
+            function(tree)
+    assert "power-scaling" in tree.log_likelihood.attrs["note"]
 
 
 def test_power_scaling_detects_a_prior_that_counts() -> None:
@@ -310,16 +280,6 @@ def test_responses_that_cost_runs_are_not_computed_for_groups() -> None:
     assert prb.diagnose(tree, model=model).support.sizes["simulator"] == 0
 
 
-def test_arviz_draws_the_tree() -> None:
-    mpl.use("Agg")
-    for plot in (az.plot_trace, az.plot_rank, az.plot_forest):
-        assert list(plot(idata(), backend="matplotlib").viz.children)
-    mpl.pyplot.close("all")
-    summary = az.summary(idata())
-    assert {"r_hat", "ess_bulk"} <= set(summary.columns)
-    assert list(summary.index)[:2] == ["mean[north]", "mean[south]"]
-
-
 # -- selections
 
 
@@ -349,23 +309,6 @@ def test_selected_variables_dimensions_and_groups() -> None:
         assert tree[group].coords["plate"].size == 40
     with pytest.raises(ValueError, match=r"got \[\], expected 1 names"):
         results.selected(tree, None, {"dims": {"second": []}})
-
-
-@pytest.mark.long
-def test_chains_begin_at_their_start(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    prior = {"mean": rng.normal(1, 1, (20, 2)), "sigma": np.abs(rng.normal(size=20))}
-    transformed = {"mean": prior["mean"], "sigma_log__": np.log(prior["sigma"])}
-    path = tmp_path / "run.nc"
-    one = sample(20, start=prior, cores=1, checkpoint=path)
-    both = sample(20, start=[transformed, prior])
-    np.testing.assert_allclose(one.posterior["mean"], both.posterior["mean"], rtol=1e-9)
-    assert not np.isin(one.posterior["mean"], idata().posterior["mean"]).any()
-    with pytest.raises(ValueError, match="start: got 1 dicts, expected one, or 2"):
-        sample(20, start=[prior])
-    for start in (None, {**prior, "mean": prior["mean"] + 1}):
-        with pytest.raises(prb.response.StoreError, match="belongs to another run"):
-            sample(20, start=start, checkpoint=path)
 
 
 @pytest.mark.parametrize(

@@ -73,17 +73,17 @@ def executors() -> Iterator[dict[str, Executor]]:
         yield {"threads": threads, "processes": processes}
 
 
-EXACT = [pytest.mark.exact, pytest.mark.slow]  # other processes do not perturb last digits
-
-
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "response"),
     [
-        pytest.param("threads", bent, id="threads-module"),
-        pytest.param("threads", lambda x: bent(x), id="threads-lambda", marks=pytest.mark.slow),
-        pytest.param("processes", bent, id="processes-module", marks=EXACT),
-        pytest.param("processes", lambda x: x + 0.1 * x**2, id="processes-lambda", marks=EXACT),
+        pytest.param("threads", bent, id="threads", marks=pytest.mark.long),
+        # Other processes do not perturb last digits.
+        pytest.param(
+            "processes",
+            lambda x: x + 0.1 * x**2,
+            id="processes",
+            marks=[pytest.mark.exact, pytest.mark.slow],
+        ),
     ],
 )
 def test_ranks_do_not_depend_on_the_executor(
@@ -243,20 +243,14 @@ def spread(result: xr.DataTree) -> Any:
     return (((ranks - 0.5) ** 2).mean() - 1 / 12) / (180 * ranks.size) ** -0.5
 
 
-@pytest.mark.parametrize(
-    ("factor", "low", "high"),
-    [
-        pytest.param(0.1, 4, np.inf, marks=pytest.mark.long),
-        pytest.param(10, -np.inf, -3, marks=pytest.mark.slow),
-    ],
-)
-def test_wrong_widths_are_detected(factor: float, low: float, high: float) -> None:
+@pytest.mark.long
+def test_a_wrong_width_is_detected() -> None:
     """With a multiple f of epsilon, ranks Phi(z / sqrt(f)) have mean square asin(1/(1+f)) / (2 pi).
 
-    It is .18 for .1, six standard errors of 25 uniform ranks above 1/12, and .014 for 10.
+    It is .18 for .1, six standard errors of 25 uniform ranks above 1/12.
     """
-    found = spread(calibrate(25, build(epsilon=factor / N), draws=50, adjustment=None))
-    assert low < found < high
+    model = build(epsilon=0.1 / N)
+    assert spread(calibrate(25, model, draws=50, adjustment=None)) > 4
 
 
 @pytest.mark.slow

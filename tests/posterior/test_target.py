@@ -12,9 +12,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from normal_posterior import (
-    VAGUE,
     draws_of,
-    exact_moments,
     moments_of,
     normal_model,
     require_close,
@@ -45,9 +43,8 @@ DATA = np.random.default_rng(4).normal(1, 0.5, 20)
 # -- all samplers draw one posterior --
 
 
-@pytest.mark.parametrize("metric", [PR, pytest.param(AREA, marks=pytest.mark.long)])
-def test_both_samplers_draw_the_posterior_given_the_estimate(metric: Metric) -> None:
-    model = normal_model(metric, DATA, n=256)
+def test_both_samplers_draw_the_posterior_given_the_estimate() -> None:
+    model = normal_model(PR, DATA, n=256)
     optimum = prb.minimize(model, starts=0, progressbar=False)
     settings = {"model": model, "optimum": optimum, **QUIET}
     by_importance = prb.sample(500, chains=2, **settings)
@@ -60,14 +57,6 @@ def test_both_samplers_draw_the_posterior_given_the_estimate(metric: Metric) -> 
     # Four standard errors of a difference of means, and of a ratio of widths, of 1000 draws.
     found, expected = moments_of(by_smc.posterior), moments_of(by_importance.posterior)
     require_close(found, expected, offset=0.18, widths=(0.87, 1.15))
-
-
-@pytest.mark.long
-def test_all_samplers_draw_the_posterior_of_the_likelihood() -> None:
-    settings = {"chains": 2, "model": normal_model(prb.LogLikelihood(), DATA), **QUIET}
-    exact = exact_moments(VAGUE.log_density, DATA)
-    for tree in (prb.sample_smc(500, **settings), pm.sample(500, cores=1, **settings)):
-        require_close(moments_of(tree.posterior), exact, offset=0.15, widths=(0.85, 1.15))
 
 
 @pytest.mark.parametrize("sample", [prb.sample, prb.sample_smc])
@@ -99,16 +88,7 @@ def mean_difference(simulated: Any, observed: Any, weights: Any) -> Any:
     return ((weights * simulated).sum(axis=-1) - observed.mean()) ** 2
 
 
-def moment_difference(simulated: Any, observed: Any, weights: Any) -> Any:
-    """Return a distance whose minimiser has the mean and standard deviation of the data."""
-    mean = (weights * simulated).sum(axis=-1)
-    variance = (weights * simulated**2).sum(axis=-1) - mean**2
-    spread = np.sqrt(np.maximum(variance, 1e-12)) - observed.std()
-    return (mean - observed.mean()) ** 2 + spread**2
-
-
 MEAN = prb.FunctionMetric(mean_difference, weighted=True)
-MOMENTS = prb.FunctionMetric(moment_difference, weighted=True)
 
 
 def data(size: int, mean: float = 1.0, seed: int = 0) -> Floats:
@@ -184,27 +164,9 @@ def test_the_seed_determines_the_numbers() -> None:
     assert not np.array_equal(other, logs)
 
 
-@pytest.mark.long
-def test_mean_and_standard_deviation() -> None:
-    """Both are sufficient: the posterior is that of the full data."""
-    y = data(15)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0.8, 0.1), pm.LogNormal("sigma", np.log(0.7), 0.3))
-        simulate(x, observed=y, metric=MOMENTS)
-    draws = posterior(likelihood_of(model))
-
-    def log_prior(mu: Floats, sigma: Floats) -> Floats:
-        log_normal = stats.lognorm(0.3, scale=0.7)
-        return np.asarray(stats.norm.logpdf(mu, 0.8, 0.1) + log_normal.logpdf(sigma))
-
-    exact = exact_moments(log_prior, y)
-    require_normal(draws["mu"], exact.mean[0], exact.sd[0])
-    require_normal(np.log(draws["sigma"]), exact.mean[1], exact.sd[1])
-
-
-# The estimate is .97: the posterior is a normal distribution that is cut off.
-@pytest.mark.parametrize("upper", [0.85, pytest.param(1.2, marks=pytest.mark.long)])
-def test_a_uniform_prior_that_ends_near_the_estimate(upper: float) -> None:
+def test_a_uniform_prior_that_ends_near_the_estimate() -> None:
+    """The estimate is .97: the posterior is a normal distribution that is cut off."""
+    upper = 0.85
     draws = posterior(likelihood_of(mean_model(lambda: pm.Uniform("mu", 0, upper))))["mu"]
     error = SD / np.sqrt(12)
     ends = (np.array([0, upper]) - Y12.mean()) / error
@@ -227,36 +189,20 @@ def test_only_the_sum_is_identified() -> None:
     assert total.std() == pytest.approx(precision**-0.5, rel=0.2)
 
 
-def test_mirror_modes_have_the_weights_of_their_prior() -> None:
-    y = (np.random.default_rng(3).normal(2, 0.3, 20) - 1) ** 2
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
-        propagation = prb.Reweighted(1024)
-        simulate(x, response=lambda x: (x - 1) ** 2, observed=y, propagation=propagation)
-    likelihood = likelihood_of(model, starts=8)
-    assert len(likelihood.centers) == 2
-    share = (posterior(likelihood)["mu"] > 1).mean()
-    assert share == pytest.approx(1 / (1 + np.exp(0.5)), abs=0.06)
-
-
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("metric", "error", "is_uncertain"),
-    [(AREA, 0.1, True), (KLD, 0.05, False), (prb.ProbabilityResidual(), 0.05, False)],
-)
-def test_shares_of_mirror_populations(metric: Metric, error: float, is_uncertain: bool) -> None:
+def test_shares_of_mirror_populations() -> None:
     observed = np.random.default_rng(0).normal(0.9, 0.5, 25) ** 2
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("s", 1))
         prb.Simulator(
-            "y", np.square, x, metric=metric, observed=observed, propagation=prb.Reweighted(256)
+            "y", np.square, x, metric=AREA, observed=observed, propagation=prb.Reweighted(256)
         )
     draws = prb.sample(model=model, **QUIET).posterior
-    assert float((draws["mu"] > 0).mean()) == pytest.approx(0.5, abs=error)
+    assert float((draws["mu"] > 0).mean()) == pytest.approx(0.5, abs=0.1)
     (text,) = [f.text for f in from_json(draws.attrs["findings"]) if f.code == "second-mode"]
     # Eight such data sets were .030 off (root mean square), with a mean standard error of .030.
     pattern = r"\(standard error 0\.0[1-9], because they rest on refits\)"
-    assert bool(re.search(pattern, text)) is is_uncertain
+    assert re.search(pattern, text)
 
 
 @pytest.mark.long
@@ -283,24 +229,6 @@ def test_specimens_that_simulators_share_count_once() -> None:
         simulate(x, observed=Y12, **settings)
         simulate(x, name="z", response=lambda x: 2 * x, observed=2 * Y12, **settings)
     require_normal(posterior(likelihood_of(model))["mu"], Y12.mean(), SD / np.sqrt(12))
-
-
-@pytest.mark.long
-def test_outputs_with_gaps() -> None:
-    """Two outputs, one of which was not measured everywhere; the posterior is near the full one."""
-    y = np.random.default_rng(4).normal([0.5, 1.5], SD, (20, 2))
-    y[15:, 1] = np.nan
-    with pm.Model() as model:
-        inputs = [pm.Normal.dist(pm.Normal(name, 1, 1), SD) for name in "ab"]
-        response = lambda a, b: np.stack([a, b], axis=-1)  # noqa: E731
-        settings = {"metric": prb.Joint(AREA), "propagation": WITHOUT_EMULATOR}
-        simulate(*inputs, response=response, observed=y, **settings)
-    draws = posterior(likelihood_of(model, RefitLikelihoodOptions(n_sets=256)))
-    for name, column in zip("ab", y.T, strict=True):
-        measured = column[np.isfinite(column)]
-        error = SD / np.sqrt(measured.size)
-        assert abs(draws[name].mean() - measured.mean()) < error
-        assert 0.9 < draws[name].std() / error < 1.5
 
 
 def test_an_estimate_at_an_edge_is_refused_with_a_remedy_that_works() -> None:
@@ -332,7 +260,7 @@ def cubic(x: Any) -> Any:
 # all are about a half.
 @pytest.mark.parametrize(
     ("metric", "seed", "share", "error"),
-    [(KLD, 0, 0.13, 0.06), (KLD, 1, 0.988, 0.05), (KLD, 2, 0.005, 0.05), (AREA, 2, 0.005, 0.05)],
+    [(KLD, 0, 0.13, 0.06), (AREA, 2, 0.005, 0.05)],
 )
 def test_modes_that_fit_worse_have_less_of_the_posterior(
     metric: Metric, seed: int, share: float, error: float

@@ -21,12 +21,10 @@ from prbayes.optimize.design_refinement import (
     grow,
     refine_at,
 )
-from prbayes.propagation.base import DesignError
 from prbayes.propagation.design import PoorEmulatorError
 from prbayes.propagation.importance import SIZES, MixtureSampler, mixture_of, spread_over
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
-from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
 
 
@@ -149,26 +147,6 @@ def test_runs_are_added_where_emulators_predict_little(monkeypatch: pytest.Monke
             assert bound.n_runs == runs
 
 
-def test_a_part_of_a_sample_for_a_while() -> None:
-    evaluator, bound = emulated()
-    values, weights = evaluator.populations(THETA, 0)
-    (whole,) = evaluator(THETA).discrepancies
-    rows = bound.blocks == 3
-    with designs_restored([bound]):
-        bound.design = bound.design.rows(rows)
-        part_values, part_weights = evaluator.populations(THETA, 0)
-        expected = weights[:, rows] / weights[:, rows].sum()
-        np.testing.assert_allclose(part_weights, expected, rtol=1e-9)
-        np.testing.assert_array_equal(part_values, values[:, rows])
-        (part,) = evaluator(THETA).discrepancies
-        bound.add(evaluator.parents(THETA, 0), 32)
-        assert bound.n_runs == 96
-    assert 0 < abs(part[0] - whole[0]) < 0.2 * whole[0]
-    assert bound.n_runs == 64
-    np.testing.assert_array_equal(evaluator(THETA).discrepancies[0], whole)
-    np.testing.assert_array_equal(evaluator.populations(THETA, 0)[1], weights)
-
-
 @pytest.mark.long
 def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     errors = {}
@@ -237,20 +215,6 @@ def test_another_response_that_no_emulator_follows_is_predicted_from_the_runs() 
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[1], weights)
 
 
-@pytest.mark.long
-def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
-    optimum = prb.minimize(build(), starts=0, refine=False, progressbar=False)
-    inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
-    with pytest.raises(DesignError, match=r"weight effective sample size of .* stored=False"):
-        prb.predict(optimum, rough, *inputs, n_samples=100, random_seed=1)
-    fresh = prb.predict(optimum, rough, *inputs, n_samples=500, random_seed=1, stored=False)
-    null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
-    before = optimum.evaluator(optimum.theta[None]).discrepancies
-    with pytest.raises(DesignError, match=r"y: .* to the \d+ runs alone"):
-        prb.area_test(np.linspace(-1, 1, 20), fresh, null=null)
-    np.testing.assert_array_equal(optimum.evaluator(optimum.theta[None]).discrepancies, before)
-
-
 def test_a_compiled_discrepancy_has_the_sample_that_was_drawn_last() -> None:
     evaluator, bound = design_of(build())
     before = evaluator(THETA).discrepancies
@@ -284,17 +248,6 @@ def test_the_same_surfaces_are_judged_again_for_other_populations() -> None:
     assert same.error != before.error
     assert fitted.runs is not before.runs
     np.testing.assert_array_equal(fitted.weights, same.weights)
-
-
-def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
-    _, bound = design_of(build(lambda a, b: np.abs(a - 1) + b))
-    spread = [
-        np.abs(values - bound.design.sample.values).max()
-        for values in bound.design.without_each_block()
-    ]
-    assert len(spread) == 8
-    assert min(spread) > 1e-3
-    assert bound.design.runs_alone().without_each_block() == []
 
 
 @pytest.mark.long
@@ -346,17 +299,6 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     draw_samples(evaluator, far, {"two"}, larger=True)
     assert aligned(evaluator.nodes)
     assert {d.n_points for d in evaluator.reweighted.values()} == {2 * SIZES.first}
-
-
-@pytest.mark.slow
-def test_a_sampler_that_was_stopped_continues_with_its_samples(tmp_path: Any) -> None:
-    keywords: dict[str, Any] = {"chains": 1, "random_seed": 1, "progressbar": False}
-    file = tmp_path / "run.nc"
-    whole = prb.sample_smc(20, model=build(known=True), **keywords)
-    with pytest.raises(BudgetError):
-        prb.sample_smc(20, model=build(known=True), checkpoint=file, max_stages=1, **keywords)
-    again = prb.sample_smc(20, model=build(known=True), checkpoint=file, **keywords)
-    np.testing.assert_array_equal(again["posterior"]["ma"], whole["posterior"]["ma"])
 
 
 def test_samples_are_of_populations_that_matter_and_of_the_prior() -> None:

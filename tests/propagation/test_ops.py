@@ -47,22 +47,11 @@ METRICS = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", METRICS)
-def test_the_graph_of_a_metric_agrees_with_its_direct_call(name: str) -> None:
-    sample, weights = pt.dvector(), pt.dvector()
-    graph = symbolic_discrepancy(target(METRICS[name]), sample, weights)
-    compiled = pytensor.function([sample, weights], graph)
-    direct = target(METRICS[name])(SAMPLE, WEIGHTS)
-    assert compiled(SAMPLE, WEIGHTS) == pytest.approx(direct, rel=1e-12)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("name", ["PR", "KLD", "area"])
 def test_gradients_in_values_and_weights_are_those_of_differences(name: str) -> None:
     sample, weights = pt.dvector(), pt.dvector()
     graph = symbolic_discrepancy(target(METRICS[name]), sample, weights)
-    gradient = pytensor.function([sample, weights], pt.grad(graph, [sample, weights]))
+    gradient = pytensor.function([sample, weights], pt.grad(graph, [sample, weights]), mode=PLAIN)
     in_sample, in_weights = gradient(SAMPLE, WEIGHTS)
     direct, step = target(METRICS[name]).of, 1e-6
     for i in range(SAMPLE.size):
