@@ -146,6 +146,16 @@ def test_a_data_sheet_has_the_posterior_that_it_has_alone() -> None:
 
 
 @pytest.mark.long
+def test_a_data_sheet_with_a_metric_of_distributions() -> None:
+    model, _ = built(growth(X["near"]), prb.KullbackLeibler())
+    data = {"near": growth(X["near"]), "sheet": SHEET}
+    tree = prb.calibrate_each(data, model=model, draws=200, **QUIET)
+    got, expected = (t["posterior"]["mu"].sel(product="sheet") for t in (tree, fleet()))
+    assert float(got.mean()) == pytest.approx(float(expected.mean()), abs=0.1)
+    assert prb.population(tree, model=model).sizes["product"] == 2
+
+
+@pytest.mark.long
 def test_a_data_sheet_has_no_individuals() -> None:
     tree = prb.individuals(fleet(), model=template()[0], n_draws=50)
     assert tree["posterior"]["product"].values.tolist() == [*X]
