@@ -40,16 +40,3 @@ def test_an_input_has_the_discrepancies_of_other_draws_or_is_refused(
     case = distributions.CASES[name]
     found = distributions.trial(case, distributions.PROPAGATIONS[propagation], search=False)
     assert found["verdict"] == STORED[name][propagation]["verdict"], found
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("name", distributions.CASES)
-def test_the_whole_table(name: str) -> None:
-    for propagation, verdict in STORED[name].items():
-        found = distributions.trial(
-            distributions.CASES[name], distributions.PROPAGATIONS[propagation]
-        )
-        # PolyaGamma asks for a package that tests do not install.
-        if not (name == "PolyaGamma" and found["verdict"] == "works"):
-            assert found["verdict"] == verdict["verdict"], (propagation, found)

@@ -69,14 +69,14 @@ def test_a_problem_is_whole(name: str) -> None:
         assert len(observed) == size
         assert np.isfinite(observed).all()
         assert np.array_equal(observed, problem.data(size, 0)), "data are the same at every call"
-        reference = problem.reference(size, 0)
-        assert set(reference.center) == set(reference.sd) == set(told)
-        assert min(reference.sd.values()) > 0
         # Populations are simulated in one call, and a run is a specimen.
         response = Response(problem)
         z = rng.standard_normal((3, size, len(problem.inputs)))
         assert response(*problem.population(drawn, z)).shape == (3, *observed.shape)
         assert response.runs == 3 * size
+    reference = problem.reference(problem.sizes[0], 0)
+    assert set(reference.center) == set(reference.sd) == set(told)
+    assert min(reference.sd.values()) > 0
     if problem.replicates > 1:
         assert problem.truth is not None
         assert set(problem.truth) == set(told)
@@ -84,26 +84,22 @@ def test_a_problem_is_whole(name: str) -> None:
     assert problem.licence
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=pytest.mark.slow if n == "growth" else pytest.mark.long)
-        for n, p in PROBLEMS.items()
-        if p.replicates > 1
-    ],
-)
+# Of `growth` a reference takes ten seconds; the centre of the wrong family's is the truth.
+REPLICATED = [n for n, p in PROBLEMS.items() if p.replicates > 1]
+REPLICATED = [name for name in REPLICATED if name not in ("growth", "wrong family")]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", REPLICATED)
 def test_the_reference_is_of_the_data(name: str) -> None:
     # Over twenty data sets the exact posterior has the truth within its spread: the mean of squares
     # is 1 with a standard error of .3, twice that for ends of ranges, which are exponential.
     problem = PROBLEMS[name]
-    if name == "wrong family":
-        return  # its centre is the truth
-    size = problem.sizes[0]
     truth = problem.truth
     assert truth is not None
     squares = []
     for replicate in range(20):
-        reference = problem.reference(size, replicate)
+        reference = problem.reference(problem.sizes[0], replicate)
         squares += [((reference.center[k] - truth[k]) / reference.sd[k]) ** 2 for k in truth]
     assert 0.3 < np.mean(squares) < 2.5
 
@@ -143,15 +139,6 @@ def test_the_folded_density_integrates_to_one() -> None:
 
 
 @pytest.mark.parametrize("dose", growth.DOSES)
-def test_the_density_of_active_receptors_integrates_to_one(dose: float) -> None:
-    share = growth.active_share(np, np.array([0.75, 2.7]), dose)
-    low, high = 6.5e5 * share
-    y = np.linspace(low, high, 2001)
-    log_p = growth.log_density(y, dose, np.array([[6.5e5, 77.0, 1.7, 0.2]]))
-    assert np.trapezoid(np.exp(log_p[0]), y) == pytest.approx(1, abs=1e-5)
-
-
-@pytest.mark.parametrize("dose", growth.DOSES)
 def test_active_receptors_are_those_of_the_rate_equations(dose: float) -> None:
     k1, gain = 1.7, growth.UNBINDING + growth.INTERNALISATION
     # With a constant third state, whose product with the degradation rate is the production.
@@ -162,6 +149,11 @@ def test_active_receptors_are_those_of_the_rate_equations(dose: float) -> None:
     ]
     states = expm(growth.TIME * np.array(rates)) @ [0.0, 0.0, 1.0]
     assert growth.active_share(np, k1, dose) == pytest.approx(states[1], rel=1e-12)
+    # Their density integrates to one.
+    low, high = 6.5e5 * growth.active_share(np, np.array([0.75, 2.7]), dose)
+    y = np.linspace(low, high, 2001)
+    log_p = growth.log_density(y, dose, np.array([[6.5e5, 77.0, 1.7, 0.2]]))
+    assert np.trapezoid(np.exp(log_p[0]), y) == pytest.approx(1, abs=1e-5)
 
 
 def test_responses_are_what_they_say() -> None:

@@ -37,25 +37,11 @@ def test_at_short_times_the_slab_is_half_infinite(example: Any) -> None:
         np.testing.assert_allclose(found, 25 + 2 * FLUX / K * rise, atol=0.5)
 
 
-def test_at_long_times_all_places_warm_alike_on_a_parabola(example: Any) -> None:
-    place = np.linspace(0, 1, 11)
-    found = example.series(K, C, FLUX, THICKNESS, 1e5, place)
-    parabola = FLUX * THICKNESS / K * (1 / 3 - place + place**2 / 2)
-    np.testing.assert_allclose(found, 25 + FLUX * 1e5 / (C * THICKNESS) + parabola, rtol=1e-12)
-
-
 @pytest.mark.parametrize("seconds", [30.0, 300.0, 1000.0])
 def test_the_heat_that_went_in_is_there(example: Any, seconds: float) -> None:
     nodes, weights = np.polynomial.legendre.leggauss(100)
     mean = weights @ example.series(K, C, FLUX, THICKNESS, seconds, (nodes + 1) / 2) / 2
     assert mean == pytest.approx(25 + FLUX * seconds / (C * THICKNESS), rel=1e-9)
-
-
-def test_heat_flows_in_at_the_front_and_not_out_at_the_back(example: Any) -> None:
-    ends = example.series(K, C, FLUX, THICKNESS, 500.0, np.array([0, 1e-4, 1 - 1e-4, 1]))
-    front, _, back = np.diff(ends) / (1e-4 * THICKNESS)
-    assert -K * front == pytest.approx(FLUX, rel=1e-3)
-    assert abs(K * back) < 1e-3 * FLUX
 
 
 @pytest.mark.parametrize(("flux", "thickness"), [(1000.0, 0.0254), (3000.0, 0.019)])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.random_variable import simulators
@@ -49,11 +50,8 @@ def test_messages_name_the_order_of_the_function(name: str) -> None:
 
 
 def test_a_text_is_the_unit_of_one_output() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[1.0, 2.0], units="mm")
-        (simulator,) = simulators(model).values()
-        assert simulator.outputs.units == ("mm",)
-        several = {"a": [1.0, 2.0], "b": [1.0, 2.0]}
-        with pytest.raises(TypeError, match="units: got 'mm' for 2 outputs, expected a mapping"):
-            prb.Simulator("z", np.square, x, observed=several, units="mm")
+    (simulator,) = simulators(one_input([1.0, 2.0], prb.AreaMetric(), units="mm")).values()
+    assert simulator.outputs.units == ("mm",)
+    several = {"a": [1.0, 2.0], "b": [1.0, 2.0]}
+    with pytest.raises(TypeError, match="units: got 'mm' for 2 outputs, expected a mapping"):
+        one_input(several, units="mm")

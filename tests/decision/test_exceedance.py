@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 from decisions import doubled, jeffreys, normal, posterior, same
+from one_input import posterior_of
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
@@ -159,13 +159,11 @@ def test_a_bound_inside_an_interval_is_that_of_its_place() -> None:
 
 
 def test_a_population_without_stored_responses_takes_points() -> None:
+    observed = np.random.default_rng(1).normal(1.0, 0.5, 50)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        observed = np.random.default_rng(1).normal(1.0, 0.5, 50)
-        propagation = prb.Resimulated(64)
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=observed, propagation=propagation
-        )
+        given: Any = {"metric": prb.AreaMetric(), "propagation": prb.Resimulated(64)}
+        prb.Simulator("y", same, x, observed=observed, **given)
     table = prb.exceedance(posterior(), same, 2.5, x, model=model, n_points=1000)
     assert float(table.probability) == pytest.approx(exact(2.5)[0], rel=0.3)
     with pytest.raises(TypeError, match=r"without stored responses.*n_points=1000"):
@@ -180,7 +178,7 @@ def test_points_are_refused_where_the_support_moves() -> None:
         x = pm.Uniform.dist(0.0, pm.HalfNormal("end", 5))
         prb.Simulator("y", same, x, observed=observed)
     ends = np.random.default_rng(2).normal(3.0, 0.1, (1, 500))
-    result = xr.DataTree.from_dict({"posterior": xr.Dataset({"end": (("chain", "draw"), ends)})})
+    result = posterior_of(end=ends)
     # The central population ends at 3: its points have no response above 3, unlike the others.
     with pytest.raises(TypeError, match=r"support moves .* leave n_points= out"):
         prb.exceedance(result, same, 3.05, x, model=model, n_points=500)
@@ -234,8 +232,8 @@ def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) 
         ask(2.0, lambda x: np.where(x < 1, np.nan, x), n_points=200)
 
 
-@pytest.mark.parametrize("points", [0, 4000])
-def test_specimens_without_response_are_left_out_and_reported(points: int) -> None:
+@pytest.mark.parametrize(("points", "seeds"), [(0, 1), (4000, 3)])
+def test_specimens_without_response_are_left_out_and_reported(points: int, seeds: int) -> None:
     at = float((MU - 1.8 * SIGMA).mean())
     lost = float(ndtr((at - MU) / SIGMA).mean())  # .038
 
@@ -244,10 +242,10 @@ def test_specimens_without_response_are_left_out_and_reported(points: int) -> No
 
     tables = [
         ask(float(MU.mean()), weakest_lost, n_points=points, below=below, random_seed=seed)
-        for seed in range(3)
+        for seed in range(seeds)
         for below in (False, True)
     ]
-    total = sum(float(table.probability) for table in tables) / 3
+    total = sum(float(table.probability) for table in tables) / seeds
     # Five standard errors of three sums by importance points; the errors of stored ones cancel.
     assert total == pytest.approx(1.0, abs=0.028 if points else 1e-9)
     for table in tables:
@@ -257,10 +255,9 @@ def test_specimens_without_response_are_left_out_and_reported(points: int) -> No
         assert percent == pytest.approx(100 * lost, rel=0.5)
         # The specimens without response are within the limit, or all beyond it.
         low, high = np.nanquantile(table.by_draw, [0.055, 0.945])
-        assert float(table.lower) == pytest.approx(low * (1 - percent / 100), rel=1e-3)
-        assert float(table.upper) == pytest.approx(
-            high * (1 - percent / 100) + percent / 100, rel=1e-3
-        )
+        share = percent / 100
+        assert float(table.lower) == pytest.approx(low * (1 - share), rel=1e-3)
+        assert float(table.upper) == pytest.approx(high * (1 - share) + share, rel=1e-3)
 
 
 def test_a_requirement_counts_specimens_without_response() -> None:
@@ -332,11 +329,11 @@ def test_shares_of_weighted_points_sum_to_one() -> None:
 
 # -- rare events -----------------------------------------------------------------------------------
 
-SEEDS = 12
+SEEDS = 8
 
 
 def rare_events(
-    size: int, respond: Callable[[Floats], Any], limit: float, mu: Any = (0.0,)
+    size: int, respond: Callable[[Floats], Any], limit: float, mu: Any = (0.0,), seeds: int = SEEDS
 ) -> tuple[Floats, Floats, Floats]:
     """Return probabilities of responses of independent normal inputs, errors and lost mass, by seed."""
     with pm.Model() as model:
@@ -345,7 +342,7 @@ def rare_events(
     roots = [np.asarray(mu, dtype=float)]
     events = [
         rare_event(transform, roots, respond, limit, 1000, np.random.default_rng(seed))
-        for seed in range(SEEDS)
+        for seed in range(seeds)
     ]
     columns = [[event.by_draw, event.error, event.lost] for event in events]
     by_draw, error, lost = (np.array(column) for column in zip(*columns, strict=True))
@@ -364,13 +361,11 @@ UNEQUAL = float(ndtr(-4.5) + ndtr(-4.1))
 CASES: dict[str, tuple[int, Callable[[Floats], Any], float, float]] = {
     "one": (1, lambda z: z[:, 0], ndtri(1 - 1e-5), 1e-5),
     "ten": (10, lambda z: z.sum(axis=1) / np.sqrt(10), ndtri(1 - 1e-4), 1e-4),
-    "two sides": (1, lambda z: np.abs(z[:, 0]), ndtri(1 - 5e-5), 1e-4),
     "common": (2, lambda z: z[:, 0] + z[:, 1], 0.0, 0.5),
     "of another size": (1, lambda z: 1e6 + 3e-3 * z[:, 0], 1e6 + 3e-3 * ndtri(1 - 1e-4), 1e-4),
     "unequal sides": (1, unequal_sides, 4.5, UNEQUAL),
     "a jump on one side": (2, jump, 4.5, float(ndtr(-4.5) + ndtr(-4))),
     "two directions": (2, lambda z: np.maximum(z[:, 0], 3 * (z[:, 1] - 2.6)), 4.5, UNEQUAL),
-    "four sides": (2, lambda z: np.abs(z).max(axis=1), 4.3, 1 - (1 - 2 * ndtr(-4.3)) ** 2),
     "ring": (2, lambda z: (z**2).sum(axis=1), 20.0, np.exp(-10.0)),
     "failed": (1, lambda z: np.where(z[:, 0] > 3.0, np.inf, z[:, 0]), 3.0, ndtr(-3.0)),
 }
@@ -387,12 +382,9 @@ def test_probabilities_and_their_errors(case: str) -> None:
     assert abs(values.mean() - expected) < 4 * np.sqrt(np.mean(errors**2) / SEEDS)
 
 
-@pytest.mark.parametrize("response", [unequal_sides, jump])
-def test_no_region_is_left_out_beside_inputs_of_no_effect(
-    response: Callable[[Floats], Any],
-) -> None:
-    by_draw, errors, _ = rare_events(5, response, 4.5)
-    expected = ndtr(-4.5) + (ndtr(-4) if response is jump else ndtr(-4.1))
+def test_no_region_is_left_out_beside_inputs_of_no_effect() -> None:
+    by_draw, errors, _ = rare_events(5, jump, 4.5)
+    expected = ndtr(-4.5) + ndtr(-4)
     is_wrong = by_draw[:, 0] + 4 * errors < expected
     assert is_wrong.sum() <= 1
     assert by_draw.mean() == pytest.approx(expected, rel=0.2)
@@ -405,7 +397,7 @@ def test_the_error_sees_a_region_that_the_last_proposals_miss(
         return [max(parts, key=lambda part: part.proposal.mean[0]).proposal]
 
     monkeypatch.setattr(sys.modules[rare_event.__module__], "_mixture", on_one_side)
-    by_draw, errors, _ = rare_events(1, unequal_sides, 4.5)
+    by_draw, errors, _ = rare_events(1, unequal_sides, 4.5, seeds=4)
     assert (by_draw < 0.3 * UNEQUAL).all()
     # The first points see it roughly; the last ones alone would have an error below .02.
     assert (errors > 0.1 * UNEQUAL).all()
@@ -418,9 +410,10 @@ def test_populations_share_their_points() -> None:
 
 
 def test_lost_mass_is_counted_and_an_unreached_limit_has_an_error() -> None:
-    by_draw, _, lost = rare_events(1, lambda z: np.where(z[:, 0] < 0, np.nan, z[:, 0]), 3.0)
+    lossy = lambda z: np.where(z[:, 0] < 0, np.nan, z[:, 0])  # noqa: E731
+    by_draw, _, lost = rare_events(1, lossy, 3.0, seeds=1)
     assert lost[0] == pytest.approx(0.5, abs=0.2)
     assert by_draw[0, 0] == pytest.approx(ndtr(-3.0), rel=0.3)
-    by_draw, errors, _ = rare_events(1, lambda z: np.clip(z[:, 0], -1, 1), 2.0)
+    by_draw, errors, _ = rare_events(1, lambda z: np.clip(z[:, 0], -1, 1), 2.0, seeds=4)
     assert (by_draw == 0).all()
     assert (errors > 0).all()

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 from decisions import N, doubled, normal, optimum, posterior, same
+from one_input import posterior_of
 
 import prbayes as prb
 from prbayes.decision.plan import Draws, fisher_information, specimen_information
@@ -55,15 +55,6 @@ def test_the_number_that_reaches_a_target() -> None:
     k = int(needed.sel(name="mu"))
     around = prb.plan(optimum(), condition, k=[k - 1, k]).sd.sel(candidate="same", name="mu")
     assert float(around[1]) <= 0.03 < float(around[0])
-
-
-@pytest.mark.slow
-def test_a_target_out_of_reach() -> None:
-    _, x = normal()
-    condition = {"same": prb.decision.Condition(same, x)}
-    quantity = prb.decision.Quantile(same, x, probability=0.95)
-    table = prb.plan(optimum(), condition, k=5, quantity=quantity, target={"quantity": 1e-9})
-    assert float(table.specimens.sel(candidate="same", name="quantity")) == np.inf
 
 
 def fisher(populations: Populations, response: Any = same) -> Any:
@@ -145,10 +136,11 @@ def test_errors_of_readings_are_part_of_the_information() -> None:
         error = pm.HalfNormal("error", 0.5)
         metric = prb.LogLikelihood(error=error)
         prb.Simulator("y", same, x, observed=observed + rng.normal(0, 0.5, 30), metric=metric)
-    draws = {"mu": rng.normal(1.0, 0.05, 500)}
-    draws |= {k: v * np.exp(rng.normal(0, 0.1, 500)) for k, v in (("sigma", 0.3), ("error", 0.5))}
-    group = xr.Dataset({name: (("chain", "draw"), v[None]) for name, v in draws.items()})
-    result = xr.DataTree.from_dict({"posterior": group})
+    result = posterior_of(
+        mu=rng.normal(1.0, 0.05, (1, 500)),
+        sigma=0.3 * np.exp(rng.normal(0, 0.1, (1, 500))),
+        error=0.5 * np.exp(rng.normal(0, 0.1, (1, 500))),
+    )
     populations = Populations.of(result, model, 500, "prb.plan")
     sigma, e = np.exp(populations.center[1:])
     unit = populations.evaluator.hyperparameters.prior_sd
@@ -189,8 +181,7 @@ def test_ends_that_extreme_specimens_determine_are_refused() -> None:
     with pm.Model() as model:
         x = pm.Uniform.dist(0.0, pm.Normal("end", 3, 0.3))
         prb.Simulator("y", same, x, observed=np.linspace(0.1, 2.9, 30))
-    draws = np.random.default_rng(0).uniform(2.95, 3.1, (1, 200))
-    result = xr.DataTree.from_dict({"posterior": xr.Dataset({"end": (("chain", "draw"), draws)})})
+    result = posterior_of(end=np.random.default_rng(0).uniform(2.95, 3.1, (1, 200)))
     with pytest.raises(ValueError, match="support moves with their hyperparameters, as of a unif"):
         prb.plan(result, {"same": prb.decision.Condition(same, x)}, k=30, model=model)
 
@@ -203,10 +194,8 @@ def test_modes_keep_their_masses(share: float) -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", np.square, x, observed=rng.normal(2.0, 0.3, 20) ** 2)
     sign = np.where(np.arange(2000) < 2000 * share, -1.0, 1.0)
-    draws = {"mu": sign * rng.normal(2.0, 0.1, 2000)}
-    draws["sigma"] = 0.3 * np.exp(rng.normal(0, 0.1, 2000))
-    group = xr.Dataset({name: (("chain", "draw"), v[None]) for name, v in draws.items()})
-    result = xr.DataTree.from_dict({"posterior": group})
+    mu = sign * rng.normal(2.0, 0.1, (1, 2000))
+    result = posterior_of(mu=mu, sigma=0.3 * np.exp(rng.normal(0, 0.1, (1, 2000))))
     same = {"same": prb.decision.Condition(np.square, x)}
     table = prb.plan(result, same, k=[30, 3000], model=model, target={"mu": 0.5})
     sd = table.sd.sel(candidate="same")

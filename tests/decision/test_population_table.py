@@ -8,6 +8,7 @@ import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 from scipy import stats
 
 import prbayes as prb
@@ -24,12 +25,7 @@ FRESH: dict[str, Any] = {"metric": prb.AreaMetric(), "propagation": prb.Fresh(50
 
 def draws(**values: Any) -> xr.DataTree:
     """Return a posterior of one chain."""
-    data = {}
-    for name, value in values.items():
-        array = np.asarray(value)[None]
-        dims = ["chain", "draw", *(f"{name}_dim_{i}" for i in range(array.ndim - 2))]
-        data[name] = (dims, array)
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(data)})
+    return posterior_of(**{name: np.asarray(value)[None] for name, value in values.items()})
 
 
 def normal_model(observed: Any = DATA, **settings: Any) -> pm.Model:
@@ -47,7 +43,7 @@ def reference_posterior(n: int, seed: int) -> xr.DataTree:
 
 
 def test_tolerance_bounds_are_the_classical_ones() -> None:
-    size, posterior = DATA.size, reference_posterior(20_000, 2)
+    size, sd, posterior = DATA.size, DATA.std(ddof=1), reference_posterior(20_000, 2)
     model = normal_model()
     for upper, sign in ((False, -1), (True, 1)):
         table = prb.population(posterior, "k", model=model, upper=upper, n_draws=20_000)
@@ -56,9 +52,7 @@ def test_tolerance_bounds_are_the_classical_ones() -> None:
             factor = stats.nct.ppf(0.95, size - 1, noncentral) / np.sqrt(size)
             bound = float(table.estimate.sel(name="k", quantity=basis))
             # The standard error of the factor by so many draws is .006 and .010.
-            assert bound == pytest.approx(
-                DATA.mean() + sign * factor * DATA.std(ddof=1), abs=0.04 * DATA.std(ddof=1)
-            )
+            assert bound == pytest.approx(DATA.mean() + sign * factor * sd, abs=0.04 * sd)
 
 
 def test_numbers_are_those_of_the_distribution_in_each_draw() -> None:
@@ -226,33 +220,31 @@ def test_an_optimum_has_the_intervals_of_its_standard_errors() -> None:
         prb.population(optimum, later)
 
 
+SERIES = pd.Series(DATA, name="y")
+SERIES.attrs["units"] = "mm"
+FRAME = pd.DataFrame({"a": DATA, "b": DATA**2})
+FRAME.attrs["units"] = {"a": "mm"}
+JOINT: dict[str, Any] = {"metric": prb.Joint(prb.AreaMetric())}
+
+
 @pytest.mark.parametrize(
     ("observed", "settings", "units"),
     [
         (DATA, {"units": {"y": "mm"}}, ("mm",)),
         (xr.DataArray(DATA, dims="specimen", attrs={"units": "mm"}), {}, ("mm",)),
-        ("series", {}, ("mm",)),
-        ("series", {"units": {"y": "m"}}, ("m",)),
-        ("frame", {}, ("mm", "")),
-        ("mapping", {"units": {"b": "kg"}}, ("mm", "kg")),
+        (SERIES, {}, ("mm",)),
+        (SERIES, {"units": {"y": "m"}}, ("m",)),
+        (FRAME, JOINT, ("mm", "")),
+        ({"a": SERIES, "b": DATA**2}, JOINT | {"units": {"b": "kg"}}, ("mm", "kg")),
         (DATA, {}, ()),
     ],
 )
 def test_units_of_responses_come_from_the_data(
     observed: Any, settings: dict[str, Any], units: tuple[str, ...]
 ) -> None:
-    series = pd.Series(DATA, name="y")
-    frame = pd.DataFrame({"a": DATA, "b": DATA**2})
-    series.attrs["units"], frame.attrs["units"] = "mm", {"a": "mm"}
-    mapping = {"a": series, "b": DATA**2}
-    observed = {"series": series, "frame": frame, "mapping": mapping}.get(str(observed), observed)
-    if isinstance(observed, dict | pd.DataFrame):
-        settings = settings | {"metric": prb.Joint(prb.AreaMetric())}
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 3, 2), 0.5)
-        response = outputs if isinstance(observed, dict | pd.DataFrame) else np.positive
-        prb.Simulator("y", response, x, observed=observed, **FRESH | settings)
-    (simulator,) = simulators(model).values()
+    response = outputs if "metric" in settings else np.positive
+    given = FRESH | settings | {"response": response, "mu": (3, 2), "sd": 0.5}
+    (simulator,) = simulators(one_input(observed, **given)).values()
     assert simulator.outputs.units == units
 
 
@@ -324,12 +316,13 @@ def test_elements_of_a_vector_have_units_of_their_own() -> None:
 
 
 def test_a_coefficient_of_variation_and_correlations_have_no_unit() -> None:
-    rows = np.random.default_rng(0).normal([2.0, 3.0], [0.2, 0.3], (20, 2))
     with pm.Model() as model:
         mu = pm.Normal("mu", [2.0, 3.0], 1.0, shape=2)
         x = pm.MvNormal.dist(mu, np.array([[0.04, 0.01], [0.01, 0.09]]), name="x")
-        prb.Simulator("y", np.positive, x, observed=rows, units={"x": "ksi"})
-    table = prb.population(prb.minimize(model, starts=0, progressbar=False), "x", model=model)
+        total = lambda x: x.sum(axis=-1)  # noqa: E731
+        prb.Simulator("y", total, x, observed=DATA, units={"x": "ksi"}, **FRESH)
+    posterior = draws(mu=np.random.default_rng(0).normal([2.0, 3.0], 0.1, (50, 2)))
+    table = prb.population(posterior, "x", model=model)
     frame = table.to_dataframe().reset_index()
     units = frame.groupby("quantity")["unit"].agg(set).to_dict()
     pure = {quantity for quantity, unit in units.items() if unit == {""}}

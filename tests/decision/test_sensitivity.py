@@ -8,6 +8,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from decisions import doubled, normal, optimum, posterior, same
+from one_input import posterior_of
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -45,9 +46,7 @@ def test_a_quantile_of_a_normal_population() -> None:
 
 def correlated(rho: float, draws: int = 4000, seed: int = 0) -> xr.DataTree:
     z = np.random.default_rng(seed).multivariate_normal([0, 0], [[1, rho], [rho, 1]], (1, draws))
-    columns = {"mu": 1 + 0.05 * z[..., 0], "sigma": 0.5 * np.exp(0.05 * z[..., 1])}
-    group = xr.Dataset({name: (("chain", "draw"), value) for name, value in columns.items()})
-    return xr.DataTree.from_dict({"posterior": group.assign_coords(chain=[0], draw=range(draws))})
+    return posterior_of(mu=1 + 0.05 * z[..., 0], sigma=0.5 * np.exp(0.05 * z[..., 1]))
 
 
 @pytest.mark.long
@@ -58,9 +57,9 @@ def test_errors_contain_the_noise_of_points_and_of_draws() -> None:
     variances = np.array([0.05, 1.2816 * 0.5 * 0.05]) ** 2
     expected = variances / variances.sum()
     scores = []
-    for seed in range(4):
+    for seed in range(2):
         draws = correlated(0.0, seed=seed)
-        table = prb.sensitivity(draws, quantile, model=model, n_points=4096, random_seed=seed)
+        table = prb.sensitivity(draws, quantile, model=model, n_points=2048, random_seed=seed)
         table = table.sel(factor=["mu", "sigma"])
         scores += list((table["first"] - expected) / table.first_error)
         # All noise of the points is removed, and the squared correlation of 500 draws stays.
@@ -214,16 +213,13 @@ TOTAL_OF_FOUR = np.array([*TOTAL * SHARE, 1 - SHARE])
 @cache
 def problem(emulator: str | None = "auto", n: int = 256) -> tuple[prb.Optimum, list[Any]]:
     rng = np.random.default_rng(1)
+    data = ishigami_and_linear(*rng.uniform(-np.pi, np.pi, (3, 200)), rng.normal(0, 1, 200))
     with pm.Model() as model:
         inputs = [pm.Uniform.dist(-np.pi, np.pi) for _ in range(3)]
         inputs.append(pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0))
-        data = ishigami_and_linear(*rng.uniform(-np.pi, np.pi, (3, 200)), rng.normal(0, 1, 200))
-        prb.Simulator(
-            *("y", ishigami_and_linear, *inputs),
-            metric=prb.ProbabilityResidual(),
-            observed=data,
-            propagation=prb.Reweighted(n, emulator=emulator),
-        )
+        given: Any = {"metric": prb.ProbabilityResidual(), "observed": data}
+        given["propagation"] = prb.Reweighted(n, emulator=emulator)
+        prb.Simulator("y", ishigami_and_linear, *inputs, **given)
     return prb.minimize(model, refine=False, starts=0, progressbar=False), inputs
 
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.inference.asymptotics import Local
@@ -64,10 +64,7 @@ def test_thetas_lie_along_what_the_data_identify() -> None:
 
 
 def test_a_refusal_tells_what_the_data_do_not() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
-    evaluator = Evaluator.of(model)
+    evaluator = Evaluator.of(one_input([0.0, 1.0], prb.AreaMetric(), mu=(0, 1), sd=0.5))
     short = shortcomings(evaluator, np.array([[30.0]]))
     with pytest.raises(DesignError, match=r"^y: the design does not .* about mu - tau: n") as error:
         refuse(short, evaluator, ["mu - tau"])
@@ -97,15 +94,7 @@ def test_a_rough_emulator_is_a_remark_that_names_its_output() -> None:
 
 def test_a_pilot_goes_towards_data_that_are_far() -> None:
     # Where no response is near the data the discrepancy is the same, up to rounding.
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator(
-            "y",
-            lambda x: x * 1.0,
-            x,
-            metric=prb.ProbabilityResidual(),
-            observed=np.linspace(14, 15, 20),
-            propagation=prb.Reweighted(128),
-        )
+    metric, runs = prb.ProbabilityResidual(), prb.Reweighted(128)
+    model = one_input(np.linspace(14, 15, 20), metric, runs, mu=(0, 1), sd=0.5)
     # Of 1024 draws of the prior the best quarter lies above .67.
     assert (pilot(Evaluator.of(model), np.ones(1)) > 0.67).all()

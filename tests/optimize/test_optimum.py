@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.inference.asymptotics import Local
@@ -48,10 +49,8 @@ print(repr(float(tree["posterior"]["mu"].mean())))
 
 @pytest.mark.long
 def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        data = np.random.default_rng(1).normal(1.0, 1.0, 20)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=data)
+    data = np.random.default_rng(1).normal(1.0, 1.0, 20)
+    model = one_input(data, prb.AreaMetric(), mu=(1, 1), sd=1.0)
     optimum = prb.minimize(model, starts=0, progressbar=False)
     file = tmp_path / "optimum.pkl"
     file.write_bytes(pickle.dumps(optimum))
@@ -163,12 +162,7 @@ def test_a_function_of_what_is_not_identified_may_be_identified() -> None:
 
 
 def _normal(metric: prb.Metric, propagation: Any) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 3), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y", np.positive, x, metric=metric, observed=[0.0, 0.4, 1.0], propagation=propagation
-        )
-    return model
+    return one_input([0.0, 0.4, 1.0], metric, propagation, mu=(0, 3))
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,11 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 from scipy import stats
 
 import prbayes as prb
 from prbayes.propagation.base import Propagation
-
-Array = np.ndarray[Any, Any]
 
 
 def same(x: Any) -> Any:
@@ -38,19 +37,15 @@ def known() -> SimpleNamespace:
 def build(known: SimpleNamespace) -> Callable[..., pm.Model]:
     """How to build a normal population of unknown mean and standard deviation."""
 
-    def model_of(propagation: Propagation, response: Any = same, **keywords: Any) -> pm.Model:
-        how = {"metric": prb.AreaMetric(), "observed": known.observed} | keywords
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
-            prb.Simulator("y", response, x, propagation=propagation, **how)
-        return model
+    def model_of(propagation: Propagation, response: Any = same) -> pm.Model:
+        return one_input(known.observed, prb.AreaMetric(), propagation, response, sigma=2)
 
     return model_of
 
 
 @pytest.fixture(scope="session")
 def optimum(build: Callable[..., pm.Model]) -> prb.Optimum:
-    return prb.minimize(build(prb.Reweighted(1024)))
+    return prb.minimize(build(prb.Reweighted(1024)), starts=0)
 
 
 @pytest.fixture(scope="session")
@@ -86,22 +81,16 @@ def pair() -> SimpleNamespace:
         return np.stack([a, 0.8 * a + 0.6 * b + 5], axis=-1)
 
     rng = np.random.default_rng(3)
-    a, b = rng.normal([[2.0], [0.0]], 1.0, (2, 25))
-    observed = np.column_stack([a, 0.8 * a + 0.6 * b + 5])
+    observed = response(*rng.normal([[2.0], [0.0]], 1.0, (2, 25)))
     observed[:2, 1], observed[2, 1] = np.nan, np.inf
-    data = xr.DataArray(
-        observed,
-        dims=("specimen", "frequency"),
-        coords={"frequency": ["first", "second"]},
-        attrs={"units": "Hz"},
-    )
+    coords, units = {"frequency": ["first", "second"]}, {"units": "Hz"}
+    data = xr.DataArray(observed, dims=("specimen", "frequency"), coords=coords, attrs=units)
     with pm.Model() as model:
         mu = pm.Normal("mu", 1.9, 1.0)
         inputs = pm.Normal.dist(mu, 1.0), pm.Normal.dist(0.0, 1.0)
         given: Any = {"metric": prb.Joint(prb.ProbabilityResidual()), "observed": data}
         prb.Simulator("frame", response, *inputs, propagation=prb.Reweighted(4096), **given)
-    draws = xr.Dataset({"mu": (("chain", "draw"), rng.normal(2.0, 0.01, (2, 50)))})
-    tree = xr.DataTree.from_dict({"posterior": draws})
+    tree = posterior_of(mu=rng.normal(2.0, 0.01, (2, 50)))
 
     @cache
     def drawn() -> Any:

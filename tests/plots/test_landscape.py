@@ -9,6 +9,7 @@ import figure_reader as read
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -59,7 +60,7 @@ def test_a_curve_over_one_hyperparameter(optimum: prb.Optimum, drawn: Callable[.
 
 
 def test_other_optima_are_marked() -> None:
-    optimum = prb.minimize(_one())
+    optimum = prb.minimize(_one(), starts=0)
     modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
     pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), points=21)
     np.testing.assert_allclose(read.xy(pc, "local_optima", "landscape")[0], -optimum.theta)
@@ -69,37 +70,26 @@ def test_other_optima_are_marked() -> None:
 
 
 def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.Model]) -> None:
-    model = build(prb.Resimulated(64))
-    found = prb.minimize(model)
-    with pytest.raises(
-        ValueError,
-        match=r"got responses=0, expected at least 1600: 25 points with 64 responses each",
-    ):
+    found = prb.minimize(build(prb.Resimulated(64)))
+    match = "got responses=0, expected at least 1600: 25 points with 64 responses each"
+    with pytest.raises(ValueError, match=match):
         prb.plots.plot_landscape(found, points=5)
     assert read.panels(prb.plots.plot_landscape(found, points=5, responses=1600), "landscape")
 
 
 def test_the_landscape_of_another_metric(optimum: prb.Optimum, known: SimpleNamespace) -> None:
-    with pm.Model() as other:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.ProbabilityResidual(), observed=known.observed
-        )
+    other = one_input(known.observed, prb.ProbabilityResidual(), sigma=2)
     pc = prb.plots.plot_landscape(optimum, model=other, var_names="mu", points=9)
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])
-    with pytest.raises(
-        ValueError, match=r"plot_landscape: .*hyperparameters: got sigma_log__, expected "
-    ):
+    match = r"plot_landscape: .*hyperparameters: got sigma_log__, expected "
+    with pytest.raises(ValueError, match=match):
         prb.plots.plot_landscape(optimum, model=_one())
 
 
 def _one() -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
-        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 4.0])
-    return model
+    return one_input([0.0, 1.0, 4.0], prb.AreaMetric(), response=np.square, sd=0.3)
 
 
 def test_values_of_a_flat_landscape_are_told_apart() -> None:

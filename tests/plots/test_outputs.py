@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
@@ -61,25 +62,20 @@ def several() -> SimpleNamespace:
     def curve(a: Any, b: Any, c: Any) -> Any:
         return a[..., None] + np.arange(12) * b[..., None] + c[..., None]
 
-    names = ["p", "q", "r/s", "t", "u"]
-    data = xr.DataArray(five(*rng.normal(size=(3, 20))), dims=("i", "name"), coords={"name": names})
-    lines = xr.DataArray(
-        curve(*rng.normal(size=(3, 20))),
-        dims=("i", "hour"),
-        coords={"hour": np.arange(12) / 2},
-    )
-    metric = prb.Joint(prb.AreaMetric(), components=2)
-    how: dict[str, Any] = {"metric": metric, "propagation": prb.Resimulated(64)}
+    names = {"name": ["p", "q", "r/s", "t", "u"]}
+    data = xr.DataArray(five(*rng.normal(size=(3, 20))), dims=("i", "name"), coords=names)
+    hours = {"hour": np.arange(12) / 2}
+    lines = xr.DataArray(curve(*rng.normal(size=(3, 20))), dims=("i", "hour"), coords=hours)
+    area = prb.AreaMetric()
+    how: dict[str, Any] = {"metric": prb.Joint(area, components=2)}
+    how["propagation"] = prb.Resimulated(64)
     with pm.Model() as model:
         m = pm.Normal("m", 0, 1)
         inputs = [pm.Normal.dist(m, 1.0), pm.Normal.dist(0.0, 1.0), pm.Normal.dist(0.0, 1.0)]
-        prb.Simulator(
-            "one", np.positive, inputs[0], metric=prb.AreaMetric(), observed=data.values[:, 0]
-        )
+        prb.Simulator("one", np.positive, inputs[0], metric=area, observed=data.values[:, 0])
         prb.Simulator("five", five, *inputs, observed=data, **how)
         prb.Simulator("curve", curve, *inputs, observed=lines, **how)
-    draws = xr.Dataset({"m": (("chain", "draw"), rng.normal(0, 0.2, (2, 20)))})
-    return SimpleNamespace(model=model, posterior=xr.DataTree.from_dict({"posterior": draws}))
+    return SimpleNamespace(model=model, posterior=posterior_of(m=rng.normal(0, 0.2, (2, 20))))
 
 
 def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
@@ -136,7 +132,6 @@ def test_what_is_not_there_is_refused(
 
 
 def test_a_model_of_single_outputs_is_refused(optimum: prb.Optimum) -> None:
-    with pytest.raises(
-        ValueError, match=r"got simulators \['y'\] of one .* prb.plots.plot_responses"
-    ):
+    match = r"got simulators \['y'\] of one .* prb.plots.plot_responses"
+    with pytest.raises(ValueError, match=match):
         prb.plots.plot_outputs(optimum)

@@ -9,14 +9,14 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.margins import margins, select_margins
+from prbayes.model.margins import margins
 from prbayes.model.parameters import unconstrained
 from prbayes.plots.population import margin_densities
-from prbayes.propagation.base import Propagation
 
 
 def test_the_population_is_the_closed_form(
@@ -36,34 +36,25 @@ def test_the_population_is_the_closed_form(
 
 
 def correlated() -> pm.Model:
+    def total(loads: Any, z: Any) -> Any:
+        return loads.sum(axis=-1) + z
+
     with pm.Model() as model:
         mean = pm.Normal("mean", [1.0, 2.0, 0.0], 1.0, shape=3)
         rho = pm.Uniform("rho", -1, 1)
         covariance = [[1.0, 2 * rho, 0.0], [2 * rho, 4.0, 0.0], [0.0, 0.0, 1.0]]
-        x = pm.MvNormal.dist(mean, pt.stacklists(covariance))
-        z = pm.Normal.dist(0, 1)
-        prb.Simulator(
-            "y",
-            lambda loads, z: loads[..., 0] + loads[..., 1] + loads[..., 2] + z,
-            x,
-            z,
-            metric=prb.AreaMetric(),
-            observed=[1.0, 2.0, 3.0],
-            propagation=prb.Reweighted(64, emulator=None),
-        )
+        inputs = pm.MvNormal.dist(mean, pt.stacklists(covariance)), pm.Normal.dist(0, 1)
+        given: Any = {"metric": prb.AreaMetric(), "observed": [1.0, 2.0, 3.0]}
+        few = prb.Reweighted(64, emulator=None)
+        prb.Simulator("y", total, *inputs, propagation=few, **given)
     return model
 
 
 @pytest.mark.long
 def test_a_multivariate_input_has_its_pairs() -> None:
-    draws = xr.Dataset(
-        {
-            "mean": (["chain", "draw", "mean_dim_0"], np.tile([1.0, 2.0, 0.0], (1, 4, 1))),
-            "rho": (["chain", "draw"], np.full((1, 4), 0.6)),
-        }
-    )
-    posterior = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plots.plot_population(posterior, model=correlated(), prob=0.89)
+    mean = np.tile([1.0, 2.0, 0.0], (1, 4, 1))
+    posterior, model = posterior_of(mean=mean, rho=np.full((1, 4), 0.6)), correlated()
+    pc = prb.plots.plot_population(posterior, model=model, prob=0.89)
     pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
     assert read.panels(pc, "region") == read.panels(pc, "half") == pairs
     # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.
@@ -76,50 +67,9 @@ def test_a_multivariate_input_has_its_pairs() -> None:
         assert top == pytest.approx(0.6 * reach, abs=0.3 * reach)
     assert "correlation 0.6" in read.panel(pc, pairs[0]).get_title()
     coords = {"loads_dim_0": [0, 2]}
-    some = prb.plots.plot_population(posterior, model=correlated(), coords=coords)
+    some = prb.plots.plot_population(posterior, model=model, coords=coords)
     labels = [axis.get_label() for axis in some.axes]
     assert labels == ["loads[0]", "loads[2]", "z", "loads[2], loads[0]"]
-
-
-def two_inputs(propagation: Propagation) -> tuple[pm.Model, list[object]]:
-    def first(load: np.ndarray, gap: np.ndarray, factor: float) -> np.ndarray:
-        return load[..., 0] * factor + gap + 0 * load[..., 1]
-
-    rng = np.random.default_rng(1)
-    with pm.Model() as model:
-        mu, size = pm.Normal("mu", [1.0, 3.0], 1.0, shape=2), pm.HalfNormal("size", 1.0)
-        load = pm.MvNormal.dist(mu, np.array([[0.04, 0.05], [0.05, 0.25]]))
-        gap = pm.Gamma.dist(4.0, 4.0 / size)
-        observed = rng.normal(3, 0.5, 20)
-        given: Any = {"metric": prb.AreaMetric(), "observed": observed, "propagation": propagation}
-        prb.Simulator("first", first, load, gap, 2.0, **given)
-        prb.Simulator("second", lambda gap: gap**2, gap, **given)
-    return model, [load, gap]
-
-
-@pytest.mark.long
-def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> None:
-    model, (load, gap) = two_inputs(prb.Resimulated(64))
-    evaluator = Evaluator.of(model)
-    known = margins(evaluator)
-    assert [m.name for m in known] == ["load[0]", "load[1]", "gap"]
-    assert select_margins(known, ["gap"]) == select_margins(known, [gap]) == known[2:]
-    assert select_margins(known, "load") == select_margins(known, [load]) == known[:2]
-    with pytest.raises(KeyError, match=r"got nothing, expected some of \['load\[0\]'"):
-        select_margins(known, ["nothing"])
-    points = ({"mu": [1, 3], "size": 1.0}, {"mu": [1.2, 2.5], "size": 1.5})
-    thetas = np.array([unconstrained(evaluator.hyperparameters, point) for point in points])
-    before = evaluator.n_responses
-    found = margin_densities(evaluator, known, thetas)
-    assert evaluator.n_responses == before
-    exact = {
-        "load[0]": lambda x: stats.norm.pdf(x, [[1], [1.2]], 0.2),
-        "load[1]": lambda x: stats.norm.pdf(x, [[3], [2.5]], 0.5),
-        "gap": lambda x: stats.gamma.pdf(x, 4, scale=np.array([[1], [1.5]]) / 4),
-    }
-    for name, (grid, y) in found.items():
-        np.testing.assert_allclose(y, exact[name](grid), atol=1e-9)
-        assert (np.trapezoid(y, grid) > 0.98).all()
 
 
 def test_margins_without_a_density_of_their_own_are_drawn() -> None:

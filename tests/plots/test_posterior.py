@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
@@ -90,11 +91,7 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
 def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
     rng = np.random.default_rng(0)
     sizes = {"chol": 3, "chol_stds": 2, "chol_corr": 1}
-    draws = {
-        name: (["chain", "draw", f"{name}_dim"], rng.normal(size=(1, 50, size)))
-        for name, size in sizes.items()
-    }
-    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    tree = posterior_of(**{name: rng.normal(size=(1, 50, size)) for name, size in sizes.items()})
     drawn = list(prb.plots.plot_posterior(tree).viz["dist"])
     assert drawn == ["chol_stds[0]", "chol_stds[1]", "chol_corr[0]"]
     drawn = list(prb.plots.plot_posterior(tree, var_names="chol").viz["dist"])

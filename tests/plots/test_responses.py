@@ -11,6 +11,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from first_use import first_use
+from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
@@ -88,8 +89,7 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
         model = build(propagation, counted)
         first_use(model)
         seen.clear()
-        pc = prb.plots.plot_responses(posterior, model=model)
-        assert pc.axes
+        assert prb.plots.plot_responses(posterior, model=model).axes
         assert sum(seen) <= cost + 300  # a few more where a response is tried first
         seen.clear()
         prb.plots.plot_population(posterior, model=model)
@@ -122,16 +122,13 @@ def test_each_output_has_a_panel_with_what_was_measured_of_it(pair: SimpleNamesp
         x, y = read.xy(pc, "after", f"frame[{column}]")
         np.testing.assert_allclose(y, stats.norm.pdf(x, mean, 1), atol=0.025)
     axes = [read.panel(pc, f"frame[{name}]") for name in ("first", "second")]
-    assert [axis.get_title() for axis in axes] == [
-        "25 measured values",
-        "23 measured values, 1 failed",
-    ]
+    titles = ["25 measured values", "23 measured values, 1 failed"]
+    assert [axis.get_title() for axis in axes] == titles
     assert [axis.get_xlabel() for axis in axes] == ["first (Hz)", "second (Hz)"]
     finite = np.sort(pair.observed[:, 1][np.isfinite(pair.observed[:, 1])])
     np.testing.assert_array_equal(np.sort(read.xy(pc, "rug", "frame[second]")[0]), finite)
-    (second,) = prb.plots.plot_responses(
-        pair.posterior, model=pair.model, coords={"frequency": "second"}
-    ).axes
+    coords = {"frequency": "second"}
+    (second,) = prb.plots.plot_responses(pair.posterior, model=pair.model, coords=coords).axes
     assert second.get_label() == "frame[second]"
 
 
@@ -188,14 +185,12 @@ def test_groups_have_the_same_axis() -> None:
     with pm.Model(coords={"kind": ["a", "b"]}) as model:
         mu = pm.Normal("mu", 4, 4, dims="kind")
         x = pm.Normal.dist(mu[prb.response.group("kind")], 0.5, name="x")
-        y: dict[str, Any] = {"metric": prb.AreaMetric(), "observed": measured}
-        prb.Simulator("y", lambda x: x + 0.0, x, **y)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=measured)
         z = pm.Normal.dist(100 * pm.Normal("nu", 1, 1), 1, name="z")
-        prb.Simulator("far", lambda z: z, z, metric=prb.AreaMetric(), observed=[99.0, 101])
-    optimum = prb.minimize(model)
+        prb.Simulator("far", np.positive, z, metric=prb.AreaMetric(), observed=[99.0, 101])
+    optimum = prb.minimize(model, starts=0)
     for plot in (prb.plots.plot_responses, prb.plots.plot_population):
-        pc = plot(optimum)
-        first, second, other = [axis.get_xlim() for axis in pc.axes]
+        first, second, other = [axis.get_xlim() for axis in plot(optimum).axes]
         assert first == second
         assert first[0] < 1
         assert first[1] > 8
@@ -229,17 +224,17 @@ def curve(a: Any) -> Any:
 
 
 def test_a_curve_has_one_panel_from_left_to_right() -> None:
-    observed = curve(np.linspace(0.5, 2.5, 11))
-    observed[0, 2] = np.nan
-    coords = {"hour": HOURS}
+    observed = curve(np.linspace(0.5, 2.5, 11))[:, [0, 2, 3]]
+    observed[0, 1] = np.nan
+    coords = {"hour": HOURS[[0, 2, 3]]}
     data = xr.DataArray(observed, dims=("specimen", "hour"), coords=coords, attrs={"units": "mm"})
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), 0.5)
         given: Any = {"metric": prb.Joint(prb.AreaMetric()), "propagation": prb.Resimulated(512)}
         response = lambda a: curve(a)[..., [0, 2, 3]]  # noqa: E731
-        prb.Simulator("wear", response, a, observed=data[:, [0, 2, 3]], **given)
-    draws = xr.Dataset({"mu": (("chain", "draw"), np.linspace(1.4, 1.6, 20).reshape(2, 10))})
-    pc = prb.plots.plot_responses(xr.DataTree.from_dict({"posterior": draws}), model=model)
+        prb.Simulator("wear", response, a, observed=data, **given)
+    draws = posterior_of(mu=np.linspace(1.4, 1.6, 20).reshape(2, 10))
+    pc = prb.plots.plot_responses(draws, model=model)
     axis = read.panel(pc, "wear")
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("hour", "wear (mm)")
     assert axis.get_title() == "11 measured specimens, 1 incomplete, 4 failed"
@@ -266,17 +261,15 @@ def test_a_curve_has_one_panel_from_left_to_right() -> None:
 def test_many_outputs_with_names_are_in_their_own_spread() -> None:
     names = [f"gauge {i}" for i in range(9)]
     unit = 10.0 ** np.arange(9)
-    rng = np.random.default_rng(1)
-    data = rng.normal(size=(20, 9)) * unit
+    data = np.random.default_rng(1).normal(size=(20, 9)) * unit
     frame = xr.DataArray(data, dims=("i", "gauge"), coords={"gauge": names})
     with pm.Model() as model:
         a, b = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0), pm.Normal.dist(0.0, 1.0)
         given: Any = {"metric": prb.Joint(prb.AreaMetric()), "observed": frame}
         response = lambda a, b: (a[..., None] + b[..., None] * np.arange(9)) * unit  # noqa: E731
         prb.Simulator("strain", response, a, b, propagation=prb.Resimulated(64), **given)
-    draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((1, 8)))})
-    tree = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plots.plot_responses(tree, model=model, before=False)
+    draws = posterior_of(mu=np.zeros((1, 8)))
+    pc = prb.plots.plot_responses(draws, model=model, before=False)
     _, y = read.xy(pc, "measured", "strain")
     expected = (data - data.mean(axis=0)) / data.std(axis=0)
     np.testing.assert_allclose(y[np.isfinite(y)], expected.ravel())

@@ -56,6 +56,11 @@ def test_the_verdict_stands_in_the_title() -> None:
         assert axis.get_title() == f"p = {test.p_value:.2g}, level 5%\n{expected}"
         assert axis.get_xlabel() == "u-value"
     assert prb.plots.plot_validity(validity(0.0, True)).axes[0].get_xlabel() == "|2u - 1|"
+    # Several tests have a panel each.
+    small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
+    pc = prb.plots.plot_validity({"all": validity(), "some": small})
+    assert [axis.get_title().split(",")[0] for axis in pc.axes] == ["all", "some"]
+    assert [axis.get_ylabel() for axis in pc.axes] == ["share of 20 values", "share of 7 values"]
 
 
 def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
@@ -69,16 +74,6 @@ def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
         middle = path.contains_points(np.column_stack([v, (low + high) / 2 + 1e-9]))
         assert middle[high > low].all()
         assert not path.contains_points(np.column_stack([v, high + 0.03]))[high < 0.96].any()
-
-
-def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
-    small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
-    pc = prb.plots.plot_validity({"all": validity(), "some": small})
-    assert [axis.get_title().split(",")[0] for axis in pc.axes] == ["all", "some"]
-    assert [axis.get_ylabel() for axis in pc.axes] == [
-        "share of 20 values",
-        "share of 7 values",
-    ]
 
 
 # -- several outputs -------------------------------------------------------------------------------

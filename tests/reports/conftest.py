@@ -11,6 +11,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 
 import prbayes as prb
 
@@ -37,24 +38,14 @@ def same(x: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def calibrated() -> Calibrated:
-    with pm.Model() as model:
-        mu = pm.Normal("mu", 1.5, 1)
-        sigma = pm.HalfNormal("sigma", 1)
-        pm.Deterministic("cv", sigma / mu)
-        x = pm.Normal.dist(mu, sigma)
-        prb.Simulator(
-            "y",
-            same,
-            x,
-            metric=prb.KullbackLeibler(),
-            observed=OBSERVED,
-            specimens=np.arange(100, 130),
-            propagation=prb.Reweighted(256),
-        )
-    optimum = prb.minimize(model)
+    metric, few, labels = prb.KullbackLeibler(), prb.Reweighted(256), np.arange(100, 130)
+    with one_input(OBSERVED, metric, few, same, mu=(1.5, 1), specimens=labels) as model:
+        pm.Deterministic("cv", model["sigma"] / model["mu"])
+    optimum = prb.minimize(model, starts=0)
     posterior = prb.sample_smc(
         150, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
+    x = pm.Normal.dist(model["mu"], model["sigma"])
     later = prb.predict(posterior, same, x, model=model, random_seed=1)
     fresh = np.random.default_rng(4).normal(2.0, 0.6, 12)
     test = prb.area_test(fresh, later, null=prb.validation.PosteriorNull(199))

@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import posterior_of
 
 import prbayes as prb
 from prbayes._finding import Finding, as_json
@@ -80,11 +81,9 @@ def test_validity(calibrated: Any, page: Any, row: Any, section: Any) -> None:
     assert not any("up to" in p for p in section(one, "Test of the model").text)
     statistics = section(both, "Test statistics")
     rows = cells(statistics.table).rows
-    assert [r[0] for r in rows] == ["early", "late"]
-    assert [r[1] for r in rows] == ["not rejected", "rejected"]
-    assert [p for p in statistics.text if p.startswith("Null hypothesis: ")] == [
-        f"Null hypothesis: {test.null}."
-    ], "one null, said once"
+    assert [r[:2] for r in rows] == [("early", "not rejected"), ("late", "rejected")]
+    null = f"Null hypothesis: {test.null}."
+    assert [p for p in statistics.text if p.startswith("Null hypothesis: ")] == [null], "once"
 
 
 def test_origin(calibrated: Any, page: Any, row: Any) -> None:
@@ -95,6 +94,10 @@ def test_origin(calibrated: Any, page: Any, row: Any) -> None:
     assert float(found["seconds"]) == pytest.approx(attrs["seconds"], abs=0.51)
     assert row("optimum", "seed", page)["responses"] == str(optimum.n_responses)
     assert f"pymc {attrs['pymc_version']}" in page.text("p")
+
+
+def pair_of(a: Any, b: Any) -> Any:
+    return np.stack([a, b], axis=-1)
 
 
 NULL: dict[str, Any] = {"null": prb.validation.PosteriorNull(99)}
@@ -135,7 +138,7 @@ def test_specimens_have_readings_beside_u_values(calibrated: Any, later: xr.Data
     assert [row["specimen"] for row in rows] == names
 
 
-def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray) -> None:
+def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray, section: Any) -> None:
     right = later.copy(data=later.values[..., ::-1] + 10)
     prediction = xr.concat([later, right], dim=xr.Variable("end", ["left", "right"]))
     prediction = prediction.transpose(..., "end").assign_attrs(later.attrs)
@@ -152,7 +155,13 @@ def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray) -> 
     shown = [float(row[key]) for key in ("predicted median", "89% from", "to")]
     np.testing.assert_allclose(shown, np.quantile(later, [0.5, 0.055, 0.945]), atol=6e-3)
     assert len(table(**given)) == 40  # of 60 values, a page
-    assert table(**given)[30]["condition"] == "hot[right]"
+    # Failures that no predicted specimen has are named.
+    words = ": specimens failed, and no predicted one does: the model excludes them."
+    report = prb.Report("x", **given, pictures=False)
+    assert "hot[left]" + words in section(report, "Test of the model").text
+    prediction[..., 0, 0] = np.inf
+    report = prb.Report("x", **given, pictures=False)
+    assert "hot[left]" + words not in section(report, "Test of the model").text
 
 
 # -- page one, and the answer -----------------------------------------------------------------
@@ -182,16 +191,11 @@ def test_repeated_readings_are_those_of_their_specimens(grouped: bool) -> None:
         mu = pm.Normal("mu", 5, 1, dims="kind" if grouped else None)
         if grouped:
             mu = mu[prb.response.group("kind")]
-        a, b = pm.Normal.dist(mu, 0.5), pm.Normal.dist(70, 3.0)
-        prb.Simulator(
-            "frame",
-            lambda a, b: np.stack([a, b], axis=-1),
-            *(a, b),
-            metric=prb.LogLikelihood(error=0.1),
-            observed=y,
-            specimens=np.repeat(np.arange(10), 2),
-        )
-    tree = draws(mu=np.full((1, 3), 5.0))
+        inputs = pm.Normal.dist(mu, 0.5), pm.Normal.dist(70, 3.0)
+        given: Any = {"metric": prb.LogLikelihood(error=0.1), "observed": y}
+        labels = np.repeat(np.arange(10), 2)
+        prb.Simulator("frame", pair_of, *inputs, specimens=labels, **given)
+    tree = posterior_of(mu=np.full((1, 3), 5.0))
     fitted_to = "10 specimens with 2 outputs of frame."
     if grouped:
         tree["posterior"] = xr.Dataset({"mu": (["chain", "draw", "kind"], np.full((1, 3, 2), 5.0))})
@@ -217,20 +221,16 @@ def test_problems_are_counted_on_page_one(calibrated: Any, section: Any) -> None
     assert "Posterior: The data do not see mu." in section(again, "Diagnostics").text
 
 
-def draws(**values: Any) -> xr.DataTree:
-    variables = {name: (["chain", "draw"], v) for name, v in values.items()}
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
-
-
 def test_many_parameters_are_in_the_appendix() -> None:
-    first = draws(p=np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0]]))
+    first = posterior_of(p=np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0]]))
     (section,) = answer(gather(posterior={"a": first, "b": first}))
     assert cells(section.table).rows[0][:3] == ("p", "2.00", "0.63")
     many = {f"p{i}": np.random.default_rng(i).normal(size=(2, 20)) for i in range(31)}
-    (section,) = answer(gather(posterior=draws(**many)))
+    tree = posterior_of(**many)
+    (section,) = answer(gather(posterior=tree))
     assert section.text == ("The estimates are in the appendix.",)
     assert section.table is None
-    (section,) = comparison(gather(posterior={"a": draws(**many), "b": draws(**many)}))
+    (section,) = comparison(gather(posterior={"a": tree, "b": tree}))
     assert len(section.table) == 2 * 31, "all rows, where a notebook shows a page"
 
 
@@ -318,14 +318,3 @@ def test_a_bootstrap_is_reported_without_the_model(calibrated: Any, section: Any
     passed = prb.Report("x", posterior=boot, validity=calibrated.test, pictures=False).sections[0]
     assert passed.title == "Passed"
     assert passed.text[-1] == "Not all results were diagnosed: that needs the model."
-
-
-def test_failures_that_the_prediction_excludes_are_named(later: xr.DataArray, section: Any) -> None:
-    fresh = np.append(np.random.default_rng(4).normal(2.0, 0.6, 11), np.inf)
-    words = "a: specimens failed, and no predicted one does: the model excludes them."
-    report = prb.Report("x", validation={"a": (fresh, later)}, pictures=False)
-    assert words in section(report, "Test of the model").text
-    some = later.copy()
-    some[..., 0] = np.inf
-    report = prb.Report("x", validation={"a": (fresh, some)}, pictures=False)
-    assert words not in section(report, "Test of the model").text

@@ -15,6 +15,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 
 import prbayes as prb
 from prbayes.reports import figures
@@ -113,12 +114,7 @@ def test_a_report_computes_responses_only_if_they_are_cheap(
         count += np.size(x)
         return 2 * x
 
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        once = prb.Resimulated(64)
-        prb.Simulator(
-            "y", response, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0], propagation=once
-        )
+    model = one_input([0.0, 2.0, 4.0], prb.AreaMetric(), prb.Resimulated(64), response, sd=1.0)
     optimum = prb.minimize(model)
     optimum = replace(optimum, search=replace(optimum.search, seconds=seconds))
     before = count, optimum.evaluator.n_responses
@@ -163,13 +159,8 @@ def test_without_graphviz_there_is_no_graph(
     assert lacking not in report._html()
 
 
-def needs_dot() -> None:
-    if shutil.which("dot") is None:
-        pytest.skip("the program dot of Graphviz is not installed")
-
-
+@pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
 def test_the_graph_shows_the_variables(report: prb.Report, section: Any) -> None:
-    needs_dot()
     drawn = section(report, "Graph").picture
     for name in ("mu", "sigma", "y", "Simulator"):
         assert f">{name}</text>".encode() in drawn
@@ -213,22 +204,15 @@ def test_the_graph_is_the_same_in_every_process(monkeypatch: pytest.MonkeyPatch)
     assert sources[0][0] == [["z", "b", "y", "a"], ["s"]]
 
 
-def pair_of(a: Any, b: Any) -> Any:
-    return np.stack([a, b], axis=-1)
-
-
 def test_pairs_of_outputs_are_drawn_where_responses_are_stored(calls: Calls) -> None:
     """Otherwise one sentence reports that all pictures of responses are missing."""
     title = ["Pictures that could not be made"]
     data = np.random.default_rng(1).normal(size=(10, 2))
-    draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 20)))})
-    posterior = xr.DataTree.from_dict({"posterior": draws})
+    posterior = posterior_of(mu=np.zeros((2, 20)))
+    response = lambda a: np.stack([a, a**2], axis=-1)  # noqa: E731
     for propagation, count in ((prb.Reweighted(256), 2), (prb.Resimulated(64), 0)):
-        with pm.Model() as model:
-            a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-            given: Any = {"metric": prb.Joint(prb.AreaMetric()), "propagation": propagation}
-            b = pm.Normal.dist(0.0, 1.0)
-            prb.Simulator("y", pair_of, a, b, observed=data, **given)
+        metric = prb.Joint(prb.AreaMetric())
+        model = one_input(data, metric, propagation, response, mu=(0, 1), sd=1.0)
         calls.clear()
         drawn = figures.pictures_of(gather(model, None, posterior))
         assert len({"responses", "outputs"} & set(calls)) == count

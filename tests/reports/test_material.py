@@ -10,10 +10,10 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._finding import Finding
-from prbayes.model.random_variable import nodes
 from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import cells
@@ -79,28 +79,18 @@ def test_what_is_given_as_something_else_is_refused(
         gather(**{kind: results[value]})
 
 
-def test_draws_under_another_prior_are_refused_beside_the_model(calibrated: Any) -> None:
-    with pm.Model() as narrow:
-        mu = pm.Normal("mu", 1.5, 0.01)
-        sigma = pm.HalfNormal("sigma", 1)
-        pm.Deterministic("cv", sigma / mu)
-        given = {"metric": prb.KullbackLeibler(), "observed": nodes_data(calibrated.model)}
-        x = pm.Normal.dist(mu, sigma, name="stiffness")
-        labels = np.arange(100, 130)
-        prb.Simulator(
-            "y", np.positive, x, **given, specimens=labels, propagation=prb.Reweighted(256)
-        )
+def test_draws_under_another_prior_are_refused_beside_the_model(
+    observed: Any, calibrated: Any
+) -> None:
+    metric, few, labels = prb.KullbackLeibler(), prb.Reweighted(256), np.arange(100, 130)
+    with one_input(observed, metric, few, mu=(1.5, 0.01), specimens=labels) as narrow:
+        pm.Deterministic("cv", narrow["sigma"] / narrow["mu"])
     with pytest.raises(ValueError, match="posterior: got a result of another problem: prior of mu"):
         prb.Report("x", model=narrow, posterior=calibrated.posterior, pictures=False)
     # Beside draws of the model's own prior others may be shown.
     other = calibrated.posterior.copy()
     both = {"own": calibrated.posterior, "other": other}
     prb.Report("x", model=calibrated.model, posterior=both, pictures=False)
-
-
-def nodes_data(model: pm.Model) -> Any:
-    (node,) = nodes(model).values()
-    return node.target.observed
 
 
 def test_validation_data_are_those_of_the_test(calibrated: Any) -> None:
@@ -130,35 +120,31 @@ def test_a_name_is_given_once(calibrated: Any) -> None:
         prb.Report("x", optimum={"a": calibrated.optimum}, posterior={"a": calibrated.posterior})
 
 
-def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
+def test_a_saved_optimum_is_diagnosed_and_compared_as_in_memory(calibrated: Any) -> None:
     lost = replace(
         calibrated.optimum,
         search=replace(calibrated.optimum.search, result=Result.FAILED),
         findings=(Finding("not-identified", "The data do not see mu."),),
     )
     memory = gather(optimum=lost).diagnoses["optimum"]
-    saved = gather(optimum=lost.to_datatree()).diagnoses["optimum"]
+    saved = gather(optimum=lost.to_datatree(), posterior=calibrated.posterior)
+    diagnosis = saved.diagnoses["optimum"]
     assert memory is not None
-    assert saved is not None
-    assert memory.messages == saved.messages
-    assert saved.messages[0] == "The data do not see mu."
-    assert "did not converge (The minimiser failed)" in saved.messages[1]
-
-
-def test_deterministics_are_compared(calibrated: Any) -> None:
-    trees = {"optimum": calibrated.optimum.to_datatree(), "posterior": calibrated.posterior}
-    comparison = gather(**trees).comparison
-    assert comparison is not None
-    assert comparison["hyperparameter"].values.tolist() == ["mu", "sigma", "cv"]
+    assert diagnosis is not None
+    assert memory.messages == diagnosis.messages
+    assert diagnosis.messages[0] == "The data do not see mu."
+    assert "did not converge (The minimiser failed)" in diagnosis.messages[1]
+    assert saved.comparison is not None
+    assert saved.comparison["hyperparameter"].values.tolist() == ["mu", "sigma", "cv"]
 
 
 @pytest.mark.long
 def test_statistics_of_a_data_sheet_are_no_measured_responses() -> None:
-    sheet = prb.Summary(n=40, mean=3.1, sd=0.9)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 1))
+        sheet = prb.Summary(n=40, mean=3.1, sd=0.9)
         prb.Simulator("load", np.positive, x, observed=sheet, propagation=prb.Reweighted(256))
-    optimum = prb.minimize(model)
+    optimum = prb.minimize(model, starts=0)
     for given in ({"model": model, "optimum": optimum}, {"optimum": optimum.to_datatree()}):
         material = gather(**given)
         assert material.observed == {}

@@ -7,6 +7,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 from scipy.stats import norm
 
 import prbayes as prb
@@ -47,11 +48,6 @@ def idata() -> xr.DataTree:
     return prb.sample_smc(100, chains=2, random_seed=3, **settings)
 
 
-def tree_of(**values: Any) -> xr.DataTree:
-    variables = {k: (["chain", "draw"], np.asarray(v)) for k, v in values.items()}
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
-
-
 # -- estimates
 
 
@@ -88,19 +84,16 @@ def test_estimates_of_an_optimum_and_a_posterior() -> None:
 
 def test_a_covariance_is_compared_by_its_parts_if_all_results_have_them() -> None:
     rng = np.random.default_rng(0)
-    sizes = {"mu": (), "cov": (3,), "cov_stds": (2,), "cov_corr": (2, 2)}
-    draws = {
-        name: (
-            ["chain", "draw", *(f"{name}_{i}" for i in range(len(shape)))],
-            rng.normal(size=(2, 50, *shape)),
-        )
-        for name, shape in sizes.items()
-    }
-    whole = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
-    part = xr.DataTree.from_dict({"posterior": xr.Dataset({n: draws[n] for n in ("mu", "cov")})})
-    names = prb.compare({"a": whole, "b": whole})["hyperparameter"].values.tolist()
+    sizes = {"mu": (), "cov": (3,), "cov_stds": (2,), "cov_corr": (2, 2), "force [N]": (2,)}
+    draws = {name: rng.normal(size=(2, 50, *shape)) for name, shape in sizes.items()}
+    whole, part = posterior_of(**draws), posterior_of(mu=draws["mu"], cov=draws["cov"])
+    table = prb.compare({"a": whole, "b": whole})
+    names = table["hyperparameter"].values.tolist()
     assert names[:3] == ["mu", "cov_stds[0]", "cov_stds[1]"]
-    assert len(names) == 7
+    assert names[-2:] == ["force [N][0]", "force [N][1]"]
+    assert len(names) == 9
+    expected = draws["force [N]"].mean(axis=(0, 1))
+    np.testing.assert_allclose(table["estimate"].sel(result="b")[-2:], expected)
     names = prb.compare({"a": whole, "b": part})["hyperparameter"].values.tolist()
     assert names == ["mu", "cov[0]", "cov[1]", "cov[2]"]
 
@@ -117,7 +110,7 @@ def test_draws_without_coordinates_have_those_of_the_optimum() -> None:
 
 
 def test_the_posterior_of_any_sampler() -> None:
-    draws = tree_of(sigma=np.random.default_rng(2).normal(size=(2, 50)))
+    draws = posterior_of(sigma=np.random.default_rng(2).normal(size=(2, 50)))
     table = prb.compare({"NUTS": draws, "optimum": optimum()}, model=model())
     assert list(table["hyperparameter"].values) == ["sigma"]
     assert np.isnan(table["n_responses"].sel(result="NUTS"))
@@ -127,7 +120,7 @@ def test_the_posterior_of_any_sampler() -> None:
     # Scores need every hyperparameter.
     assert not [key for key in table.data_vars if "AreaMetric" in str(key)]
     # Results without spread.
-    first, second = tree_of(sigma=np.ones((1, 5))), tree_of(sigma=np.full((1, 5), 2.0))
+    first, second = posterior_of(sigma=np.ones((1, 5))), posterior_of(sigma=np.full((1, 5), 2.0))
     assert np.isinf(prb.compare({"a": first, "b": second})["shift"].sel(result="b")).all()
 
 
@@ -135,45 +128,27 @@ def test_the_posterior_of_any_sampler() -> None:
     ("results", "error", "words"),
     [
         ({"a": xr.DataTree()}, TypeError, "a: got DataTree, expected"),
-        ({"a": tree_of(x=[[1.0, 2.0]]), "b": tree_of(y=[[1.0, 2.0]])}, ValueError, "share no"),
+        ({"a": posterior_of(x=[[1.0, 2.0]])}, ValueError, "share no"),
     ],
 )
 def test_invalid_results(results: Any, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        prb.compare(results)
+        prb.compare(results | {"b": posterior_of(y=[[1.0, 2.0]])})
     with pm.Model() as other:
         pm.Normal("tau")
-    with pytest.raises(
-        ValueError, match=r"share no hyperparameter \(a: mean.*\) with each other and the model"
-    ):
+    match = r"share no hyperparameter \(a: mean.*\) with each other and the model"
+    with pytest.raises(ValueError, match=match):
         prb.compare({"a": optimum()}, model=other)
 
 
 def test_names_that_not_all_results_have_are_reported(caplog: pytest.LogCaptureFixture) -> None:
-    one = tree_of(mu=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
-    other = tree_of(m=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
-    with caplog.at_level("WARNING", "prbayes"):
-        assert prb.compare({"a": one, "b": other})["hyperparameter"].values.tolist() == ["sigma"]
-    assert "compare: left out mu, m, as not all results have these names" in caplog.text
-    caplog.clear()
+    one = posterior_of(mu=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
+    other = posterior_of(m=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
     with caplog.at_level("WARNING", "prbayes"):
         prb.compare({"a": one, "b": one})
-    assert not caplog.text
-
-
-def test_names_with_brackets_are_compared() -> None:
-    with pm.Model() as other:
-        pm.Normal("mu[1]")
-        pm.Normal("force [N]", shape=2)
-    draws = np.random.default_rng(0).normal(size=(2, 1, 50))
-    vector = ("chain", "draw", "i"), np.moveaxis(draws, 0, -1)
-    values = {"mu[1]": (("chain", "draw"), draws[0]), "force [N]": vector}
-    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(values)})
-    table = prb.compare({"a": tree, "b": tree}, model=other)
-    names = ["mu[1]", "force [N][0]", "force [N][1]"]
-    assert table["hyperparameter"].values.tolist() == names
-    expected = [draws[0].mean(), *draws.mean(axis=(1, 2))]
-    np.testing.assert_allclose(table["estimate"].sel(result="b"), expected)
+        assert not caplog.text
+        assert prb.compare({"a": one, "b": other})["hyperparameter"].values.tolist() == ["sigma"]
+    assert "compare: left out mu, m, as not all results have these names" in caplog.text
 
 
 # -- scores
@@ -201,9 +176,7 @@ def test_scores_of_each_result_under_every_metric() -> None:
     few = prb.compare(results, model=model(), metrics=[prb.ProbabilityResidual(scale_base=1)])
     assert "first AreaMetric" not in few
     assert (few["first ProbabilityResidual"] != table["first ProbabilityResidual"]).all()
-    far = tree_of(sigma=np.full((1, 5), 1e-3))["posterior"].to_dataset()
-    far["mean"] = ["chain", "draw", "lab"], np.full((1, 5, 2), 90.0)
-    far = xr.DataTree.from_dict({"posterior": far})
+    far = posterior_of(sigma=np.full((1, 5), 1e-3), mean=np.full((1, 5, 2), 90.0))
     assert np.isnan(prb.compare({"far": far}, model=model())["first AreaMetric"]).all()
 
 
@@ -251,11 +224,8 @@ def test_several_outputs_are_scored_by_joint_metrics() -> None:
 
 def test_scores_that_compute_responses_have_to_be_requested() -> None:
     data: Floats = DATA[:, 0]
-    with pm.Model() as m:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        propagation = prb.Resimulated(64)
-        prb.Simulator("y", np.positive, x, metric=AREA, observed=data, propagation=propagation)
-    draws = {"a": tree_of(mu=np.ones((1, 5)))}
+    m = one_input(data, AREA, prb.Resimulated(64), mu=(1, 1), sd=0.5)
+    draws = {"a": posterior_of(mu=np.ones((1, 5)))}
     assert "AreaMetric" not in prb.compare(draws, model=m)
     table = prb.compare(draws, model=m, metrics=[AREA])
     assert "KullbackLeibler" not in table
@@ -266,14 +236,12 @@ def test_scores_that_compute_responses_have_to_be_requested() -> None:
 @pytest.mark.long
 def test_a_metric_and_the_likelihood_of_the_same_data_are_compared() -> None:
     def fitted(**given: Any) -> prb.Optimum:
-        with pm.Model() as m:
-            x = pm.Normal.dist(pm.Normal("mu", 1, 2), pm.HalfNormal("sigma", 1))
-            prb.Simulator("y", np.positive, x, **{"observed": DATA[:, 0]} | given)
-        return prb.minimize(m, starts=0, progressbar=False)
+        settings = {"observed": DATA[:, 0]} | given
+        return prb.minimize(one_input(mu=(1, 2), **settings), starts=0, progressbar=False)
 
     labels, counts = list(range(40)), np.arange(40) % 3 + 1
     by_metric = {"metric": prb.ProbabilityResidual(), "propagation": prb.Resimulated(256)}
-    for data in ({}, {"specimens": labels}, {"weights": counts}):
+    for data in ({"specimens": labels}, {"weights": counts}):
         pair = {"likelihood": fitted(**data), "metric": fitted(**by_metric, **data)}
         for m in (None, *(optimum.model for optimum in pair.values())):
             table = prb.compare(pair, model=m, metrics=[AREA])

@@ -1,11 +1,13 @@
 """Inputs of the measured specimens are those of the closed form of a normal population."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 
 import prbayes as prb
 from prbayes.response.compile import PLAIN
@@ -18,12 +20,9 @@ def double(x: Any) -> Any:
     return 2 * x
 
 
-def normal_model(observed: Any, metric: Any = None, **keywords: Any) -> pm.Model:
+def normal_model(observed: Any, metric: Any = None) -> pm.Model:
     metric = prb.LogLikelihood(error=ERROR) if metric is None else metric
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 0.5), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", double, x, metric=metric, observed=observed, **keywords)
-    return model
+    return one_input(observed, metric, response=double, mu=(1, 0.5), sigma=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -74,29 +73,33 @@ def test_replicates_are_other_specimens(optimum: prb.Optimum, tree: xr.DataTree)
     np.testing.assert_array_equal(tree["observed_data"]["y"], observed_values(optimum))
 
 
-def test_a_gross_error_leaves_the_population() -> None:
-    y = np.append(2 * np.random.default_rng(2).normal(1, 0.3, 30), 9.0)
-    metric = prb.LogLikelihood(error=0.1, gross_errors=0.1)
-    optimum = prb.minimize(normal_model(y, metric), starts=0)
-    draws = prb.individuals(optimum, n_draws=2000)["posterior"]
-    probability = draws["gross_error"].mean(("chain", "draw")).values
-    assert probability[-1] > 0.999
-    assert probability[:-1].mean() < 0.05
-    x = draws["x"].isel(specimen=-1)
-    mu, sigma = optimum.point["mu"], optimum.point["sigma"]
-    assert float(x.mean()) == pytest.approx(float(mu), abs=5 * sigma / np.sqrt(2000))
-
-
-@pytest.mark.parametrize("error", [0.02, 0.1])
-@pytest.mark.parametrize("factor", [10.0, 100.0])  # within and beyond reach of the priors
-def test_the_population_of_data_with_a_gross_error_is_that_of_the_others(
-    factor: float, error: float
-) -> None:
+@cache
+def with_gross_error(factor: float, error: float) -> tuple[prb.Optimum, Any]:
+    """Return the optimum of 25 readings one of which has a factor, and the other readings."""
     y = 2 * np.random.default_rng(2).normal(1, 0.1, 25)
     rest = np.delete(y, 3)
     y[3] *= factor
     metric = prb.LogLikelihood(error=error, gross_errors=True)
-    optimum = prb.minimize(normal_model(y, metric), starts=0)
+    return prb.minimize(normal_model(y, metric), starts=0), rest
+
+
+def test_a_gross_error_leaves_the_population() -> None:
+    optimum, _ = with_gross_error(100.0, 0.1)
+    draws = prb.individuals(optimum, n_draws=2000)["posterior"]
+    probability = draws["gross_error"].mean(("chain", "draw")).values
+    assert probability[3] > 0.999
+    assert np.delete(probability, 3).mean() < 0.05
+    x = draws["x"].isel(specimen=3)
+    mu, sigma = optimum.point["mu"], optimum.point["sigma"]
+    assert float(x.mean()) == pytest.approx(float(mu), abs=5 * sigma / np.sqrt(2000))
+
+
+@pytest.mark.parametrize(("factor", "error"), [(10.0, 0.02), (100.0, 0.1)])
+def test_the_population_of_data_with_a_gross_error_is_that_of_the_others(
+    factor: float, error: float
+) -> None:
+    """Within and beyond reach of the priors."""
+    optimum, rest = with_gross_error(factor, error)
     assert optimum.converged
     assert not optimum.findings
     sigma = np.sqrt(rest.var() - error**2) / 2
@@ -112,11 +115,9 @@ def test_an_unknown_error_of_the_readings() -> None:
     rows = 2 * rng.normal(1, 0.5, (20, 1)) + rng.normal(0, 0.2, (20, 3))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 0.5), pm.HalfNormal("sigma", 0.5))
-        error = pm.HalfNormal("error", 0.5)
-        metric = prb.LogLikelihood(error=error)
-        prb.Simulator(
-            "y", lambda x: np.stack([2 * x] * 3, axis=-1), x, metric=metric, observed=rows
-        )
+        metric = prb.LogLikelihood(error=pm.HalfNormal("error", 0.5))
+        response = lambda x: np.stack([2 * x] * 3, axis=-1)  # noqa: E731
+        prb.Simulator("y", response, x, metric=metric, observed=rows)
     optimum = prb.minimize(model, starts=0)
     draws = prb.individuals(optimum, n_draws=1000)["posterior"]["x"]
     mu, sigma, sd = (float(optimum.point[name]) for name in ("mu", "sigma", "error"))
@@ -135,17 +136,16 @@ def test_a_posterior_keeps_its_chains(optimum: prb.Optimum) -> None:
 
 
 def test_a_metric_has_no_record_of_specimens() -> None:
-    optimum = prb.minimize(normal_model([1.0, 2.0, 3.0], prb.AreaMetric()), starts=0)
+    draws = posterior_of(mu=np.ones((1, 4)), sigma=np.ones((1, 4)))
+    model = normal_model([1.0, 2.0, 3.0], prb.AreaMetric())
     with pytest.raises(TypeError, match="metrics compare distributions"):
-        prb.individuals(optimum)
+        prb.individuals(draws, model=model)
 
 
 def test_specimens_have_their_labels() -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1), name="x")
-        observed, labels = [1.0, 3.0, 2.0, 2.5], ["c", "a", "d", "b"]
-        prb.Simulator("y", lambda x: 2 * x, x, observed=observed, specimens=labels)
-        tree = prb.individuals(prb.minimize(starts=0), n_draws=20)
+    observed, labels = [1.0, 3.0, 2.0, 2.5], ["c", "a", "d", "b"]
+    model = one_input(observed, response=double, mu=(1, 1), specimens=labels)
+    tree = prb.individuals(prb.minimize(model, starts=0), n_draws=20)
     for group in ("posterior", "posterior_predictive", "observed_data"):
         assert tree[group]["specimen"].values.tolist() == labels
     draws = tree["posterior"]["x"].sel(specimen="a")

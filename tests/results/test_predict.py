@@ -10,6 +10,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from first_use import first_use
+from one_input import one_input, posterior_of
 from scipy.special import ndtri
 
 import prbayes as prb
@@ -41,22 +42,13 @@ class Counted:
         return np.exp(x)
 
 
-def tree(**values: Any) -> xr.DataTree:
-    """Return a posterior as any sampler gives it."""
-    arrays = {
-        n: (["chain", "draw", *(f"{n}_{i}" for i in range(np.ndim(v) - 2))], v)
-        for n, v in values.items()
-    }
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(arrays)})
+POSTERIOR = posterior_of(mu=MEANS, sigma=np.full((2, 3), 0.5))
 
 
-POSTERIOR = tree(mu=MEANS, sigma=np.full((2, 3), 0.5))
-
-
-def build(response: Any = identity, n: int = 512, **keywords: Any) -> tuple[pm.Model, Any]:
+def build(response: Any = identity, **keywords: Any) -> tuple[pm.Model, Any]:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        settings = {"propagation": prb.Reweighted(n), "observed": OBSERVED, **keywords}
+        settings = {"propagation": prb.Reweighted(512), "observed": OBSERVED, **keywords}
         prb.Simulator("y", response, x, metric=prb.KullbackLeibler(), **settings)
     return model, x
 
@@ -93,7 +85,9 @@ def test_each_draw_is_a_population(stored: bool) -> None:
 
 
 def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
-    many = tree(mu=np.tile(np.linspace(0.5, 1.5, 101), (2, 1)), sigma=np.full((2, 101), 0.5))
+    many = posterior_of(
+        mu=np.tile(np.linspace(0.5, 1.5, 101), (2, 1)), sigma=np.full((2, 101), 0.5)
+    )
     many["posterior"] = many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)
     y = predict(identity, many, n_draws=10, n_samples=200)
     assert y.draw.values.tolist() == [0, 250, 500, 750, 1000]
@@ -104,21 +98,6 @@ def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
     y = prb.predict(best, identity, plain()[1], random_seed=1)
     assert y.shape == (1, 1, 500)
     assert y.mean() == pytest.approx(best.point["mu"], abs=0.02)
-
-
-@pytest.mark.slow
-def test_a_posterior_of_stock_pymc() -> None:
-    model, x = plain()
-    prb.refine(model)
-    idata = pm.sample(
-        200, tune=200, chains=2, cores=1, model=model, random_seed=1, progressbar=False, quiet=True,
-        compute_convergence_checks=False,
-    )  # fmt: skip
-    y = prb.predict(idata, identity, x, model=model, random_seed=1)
-    assert y.shape == (2, 200, 500)
-    assert y.mean() == pytest.approx(float(idata.posterior["mu"].mean()), abs=0.01)
-    with pytest.raises(ValueError, match="the data of the calibration"):
-        prb.area_test(OBSERVED, y)
 
 
 # -- what is computed
@@ -213,7 +192,7 @@ def test_epistemic_variables_and_vectors() -> None:
         x = pm.MvNormal.dist(mu, np.array([[1.0, 0.5], [0.5, 1.0]]))
         prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=AREA, observed=OBSERVED)
     means = np.array([[[0.0, 1.0], [1.0, 2.0]]])
-    posterior = tree(mu=means, factor=np.array([[1.0, 3.0]]))
+    posterior = posterior_of(mu=means, factor=np.array([[1.0, 3.0]]))
     settings = {"model": model, "random_seed": 1}
 
     def scaled(x: Any, factor: Any, shift: Any) -> Any:
@@ -244,23 +223,6 @@ def test_the_seed_determines_the_specimens(stored: bool) -> None:
     for change in changes:
         other = predict(identity, stored=stored, **change)
         assert other.attrs["specimens_id"] != y.attrs["specimens_id"]
-
-
-def test_each_simulator_has_a_design() -> None:
-    responses = {"y0": identity, "y1": np.exp}
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        for k, (name, response) in enumerate(responses.items()):
-            propagation = prb.Reweighted(256, random_seed=k)
-            prb.Simulator(
-                name, response, x, metric=AREA, observed=OBSERVED, propagation=propagation
-            )
-    identities = set()
-    for name, response in responses.items():
-        y = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
-        assert y.attrs["source"] == f"stored responses of {name}"
-        identities.add(y.attrs["specimens_id"])
-    assert len(identities) == 2
 
 
 def test_specimens_and_data_of_the_calibration_are_saved(tmp_path: Path) -> None:
@@ -294,7 +256,7 @@ def test_failed_specimens_stay_and_nan_is_counted(caplog: pytest.LogCaptureFixtu
 
 
 def test_a_design_that_does_not_cover_the_populations_is_refused() -> None:
-    far = tree(mu=np.full((1, 3), 9.0), sigma=np.full((1, 3), 0.01))
+    far = posterior_of(mu=np.full((1, 3), 9.0), sigma=np.full((1, 3), 0.01))
     with pytest.raises(DesignError, match=r"y: got a weight effective sample .*stored=False"):
         predict(identity, far)
     assert predict(identity, far, stored=False).mean() == pytest.approx(9.0, abs=0.01)
@@ -304,7 +266,7 @@ def test_a_design_that_does_not_cover_the_populations_is_refused() -> None:
     ("arguments", "keywords", "error", "message"),
     [
         (({"mu": 1.0}, identity), {}, TypeError, "got dict, expected an Optimum"),
-        ((tree(mu=MEANS), identity), {}, KeyError, r"a result without \['sigma'\]"),
+        ((posterior_of(mu=MEANS), identity), {}, KeyError, r"a result without \['sigma'\]"),
         ((POSTERIOR, identity), {"model": None}, TypeError, "no model on the context"),
         ((POSTERIOR, lambda x: 1 // 0), {}, ResponseError, "raised ZeroDivisionError"),
         ((POSTERIOR, prb.scalar(lambda x: 1 // 0)), {}, ResponseError, r"or return NaN \(.*there$"),
@@ -339,25 +301,23 @@ def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
 
 
 def test_draws_as_wide_as_epsilon_are_named_by_any_sampler() -> None:
-    def model_of(metric: prb.Metric) -> pm.Model:
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-            prb.Simulator("y", np.positive, x, metric=metric, observed=np.arange(9.0))
-        return model
-
-    by_distance, by_likelihood = (
-        model_of(metric)
-        for metric in (prb.KullbackLeibler(), prb.LogLikelihood(density=prb.GaussianKDE()))
+    by_distance, by_likelihood, by_specimen = (
+        one_input(np.arange(9.0), metric, sd=1.0)
+        for metric in (
+            prb.KullbackLeibler(),
+            prb.LogLikelihood(density=prb.GaussianKDE()),
+            prb.LogLikelihood(),
+        )
     )
-    draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 9)))})
 
     def codes(model: pm.Model | None, **attrs: Any) -> list[str]:
-        tree = xr.DataTree.from_dict({"posterior": draws.assign_attrs(attrs)})
+        tree = posterior_of(mu=np.zeros((2, 9)))
+        tree["posterior"].attrs.update(attrs)
         return [finding.code for finding in width_of_epsilon(tree, model)]
 
     assert codes(by_distance) == codes(by_distance, adjustment="none") == ["width-of-epsilon"]
     assert codes(by_distance, adjustment="estimate") == codes(by_distance, converged=1.0) == []
-    assert codes(by_likelihood) == codes(model_of(prb.LogLikelihood())) == codes(None) == []
+    assert codes(by_likelihood) == codes(by_specimen) == codes(None) == []
 
 
 def test_labels_of_the_response_are_those_of_the_prediction() -> None:
@@ -401,14 +361,13 @@ def test_a_prediction_with_failures_shows_moments_of_the_others() -> None:
     assert "inf  nan" not in shown
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_wide_populations_have_the_response_of_runs_far_from_the_data(seed: int) -> None:
-    observed = np.square(np.random.default_rng(seed).normal(10, 1, 3))
+def test_wide_populations_have_the_response_of_runs_far_from_the_data() -> None:
+    observed = np.square(np.random.default_rng(0).normal(10, 1, 3))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 30))
         prb.Simulator("y", np.square, x, observed=observed)
     for sigma, codes in ((15.0, []), (60.0, ["beyond-runs"])):
-        result = tree(mu=np.full((1, 4), 10.0), sigma=np.full((1, 4), sigma))
+        result = posterior_of(mu=np.full((1, 4), 10.0), sigma=np.full((1, 4), sigma))
         predicted, computed = (
             prb.predict(result, np.square, x, model=model, random_seed=1, stored=stored)
             for stored in (True, False)

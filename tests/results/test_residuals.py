@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input, posterior_of
 
 import prbayes as prb
 
@@ -22,23 +23,14 @@ def double(x: Any) -> Any:
 
 
 def at_truth(model: pm.Model, draws: int = 2) -> xr.DataTree:
-    """Return a posterior of the true hyperparameters alone."""
-    values = {"mu": np.full((1, draws), MU), "sigma": np.full((1, draws), SIGMA)}
-    return prb.residuals(
-        xr.DataTree.from_dict(
-            {"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in values.items()})}
-        ),
-        model=model,
-        n_draws=DRAWS,
-    )
+    """Return residuals of a posterior of the true hyperparameters alone."""
+    truth = posterior_of(mu=np.full((1, draws), MU), sigma=np.full((1, draws), SIGMA))
+    return prb.residuals(truth, model=model, n_draws=DRAWS)
 
 
 def build(observed: Any, response: Any = line, **options: Any) -> pm.Model:
     metric = prb.LogLikelihood(**{"error": ERROR} | options)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 0.5), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", response, x, metric=metric, observed=observed)
-    return model
+    return one_input(observed, metric, response=response, mu=(1, 0.5), sigma=0.5)
 
 
 def data(n: int = 9) -> Any:
@@ -77,25 +69,17 @@ def test_residuals_of_two_outputs_are_whitened_together() -> None:
 @pytest.mark.long
 def test_simulators_with_common_specimens_are_whitened_together() -> None:
     y = data()
-    metric = prb.LogLikelihood(error=ERROR)
     labels = [f"s{i}" for i in range(len(y))]
+    given: dict[str, Any] = {"metric": prb.LogLikelihood(error=ERROR), "specimens": labels}
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 0.5), pm.HalfNormal("sigma", 0.5))
-        for name, k, sign in (("a", 0, 2.0), ("b", 1, -1.0)):
-            prb.Simulator(
-                name,
-                lambda x, sign=sign: sign * x,
-                x,
-                metric=metric,
-                observed=y[:, k],
-                specimens=labels,
-            )
+        prb.Simulator("a", double, x, observed=y[:, 0], **given)
+        prb.Simulator("b", np.negative, x, observed=y[:, 1], **given)
     tree = at_truth(model, DRAWS)
     together = at_truth(build(y), DRAWS)["y"]["CWRES"].values
     for k, name in enumerate("ab"):
         np.testing.assert_allclose(tree[name]["CWRES"].values, together[:, k], atol=0.15)
-    table = prb.residuals(prb.minimize(model, starts=0, progressbar=False), n_draws=50)
-    frame = table.to_dataframe()
+    frame = tree.to_dataframe()
     assert frame["simulator"].tolist() == ["a"] * 9 + ["b"] * 9
     assert frame["specimen"].tolist() == labels * 2
     assert set(frame.columns) >= {"DV", "PRED", "IPRED", "IWRES", "CWRES"}
@@ -134,30 +118,7 @@ def test_logarithms_and_censored_readings() -> None:
     assert "DataTree" in repr(tree["y"])
 
 
-@pytest.mark.long
-def test_a_right_model_has_standard_residuals() -> None:
-    rng = np.random.default_rng(5)
-    n, times = 120, np.array([0.3, 1.0, 3.0])
-    rate, error = np.exp(rng.normal(0, 0.4, n)), 0.05
-
-    def decay(rate: Any) -> Any:
-        return np.exp(-np.multiply.outer(rate, times))
-
-    y = decay(rate) + rng.normal(0, error, (n, 3))
-    with pm.Model() as model:
-        k = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
-        metric = prb.LogLikelihood(error=error)
-        prb.Simulator("y", decay, k, metric=metric, observed=y)
-    table = prb.residuals(prb.minimize(model, starts=0, progressbar=False)).to_dataframe()
-    # Of 360 numbers: four standard errors of the mean and the standard deviation.
-    assert abs(table["CWRES"].mean()) < 4 / np.sqrt(360)
-    assert abs(table["CWRES"].std() - 1) < 4 / np.sqrt(720)
-
-
 def test_metrics_of_distributions_have_no_residuals() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 0.5), 0.5)
-        prb.Simulator("y", double, x, metric=prb.AreaMetric(), observed=data()[:, 0])
-    draws = xr.Dataset({"mu": (("chain", "draw"), np.ones((1, 4)))})
+    model = one_input(data()[:, 0], prb.AreaMetric(), response=double, mu=(1, 0.5), sd=0.5)
     with pytest.raises(TypeError, match=r"prb\.residuals: got a model whose metrics"):
-        prb.residuals(xr.DataTree.from_dict({"posterior": draws}), model=model)
+        prb.residuals(posterior_of(mu=np.ones((1, 4))), model=model)

@@ -53,13 +53,17 @@ def optimum(family: Any = lognormal) -> prb.Optimum:
 
 
 @cache
+def fitted(label: str) -> prb.Optimum:
+    return minimized({"normal": normal, "lognormal": lognormal}[label])
+
+
 def skewed() -> dict[str, prb.Optimum]:
-    return {f.__name__: minimized(f) for f in (normal, lognormal)}
+    return {label: fitted(label) for label in ("normal", "lognormal")}
 
 
 @cache
 def validated(label: str, folds: int = 5) -> xr.Dataset:
-    return prb.cross_validate(skewed()[label], folds=folds, random_seed=0, **QUIET)
+    return prb.cross_validate(fitted(label), folds=folds, random_seed=0, **QUIET)
 
 
 @pytest.mark.long
@@ -71,13 +75,12 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     assert found.n_held_out.values.ravel().tolist() == [15] * 4
     assert found.converged.all()
     fold = np.random.default_rng([3, 3]).permutation(np.arange(60) % 4)
-    for i in (0, 3):
-        refit = minimized(data=DATA[fold != i], metric=METRIC)
-        assert float(found.calibrated[i, 0]) == pytest.approx(refit.discrepancy, rel=0.01)
-        (x,) = refit.evaluator.nodes[0].inputs.aleatory
-        population = prb.predict(refit, np.positive, x, n_samples=40_000, **QUIET).values.ravel()
-        expected = METRIC(population, DATA[fold == i])
-        assert float(found.discrepancy[i, 0]) == pytest.approx(expected, rel=0.03)
+    refit = minimized(data=DATA[fold != 3], metric=METRIC)
+    assert float(found.calibrated[3, 0]) == pytest.approx(refit.discrepancy, rel=0.01)
+    (x,) = refit.evaluator.nodes[0].inputs.aleatory
+    population = prb.predict(refit, np.positive, x, n_samples=40_000, **QUIET).values.ravel()
+    expected = METRIC(population, DATA[fold == 3])
+    assert float(found.discrepancy[3, 0]) == pytest.approx(expected, rel=0.03)
     wrong = prb.cross_validate(optimum(normal), folds=4, random_seed=3)
     assert float(wrong.discrepancy.mean()) > 1.1 * float(found.discrepancy.mean())
     assert float(found.discrepancy.mean()) > float(found.calibrated.mean())
@@ -140,10 +143,8 @@ def test_the_numbers_are_those_of_arviz() -> None:
     table = prb.rank(found)
     options = {"se": 1.0, "p": 2.0, "n_samples": 1, "scale": "log", "warning": False, "good_k": 0.7}
     elpds = {
-        label: ELPDData(
-            elpd=float(table.score.sum()), n_data_points=60, elpd_i=table.score, **options
-        )
-        for label, table in found.items()
+        label: ELPDData(elpd=float(x.score.sum()), n_data_points=60, elpd_i=x.score, **options)
+        for label, x in found.items()
     }
     theirs = arviz_compare(elpds, method="pseudo-BMA", round_to="none")
     assert theirs.index.tolist() == table.candidate.values.tolist()
@@ -204,7 +205,7 @@ def test_two_responses_of_several_simulators_with_labels_and_weights() -> None:
                     specimens=np.arange(n), weights=weights[:n],
                     propagation=prb.Reweighted(512), **QUIET,
                 )  # fmt: skip
-        return prb.minimize(model, refine=False, **QUIET)
+        return prb.minimize(model, refine=False, starts=0, **QUIET)
 
     optima = {"bent": model_of(lambda x: 1.5 * x**2), "straight": model_of(lambda x: 2.0 * x)}
     # Specimens are assigned to folds whole.
@@ -226,29 +227,19 @@ def test_several_outputs_with_some_not_measured_and_some_failed() -> None:
     data = outputs(DATA)
     data[:12, 1] = np.nan
     assert np.isposinf(data).any()
-    metric = prb.Joint(prb.KullbackLeibler())
-    optima = {f.__name__: minimized(f, data, outputs, metric=metric) for f in (normal, lognormal)}
+    metric, few = prb.Joint(prb.KullbackLeibler()), prb.Reweighted(256)
+    optima = {
+        f.__name__: minimized(f, data, outputs, metric=metric, propagation=few)
+        for f in (normal, lognormal)
+    }
     table = prb.rank(optima, **QUIET)
     assert table.candidate.values[0] == "lognormal"
     assert np.isfinite(table["stderr"].values).all()
     assert table.attrs["n_specimens"] == 60
 
 
-@pytest.mark.long
-def test_any_metric_and_propagation_that_can_be_refitted() -> None:
-    candidates = {
-        "stored": skewed()["lognormal"],
-        "computed": minimized(propagation=prb.Resimulated(2000)),
-        "normal, PR": minimized(normal, metric=prb.ProbabilityResidual()),
-    }
-    table = prb.rank(candidates, **QUIET)
-    assert table.candidate.values[-1] == "normal, PR"
-    assert not table.significant.values[1]
-    assert float(table.difference[1]) < 1
-
-
 def test_refusals_of_a_ranking() -> None:
-    first = validated("normal")
+    first = validated("lognormal")
     seeded = first.assign_attrs(random_seed="1")
     reordered = first.assign(data=("simulator", ["another digest"]))
     for candidates, error, words in (

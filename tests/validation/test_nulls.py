@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
@@ -70,29 +71,10 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         judge_by_replicates([u], case, 0.5, 0.01)
 
 
-@pytest.mark.parametrize("n", [40, 2000])
-def test_critical_values_go_on_beyond_the_table(n: int) -> None:
-    assert EXACT.p_value(EXACT.critical_value(n, 1e-8), n) == pytest.approx(1e-8, rel=1e-6)
-
-
 def test_a_likelihood_by_specimen_has_no_joint_null() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator("y", lambda x: 2 * x, x, observed=GRID[::50])
+    optimum = prb.minimize(one_input(GRID[::50], response=double, sd=1.0), starts=0)
     with pytest.raises(ValueError, match=r"log-likelihood by specimen; .* prb\.cross_validate"):
-        prb.validation.JointNull(prb.minimize(model))
-
-
-def test_nan_is_left_out_of_populations(posterior: Posterior) -> None:
-    predicted = posterior()
-    holes = np.where(np.random.default_rng(8).random(predicted.shape) < 0.2, np.nan, predicted)
-    holes[3] = np.nan
-    y = np.random.default_rng(9).normal(size=20)
-    with_holes, whole = (
-        prb.area_test(y, p, null=prb.validation.PosteriorNull(9999)) for p in (holes, predicted)
-    )
-    assert with_holes.statistic == pytest.approx(whole.statistic, abs=0.01)
-    assert with_holes.critical_value == pytest.approx(whole.critical_value, rel=0.08)
+        prb.validation.JointNull(optimum)
 
 
 def test_repeated_measurements_are_not_counted_as_independent(posterior: Posterior) -> None:
@@ -182,7 +164,7 @@ def test_published_critical_values_and_closed_forms() -> None:
     assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
 
 
-@pytest.mark.parametrize("n", [2, 7, 23, pytest.param(170, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [2, 23])
 def test_the_table_against_simulation(n: int) -> None:
     size = 100_000
     found = area(np.random.default_rng(n).random((size, n)))
@@ -201,7 +183,8 @@ def test_the_table_is_what_its_script_makes() -> None:
 
 @pytest.mark.parametrize("n", [1, 8, 77, 5000])
 def test_p_values_and_critical_values_belong_together(n: int) -> None:
-    for alpha in (0.2, 0.05, 0.01, 1e-4):
+    beyond_the_table = [1e-8] if n > 8 else []
+    for alpha in (0.2, 0.05, 0.01, 1e-4, *beyond_the_table):
         assert EXACT.p_value(EXACT.critical_value(n, alpha), n) == pytest.approx(alpha, rel=1e-6)
     p = [EXACT.p_value(a, n) for a in np.linspace(0, 0.5, 200)]
     assert (np.diff(p) <= 0).all()
@@ -248,7 +231,7 @@ def model_of(
 @cache
 def calibrated() -> tuple[prb.Optimum, Any]:
     model, x = model_of(labels=np.arange(20))
-    return prb.minimize(model), x
+    return prb.minimize(model, starts=0), x
 
 
 def joint(optimum: prb.Optimum, replicates: int = 199, **keywords: Any) -> Any:
@@ -338,11 +321,14 @@ def test_the_joint_null_rejects_data_that_the_family_cannot_follow() -> None:
     assert prb.area_test(data, predicted, null=joint(optimum, 99)).rejected
 
 
-@pytest.mark.parametrize(("n", "replicates"), [(1000, 9999), (1001, 999)])
-def test_many_values_have_fewer_replicates_by_default(n: int, replicates: int) -> None:
+def test_many_values_have_fewer_replicates_by_default() -> None:
     rng = np.random.default_rng(0)
     predicted = rng.standard_normal((20, 50))
-    observed = rng.standard_normal(n)
+    observed = rng.standard_normal(1001)
     test = prb.area_test(observed, predicted, progressbar=False)
-    null = prb.validation.PosteriorNull(replicates)
+    null = prb.validation.PosteriorNull(999)
     assert test.p_value == prb.area_test(observed, predicted, null=null, progressbar=False).p_value
+    # Up to a thousand values p-values are counts of 10 000.
+    few = prb.area_test(observed[:50], predicted, progressbar=False)
+    assert round(few.p_value * 10_000) == pytest.approx(few.p_value * 10_000)
+    assert few.p_value * 1000 % 1 > 1e-6

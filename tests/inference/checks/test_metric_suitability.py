@@ -112,7 +112,6 @@ def test_a_value_beside_a_response_on_either_side_is_not_reported() -> None:
     [
         (prb.KullbackLeibler(), True, 12, True),
         (prb.AreaMetric(), True, 12, False),
-        (prb.ProbabilityResidual(), True, 12, False),
         (prb.KullbackLeibler(), False, 12, False),
         (prb.KullbackLeibler(), True, 30, False),
     ],
@@ -131,8 +130,10 @@ def test_few_specimens_underestimate_a_spread_in_common(
         assert f"the smallest with {n} specimens, expected at least 30" in finding.text
 
 
-@pytest.mark.parametrize("metric", [prb.KullbackLeibler(), LOG_LIKELIHOOD])
-@pytest.mark.parametrize("response", [same, np.negative])
+@pytest.mark.parametrize(
+    ("metric", "response"),
+    [(prb.KullbackLeibler(), same), (prb.KullbackLeibler(), np.negative), (LOG_LIKELIHOOD, same)],
+)
 def test_a_bandwidth_of_each_response_underestimates_a_spread_in_common(
     metric: prb.Metric, response: Any
 ) -> None:
@@ -202,7 +203,7 @@ def test_a_kernel_that_is_wide_beside_a_branch_is_reported() -> None:
     def optimum(metric: prb.Metric) -> prb.Optimum:
         observed = branches(INPUTS)
         evaluator = evaluator_of(normal, metric, observed, branches)
-        return prb.minimize(evaluator.model, progressbar=False)
+        return prb.minimize(evaluator.model, starts=0, progressbar=False)
 
     biased = optimum(LOG_LIKELIHOOD)
     assert biased.point["sigma"] < INPUTS.std() - biased.stderr["sigma"]

@@ -41,7 +41,8 @@ COMPUTED = prb.Resimulated(256)
 @pytest.mark.parametrize(
     ("name", "propagation", "spread"),
     [
-        *[(name, R256, 0.05) for name in sorted(METRICS)],
+        ("kl", R256, 0.05),
+        ("ll", R256, 0.05),
         ("pr", COMPUTED, 0.05),
         ("pr", COMPUTED, 1e-4),
         ("area", R256, 0.003),
@@ -85,10 +86,9 @@ def test_bounds_are_not_searched_if_they_cost_too_much(monkeypatch: pytest.Monke
     assert text not in finding.text
 
 
-@pytest.mark.parametrize("scatter", [0.4, 0.55])
-def test_propagations_have_the_same_posterior_near_zero(scatter: float) -> None:
-    """Of log densities on a grid, with the optimum of sigma at zero, and at .22."""
-    y = scatter * LEVELS[::2]
+def test_propagations_have_the_same_posterior_near_zero() -> None:
+    """Of log densities on a grid, with the optimum of sigma at zero."""
+    y = 0.4 * LEVELS[::2]
     sigma, mu = np.geomspace(0.01, 4, 12), np.linspace(-0.5, 0.5, 7)
     thetas = np.stack(np.meshgrid(np.log(sigma), mu, indexing="ij"), axis=-1).reshape(-1, 2)
     moments = []
@@ -138,10 +138,9 @@ def exact_moments(y: Floats) -> tuple[float, float]:
     return mean, float(np.sqrt(mass @ (sigma[:, 0] - mean) ** 2))
 
 
-@pytest.mark.parametrize("scatter", [0.45, pytest.param(0.55, marks=pytest.mark.long)])
-def test_the_posterior_of_an_area_is_not_the_prior_near_zero(scatter: float) -> None:
+def test_the_posterior_of_an_area_is_not_the_prior_near_zero() -> None:
     """The prior's mean is .8, and its standard deviation .6."""
-    y = scatter * LEVELS[::2]
+    y = 0.45 * LEVELS[::2]
     evaluator = known_scatter("area", y)
     optimum = prb.minimize(evaluator.model, starts=0, progressbar=False)
     draws = prb.sample(500, model=evaluator.model, optimum=optimum, progressbar=False)
