@@ -610,27 +610,33 @@ def without_spurious_modes(
     improbable, but those of all specimens together may be a population.
     """
     proposals, scale = likely.proposals, likely.scale(data)
+    if proposals.is_open():
+        return emulation
     spread = data.readings.spread()
+    # As `is_rough`, and far less certain than at most likely inputs
+    largest = np.maximum(0.03 * spread, 10 * emulation.error)
+    known, before, grown = likely.best(), emulation, emulation
     for _ in range(4):
-        if proposals.is_open():
-            break
         modes = proposals.modes
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
         deviation = np.sqrt(emulation.surface.variance(z))
-        # As `is_rough`, and far less certain than at most likely inputs.
-        is_doubtful = deviation > np.maximum(0.03 * spread, 10 * emulation.error)
-        doubtful = z[is_doubtful.any(axis=1)]
+        doubtful = z[(deviation > largest).any(axis=1)]
         if not len(doubtful):
-            break
+            return emulation
         runs = farthest(emulation.z, doubtful, min(4, len(doubtful)), scale)
         grown, misfit, _ = _compared(run, emulation, runs, scale)
         audited = range(len(emulation.z), len(grown.z))
         grown = replace(grown, audited=(*emulation.audited, *audited))
         emulation, _ = _refitted(data, grown, likely.population)
         if (np.abs(misfit) < 0.1 * spread).all():  # the modes exist
+            return emulation
+        change = emulation.surface.values(known) - before.surface.values(known)
+        if (np.abs(change) > largest).any():
             break
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
-    return emulation
+    # A response that oscillates far off is not known from a few runs, which would also make the
+    # surface worse at the specimens.
+    return replace(before, z=grown.z, y=grown.y)
 
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:
