@@ -129,7 +129,7 @@ def test_predictions_are_at_a_value_of_the_covariate(
     for given in (None, {"load": 1.0}, 3.0, {"hardness": 400}, {"hardness": "high"}):
         with pytest.raises((TypeError, ValueError), match=r"at: .*got"):
             prb.predict(posterior, double, x, model=model, at=given)
-    with pytest.raises(TypeError, match="has the responses of a population"):
+    with pytest.raises(TypeError, match=r"expected a \.dist\(\) with a value of it"):
         prb.exceedance(posterior, double, 3.0, x, model=model)
 
 

@@ -171,14 +171,17 @@ class Populations:
         if simulator is None:
             simulator, replaced = replaced_inputs(self.evaluator.emulated, responses)
             places = {new: old for old, new in replaced.items()}
-            own = [places.get(x, x) if isinstance(x, Variable) else x for x in population.sources]
-            responses = self._responses(response, own)
+            arguments = [
+                places.get(x, x) if isinstance(x, Variable) else x for x in population.sources
+            ]
+            responses = self._responses(response, arguments)
         if simulator is None:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
                 "simulator of the model, expected the .dist() objects of one with "
                 "prb.Reweighted() or prb.LogLikelihood(), for the latter also others of the same "
-                "names, and constants; prb.exceedance takes all with n_points=1000"
+                "names, and constants; prb.exceedance takes all with n_points=1000, prb.predict "
+                "also model variables"
             )
         k = self.evaluator.simulators.index(simulator)
         key = (k, *replaced.values())

@@ -178,8 +178,8 @@ def sensitivity(
     simulator = evaluator.simulators[sample.k]
     named = aleatory_names(simulator.inputs, simulator.responses.function)
     is_replaced = sample.design.inputs is not simulator.inputs
-    own = sample.responses.inputs if is_replaced else simulator.inputs
-    places = [simulator.inputs.aleatory.index(x) for x in own.aleatory]
+    factors = sample.responses.inputs if is_replaced else simulator.inputs
+    places = [simulator.inputs.aleatory.index(x) for x in factors.aleatory]
     names = [named[place] for place in places]
     kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
     return SensitivityTable(

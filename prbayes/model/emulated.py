@@ -298,11 +298,11 @@ def replaced_inputs(
     """
     for simulator in simulators:
         replaced = _replaced(simulator, responses)
-        own, others = list(replaced), list(replaced.values())
-        shapes = [[event_shape(x) for x in inputs] for inputs in (own, others)]
-        conditions = [[x for x in inputs if is_condition(x)] for inputs in (own, others)]
+        pair = list(replaced), list(replaced.values())
+        shapes = [[event_shape(x) for x in inputs] for inputs in pair]
+        conditions = [[x for x in inputs if is_condition(x)] for inputs in pair]
         is_same_kind = shapes[0] == shapes[1] and conditions[0] == conditions[1]
-        is_complete = set(others) == set(responses.inputs.aleatory)
+        is_complete = set(pair[1]) == set(responses.inputs.aleatory)
         if is_same_kind and is_complete and simulator.has_specimens:
             return simulator, replaced
     return None, {}
@@ -312,15 +312,15 @@ def _replaced(
     simulator: EmulatedSimulator, responses: Responses
 ) -> dict[Variable[Any, Any], Variable[Any, Any]]:
     """Return the inputs of a response by the simulator's inputs in whose place they are."""
-    own, inputs = simulator.inputs, responses.inputs
+    model_inputs, inputs = simulator.inputs, responses.inputs
     if responses.function is not simulator.responses.function:
-        names = aleatory_names(own, simulator.responses.function)
-        by_name = dict(zip(names, own.aleatory, strict=True))
+        names = aleatory_names(model_inputs, simulator.responses.function)
+        by_name = dict(zip(names, model_inputs.aleatory, strict=True))
         names = aleatory_names(inputs, responses.function)
         pairs = zip(names, inputs.aleatory, strict=True)
         return {by_name[name]: x for name, x in pairs if name in by_name}
     replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
-    for x, y in zip(own.sources, inputs.sources, strict=True):
+    for x, y in zip(model_inputs.sources, inputs.sources, strict=True):
         if isinstance(x, Variable) and isinstance(y, Variable):
             replaced[x] = y
         elif isinstance(x, Variable) or isinstance(y, Variable) or not np.array_equal(x, y):

@@ -47,7 +47,7 @@ class Coordinates:
     ) -> Coordinates:
         """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
         roots = PriorSampler(inputs.parents)(populations, 0)
-        sampler = PopulationSampler(inputs) if sampler is None else sampler
+        sampler = sampler or PopulationSampler(inputs)
         rng = np.random.default_rng([0, 11])
 
         def draw(count: int, among: int) -> Floats:
@@ -58,10 +58,11 @@ class Coordinates:
         flat = draw(1, populations)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
-        is_share = ((flat >= 0) & (flat <= 1)).all(axis=0) & (high > 0.5)
+        from_middle = np.abs(flat - 0.5)
+        is_share = (from_middle <= 0.5).all(axis=0) & (high > 0.5)
         is_log = (flat > 0).all(axis=0) & (high > 10 * low) & ~is_share
         # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
-        is_infinite = is_share & ((np.abs(flat - 0.5) > 0.499).mean(axis=0) > 0.01)
+        is_infinite = is_share & ((from_middle > 0.499).mean(axis=0) > 0.01)
         low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2

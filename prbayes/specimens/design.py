@@ -610,12 +610,13 @@ def without_spurious_modes(
     improbable, but those of all specimens together may be a population.
     """
     proposals, scale = likely.proposals, likely.scale(data)
-    if proposals.is_open():
+    # With errors of readings, further modes are points that the likelihood of wide populations needs.
+    if proposals.is_open() or data.readings.error.any():
         return emulation
     spread = data.readings.spread()
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
-    known, before, grown = likely.best(), emulation, emulation
+    likeliest, before, grown = likely.best(), emulation, emulation
     for _ in range(4):
         modes = proposals.modes
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
@@ -630,7 +631,7 @@ def without_spurious_modes(
         emulation, _ = _refitted(data, grown, likely.population)
         if (np.abs(misfit) < 0.1 * spread).all():  # the modes exist
             return emulation
-        change = emulation.surface.values(known) - before.surface.values(known)
+        change = emulation.surface.values(likeliest) - before.surface.values(likeliest)
         if (np.abs(change) > largest).any():
             break
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
