@@ -610,7 +610,7 @@ def without_spurious_modes(
     improbable, but those of all specimens together may be a population.
     """
     proposals, scale = likely.proposals, likely.scale(data)
-    # With errors of readings, further modes are points that the likelihood of wide populations needs.
+    # With errors of readings, further modes are points that wide populations need.
     if proposals.is_open() or data.readings.error.any():
         return emulation
     spread = data.readings.spread()
