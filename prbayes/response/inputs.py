@@ -532,7 +532,8 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "
             f"the .dist() of one of {groups.names} or of a new group in its place, such as "
-            "pm.Normal.dist(mu[0], sigma); prb.predict has a population for each group"
+            "pm.Normal.dist(mu[0], sigma), under a metric of distributions for prb.exceedance(..., "
+            "n_points=1000) alone; prb.predict has a population for each group"
         )
     covariates = [str(v.name) for v in parents if is_condition(v)]
     if covariates:

@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.decision import Condition, Mean, Quantile
+from prbayes.model.evaluator import Evaluator
 
 SUPPLIERS = ["Adler", "Busch"]
 
@@ -129,6 +130,6 @@ def test_constants_of_the_simulator_stay(model: pm.Model, result: Any) -> None:
 
 
 def test_inputs_that_depend_on_a_group_are_refused(model: pm.Model, result: Any) -> None:
-    (x,) = prb.decision.populations.Evaluator.of(model).simulators[0].inputs.aleatory
+    (x,) = Evaluator.of(model).simulators[0].inputs.aleatory
     with pytest.raises(TypeError, match=r"the .dist\(\) of one of \['Adler', 'Busch'\]"):
         prb.exceedance(result, life, 50.0, x, 2.0, model=model)
