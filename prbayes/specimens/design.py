@@ -610,8 +610,7 @@ def without_spurious_modes(
     improbable, but those of all specimens together may be a population.
     """
     proposals, scale = likely.proposals, likely.scale(data)
-    # With errors of readings, further modes are points that wide populations need.
-    if proposals.is_open() or data.readings.error.any():
+    if proposals.is_open():
         return emulation
     spread = data.readings.spread()
     # As `is_rough`, and far less certain than at most likely inputs

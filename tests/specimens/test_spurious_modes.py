@@ -12,14 +12,17 @@ from prbayes.model.emulated import emulated_simulators
 from prbayes.model.specimen_preparation import prepared
 
 
-def points(response: Callable[..., Any], prior: tuple[Any, Any], x: Any) -> Any:
+def points(
+    response: Callable[..., Any], prior: tuple[Any, Any], x: Any, error: float | None = None
+) -> Any:
     """Return the likely inputs of specimens with inputs (N, d), shape (N, K, d)."""
     d = x.shape[1]
     with pm.Model() as model:
         mu = pm.Normal("mu", *prior, shape=d)
         sigma = pm.HalfNormal("sigma", 1, shape=d)
         inputs = [pm.Normal.dist(mu[k], sigma[k]) for k in range(d)]
-        prb.Simulator("y", response, *inputs, observed=response(*x.T))
+        metric = prb.LogLikelihood(error=error)
+        prb.Simulator("y", response, *inputs, observed=response(*x.T), metric=metric)
     (simulator,) = emulated_simulators(model)
     found = prepared(simulator.likelihood).points
     z = np.where(np.isfinite(found.log_a)[..., None], found.z, np.nan)
@@ -38,6 +41,13 @@ def test_a_monotone_response_has_one_input_for_each_reading(name: str) -> None:
     x = np.random.default_rng(0).normal(mean, sd, (n, 1))
     (found,), shape = points(response, prior, x)
     np.testing.assert_array_less(np.nan_to_num(abs(found.reshape(shape[:2]) - x)), 1e-2)
+
+
+def test_readings_with_errors_have_inputs_beside_the_true_ones() -> None:
+    response, n, mean, sd, prior = ONE_INPUT["increasing"]
+    x = np.random.default_rng(0).normal(mean, sd, (n, 1))
+    (found,), shape = points(response, prior, x, error=0.01)
+    np.testing.assert_array_less(np.nan_to_num(abs(found.reshape(shape[:2]) - x)), 0.2)
 
 
 def test_two_inputs_have_one_mode_for_each_specimen() -> None:
