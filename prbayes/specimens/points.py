@@ -439,9 +439,9 @@ class Plausible:
         # halves have to agree all the same.
         n = len(data.readings)
         of_mode = options.points if n <= 512 else max(2, 512 * options.points // n)
-        n_modes = proposals.modes.table.shape[1]
-        # Inputs of readings with errors are spread around one mode.
-        count = of_mode * (max(n_modes, 2) if data.readings.error.any() else n_modes)
+        count = of_mode * proposals.modes.table.shape[1]
+        if proposals.residuals.has_errors:  # inputs are spread around a mode
+            count = max(count, min(4 * options.points, options.cheap_in_all // (8 * n)))
         points = draw_points(data, proposals, 2 * count, data.seed)
         scale = likely_scale(data, points, emulation.error)
         if not proposals.is_open(scale):

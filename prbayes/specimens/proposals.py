@@ -16,7 +16,7 @@ xi_k of a lattice; their density is
 
 .. math:: q(a) = g(\xi(a)) \, |\det D (V' + S U' G(a))|, \qquad (3)
 
-where g is normal along directions that the readings determine, and Student's t along open ones.
+where g is normal along directions that exact readings determine, and Student's t along others.
 
 Directions that the readings determine are solved for, and the others have the reference population:
 accurate and inaccurate readings, more or fewer than inputs, are one case. A mode has a proposal; a
@@ -79,6 +79,11 @@ class Residuals:
     def free(self) -> Indices:
         """Columns of the coordinates that are not known."""
         return np.flatnonzero(np.isnan(self.known[0]))
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether readings have errors of their own."""
+        return bool(self.relative.any() or (np.isfinite(self.error) & (self.error > 0)).any())
 
     def coordinates(self, specimen: Indices, a: Floats) -> Floats:
         """Return coordinates z, (k, d), of whitened inputs, (k, free)."""
@@ -355,7 +360,7 @@ class Proposals:
     # A direction is open if the readings' precision along it is less than this many times that of
     # the population.
     least_precision: ClassVar[float] = 4.0
-    degrees: ClassVar[float] = 5.0  # of Student's t distribution along open directions
+    degrees: ClassVar[float] = 5.0  # of Student's t distribution
 
     residuals: Residuals
     modes: Modes
@@ -363,8 +368,8 @@ class Proposals:
     readings: Floats  # (R, free, m): D S U'
     orientation: Floats  # (R,): sign of the map's determinant at the mode
     log_det: Floats  # (R,): log of the determinant's absolute value
-    # (R, free): directions that the readings leave open, along which populations differ
-    open_axes: Bools
+    # (R, free): directions of Student's t, along which populations differ or errors are not normal
+    heavy_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
     linear: LinearMaps | None = None  # maps that replace some of the others
 
@@ -393,9 +398,9 @@ class Proposals:
         rotation, _ = np.linalg.qr((is_open[:, :, None] * inputs)[:, :, order])
         orientation = orientation * np.sign(np.linalg.det(rotation))
         back = rotation.swapaxes(1, 2)
-        first = np.arange(d) < is_open.sum(axis=1, keepdims=True)
+        heavy = (np.arange(d) < is_open.sum(axis=1, keepdims=True)) | residuals.has_errors
         proposals = cls(
-            residuals, modes, back @ inputs, back @ readings, orientation, log_det, first, share
+            residuals, modes, back @ inputs, back @ readings, orientation, log_det, heavy, share
         )
         return with_linear_maps(proposals) if residuals.allows_linear else proposals
 
@@ -416,8 +421,8 @@ class Proposals:
     def log_density(self, mode: Indices, xi: Floats) -> Floats:
         """Return the log-density of proposals at xi, (k, free) -> (k,), less that of the maps.
 
-        Normal; Student's t along open directions, where populations may be far from the reference
-        [1]_.
+        Normal; Student's t along directions where populations may be far from the reference [1]_,
+        or where a curved response makes the tails of the readings' errors long.
 
         References
         ----------
@@ -427,7 +432,7 @@ class Proposals:
         half = self.degrees / 2
         constant = gammaln(half + 0.5) - gammaln(half) - np.log(half) / 2
         student = constant - (half + 0.5) * np.log1p(xi**2 / self.degrees)
-        return np.where(self.open_axes[mode], student, -(xi**2) / 2).sum(axis=1)
+        return np.where(self.heavy_axes[mode], student, -(xi**2) / 2).sum(axis=1)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
         """Return xi, (k, free), and its Jacobian, (k, free, free), in the maps of modes (k,)."""
@@ -528,7 +533,7 @@ class Proposals:
         points = lattice(place, counts[mode], d)
         u = (points + shifts[mode]) % 1.0
         u = np.clip(u, 1e-12, 1 - 1e-12)
-        xi = np.where(self.open_axes[mode], stdtrit(self.degrees, u), ndtri(u))
+        xi = np.where(self.heavy_axes[mode], stdtrit(self.degrees, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)
@@ -622,9 +627,9 @@ def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0
     mapped, _ = proposals.mapped(mode, modes.a[mode] + away)
     difference = np.abs(mapped - xi).max(axis=1)
     is_used = (difference < largest).reshape(count, points).all(axis=1)
-    open_axes = proposals.open_axes | is_used[:, None]
+    heavy_axes = proposals.heavy_axes | is_used[:, None]
     linear = LinearMaps(is_used, values, jacobian)
-    return replace(proposals, linear=linear, open_axes=open_axes)
+    return replace(proposals, linear=linear, heavy_axes=heavy_axes)
 
 
 def mixing_weights(modes: Modes, mass: Floats) -> Floats:

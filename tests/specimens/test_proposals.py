@@ -185,8 +185,8 @@ def test_points_count_with_the_density_of_all_proposals_that_reach_them() -> Non
     p = curved_problem("cubic")
     once = p.proposals()
     twice = Proposals.at_modes(once.residuals, Modes.joined([once.modes] * 2))
-    of_one = log_likelihoods(once, p.population, 64)
-    of_two = log_likelihoods(twice, p.population, 64)
+    of_one = log_likelihoods(once, p.population, 512)
+    of_two = log_likelihoods(twice, p.population, 512)
     np.testing.assert_allclose(of_two, of_one, atol=5 * 4e-4)
 
 
