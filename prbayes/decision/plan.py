@@ -482,8 +482,7 @@ class ReadingErrors:
                 "prb.decision.Condition"
             )
         unknown = variables[0] if variables else None
-        has_error = readings.error.any() or readings.relative.any()
-        if not (has_error or readings.step.any() or likelihood.censored):
+        if not (readings.has_error.any() or readings.step.any() or likelihood.censored):
             return None
         size = sample.outputs[0].size
         size_of_model = readings.values.shape[1]

@@ -63,6 +63,11 @@ class Readings:
         """Which readings are intervals, (N, m)."""
         return ~np.isnan(self.lower)
 
+    @property
+    def has_error(self) -> Bools:
+        """Which readings have an error of their own, known or unknown, (N, m)."""
+        return (self.error > 0) | (self.relative > 0)
+
     def error_sd(self, outputs: Any) -> Any:
         """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
         return np.hypot(self.error, self.relative * np.abs(outputs))

@@ -506,7 +506,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
     is_constant = high - low <= 1e-9 * size
-    has_error = (readings.error > 0).all(axis=0) & (not is_constant.all())
+    has_error = readings.has_error.all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
         if is_constant[j] and has_error[j]:
             continue
@@ -536,7 +536,7 @@ def refuse_unreached(name: str, outputs: Floats, readings: Readings) -> None:
     count = int(outside.any(axis=1).sum())
     order = "the order of the outputs, " if finite.shape[1] > 1 else ""
     if 2 * count > len(readings):
-        error = "a larger error=" if (readings.error > 0).any() else "prb.LogLikelihood(error=...)"
+        error = "a larger error=" if readings.has_error.any() else "prb.LogLikelihood(error=...)"
         raise DesignError(
             f"{name}: the readings of {count} of {len(readings)} specimens are outside the range "
             f"of all runs over the priors; check {order}the response, the priors and the units, or "

@@ -690,7 +690,7 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
 def refuse_at_end(data: SpecimenData, specimen: int) -> None:
     """Raise if a specimen with exact readings has an input nearer to an end than it is known."""
-    if (data.readings.error[specimen] > 0).any():
+    if data.readings.has_error[specimen].any():
         return
     label = specimen if data.labels is None else data.labels[specimen]
     raise DesignError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -283,6 +284,15 @@ def test_a_change_beyond_the_ninth_digit_is_no_exact_constant(m: int) -> None:
         refuse_unreachable("y", values, Readings.exact(values[:20]))
     for caught in (by_metric, by_specimen):
         assert ("leave the output out" in str(caught.value)) == (m > 1)
+
+
+@pytest.mark.parametrize("kind", ["error", "relative"])
+def test_an_output_that_is_constant_has_readings_of_its_error(kind: str) -> None:
+    values = np.stack([SIMULATED[:40, 0], np.full(40, 10.0)], axis=1)
+    exact = Readings.exact(values[:20])
+    refuse_unreachable("y", values, replace(exact, **{kind: np.full((20, 2), 0.1)}))
+    with pytest.raises(DesignError, match="output 1 of 2: the response is constant"):
+        refuse_unreachable("y", values, exact)
 
 
 def test_constant_responses_that_are_stored_are_refused() -> None:
