@@ -241,10 +241,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         variables = _read_inputs(name, response, inputs, model)
     data = replace(data, outputs=_with_units(name, units, variables, response, data.outputs))
     refuse_vectors_of_specimens(name, variables.aleatory, variables.parents, len(data))
-    of_readings = any(isinstance(x, ReadingsCondition) for x in inputs)
-    of_readings = of_readings or of_specimens(response) is not None
+    times = next((i for i, x in enumerate(inputs) if isinstance(x, ReadingsCondition)), None)
+    of_readings = times is not None or of_specimens(response) is not None
     arguments = _Arguments(
-        name, model, response, variables, data, settings, epsilon, progressbar, of_readings
+        name, model, response, variables, data, settings, epsilon, progressbar, of_readings, times
     )
     metric = LogLikelihood() if metric is None else metric
     earlier = all_simulators(model)
@@ -273,6 +273,7 @@ class _Arguments:
     epsilon: float | None
     progressbar: bool
     at_conditions: bool  # whether outputs are readings at values of a vector condition
+    times: int | None  # position of this condition among the inputs, if it is one
 
     def other_metric(self) -> str:
         """Return advice to use a metric of distributions that the simulator accepts, or none."""
@@ -286,6 +287,7 @@ class _Arguments:
         """Return the response of inputs, and how the propagation calls it."""
         calls: dict[str, Any] = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
         calls |= {"outputs": self.data.outputs, "caller": self.name, "scatter": scatter}
+        calls["times"] = self.times
         return Responses(name, self.response, inputs, **calls)
 
 

@@ -165,6 +165,7 @@ class Responses:
         # Largest change that a response may have when it is computed again, in standard deviations
         # of the responses; None for a random response.
         scatter: float | None = 0.01,
+        times: int | None = None,  # position of the argument that is a condition of each reading
     ) -> None:
         refuse_uncallable(name, function)
         refuse_misfit(name, function, inputs.sizes, outputs)
@@ -200,6 +201,7 @@ class Responses:
         self.count = 0  # number of runs that were needed, computed here or found in the store
         self.caller = caller or name
         self.scatter = scatter
+        self.times = times
         # Function of the number of runs of a call and the seconds of one run, for progress; the
         # seconds are NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
@@ -307,6 +309,7 @@ class Responses:
                 rows = responses.reshape(size, *responses.shape[len(batch) :])
                 self._refuse_state(specimens, rows)
                 self._refuse_late_change(specimens, rows)
+                self._refuse_other_times(specimens, rows)
             self._is_checked = True
         # Keep the call for the next simulator with the same response. Before there is one, keep
         # only the trial at some points of the prior, because every simulator makes it.
@@ -492,6 +495,39 @@ class Responses:
                 f"and {numbers_text(expected, 6)} among {len(values)}, expected the same; look "
                 "for a mean, a sum, a sort or another order over the axis of specimens, and for a "
                 "state from one specimen to the next, or write it for one specimen, in prb.scalar"
+            )
+
+    def _refuse_other_times(self, specimens: Sequence[Floats], values: Floats) -> None:
+        """Raise if outputs of the last specimen change where the times of other outputs do.
+
+        Every second time, the last one among them, moves halfway to the time before it.
+        """
+        finite = finite_runs(values)
+        if self.times is None or not finite.size or self.repeats > 1:
+            return
+        row, arguments = finite[-1:], list(self.inputs.arguments)
+        times = arguments[self.times]
+        is_kept = np.arange(times.size)[::-1] % 2 == 1
+        is_kept[0] = True
+        arguments[self.times] = np.where(is_kept, times, (times + np.roll(times, 1)) / 2)
+        other = copy.copy(self)
+        other.inputs = copy.copy(self.inputs)
+        other.inputs.arguments = tuple(arguments)
+        try:
+            again = other._again(specimens, row)[0]
+        except ResponseError:  # because the response takes listed values alone
+            return
+        first = values[row[0]]
+        allowed = np.maximum(tolerance_of(values, 0.01), 1e-6 * np.abs(first))
+        is_changed = is_kept & (np.abs(again - first) > allowed)
+        if is_changed.any():
+            k = int(is_changed.argmax())
+            raise ResponseError(
+                f"{self.name}: got {first[k]:.6g} and {again[k]:.6g} at {times[k]:g}, "
+                f"{_place_of_specimen(self, specimens, row[0])} where other times change, "
+                "expected outputs that depend on their own time alone, because specimens have "
+                "different times; integrate on a grid of its own within the response, and return "
+                "values at the times"
             )
 
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:

@@ -129,6 +129,39 @@ def test_times_are_outputs() -> None:
     assert likelihood.measurements[0].outputs.dim == "time"
 
 
+def integrated(x: Any, t: Any) -> Any:
+    """Integrate by steps from one of the times to the next."""
+    return np.cumsum(x[..., None] * np.diff(t, prepend=0.0) / np.sqrt(t), axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("response", "is_right"),
+    [
+        (integrated, False),
+        (lambda x, t: line(x, t / t[-1]), False),
+        (prb.scalar(lambda x, t: [{0.5: 1, 1: 2, 2: 3, 4: 4}[k] * x for k in t]), True),
+        (prb.scalar(lambda x, t: x * np.sqrt(t)), True),
+    ],
+)
+def test_outputs_that_depend_on_other_times_are_refused(response: Any, is_right: bool) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.0, 0.3), 0.2)
+        metric = prb.LogLikelihood(error=0.1)
+        time = condition("time", TIMES)
+        prb.Simulator("y", response, x, time, observed=np.sqrt(TIMES), metric=metric)
+    (likelihood,) = specimen_likelihoods(model).values()
+    run = likelihood.measurements[0].responses
+    points = [np.linspace(0.5, 1.5, 5)]
+    if is_right:
+        assert run(points, []).shape == (5, 4)
+        assert run.computed == 5
+        return
+    with pytest.raises(
+        prb.response.ResponseError, match=r"at (2|0\.5), at \(x = 1\.5\) where other"
+    ):
+        run(points, [])
+
+
 def test_predictions_are_at_the_conditions_of_new_specimens() -> None:
     with pm.Model():
         mu, sigma = pm.Normal("mu", 1.0, 0.5), pm.HalfNormal("sigma", 0.5)
