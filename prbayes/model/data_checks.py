@@ -497,6 +497,8 @@ def _rounding_finding(outputs: Sequence[tuple[str, float, float]], largest: floa
 def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
+    Also raise if limits of zero are all that is known of the scale of an output.
+
     Far is more than three widths of the range of the runs, outputs (n, m), over the populations of
     the prior. An output that is constant, as at time zero, is one of the error of its readings.
     """
@@ -516,6 +518,12 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
         if is_constant[j]:
             raise DesignError(f"{name}: {output}: {_constant(finite[:, j])}{leave}")
         values = located_values(readings)[np.isfinite(located_values(readings)[:, j]), j]
+        has_scale = readings.is_measured[:, j].any() or readings.error[:, j].any() or values.any()
+        if not has_scale:
+            raise DesignError(
+                f"{name}: {output}: got readings that are all censored at 0, expected a limit with "
+                f"the scale of the output; add {width:.2g} to the response and the limits"
+            )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > 3 * width).all():
             raise DesignError(

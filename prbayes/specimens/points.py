@@ -597,7 +597,7 @@ def agreeing_points(
         ):
             return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
-            raise _monte_carlo_error(data, 2 * count, difference[1], largest)
+            raise _monte_carlo_error(data, 2 * count, max(difference[1:]), largest)
         # The error falls like 1 / count at best.
         times = 2 ** int(np.log2(np.clip(difference[1] / largest, 2, most // (2 * count))))
         count *= times

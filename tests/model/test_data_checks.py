@@ -295,6 +295,22 @@ def test_an_output_that_is_constant_has_readings_of_its_error(kind: str) -> None
         refuse_unreachable("y", values, exact)
 
 
+def test_limits_of_zero_have_no_scale() -> None:
+    values = np.stack([SIMULATED[:40, 0], -1e-6 * np.arange(40)], axis=1)
+    exact = Readings.exact(values[:20])
+    lower = np.where([False, True], -np.inf, np.full((20, 2), np.nan))
+    for limit in (0.0, 4e-5):
+        upper = np.where([False, True], limit, lower)
+        censored = np.where([False, True], np.nan, exact.values)
+        readings = replace(exact, values=censored, lower=lower, upper=upper)
+        if limit:
+            refuse_unreachable("y", values, readings)
+            continue
+        refuse_unreachable("y", values, replace(readings, error=np.full((20, 2), 0.1)))
+        with pytest.raises(DesignError, match="output 1 of 2: got .* censored at 0.*add 3.9e-05"):
+            refuse_unreachable("y", values, readings)
+
+
 def test_constant_responses_that_are_stored_are_refused() -> None:
     message = (
         r"y: the response is constant .* got 1 at all 3 runs .*; check the .*, or take more runs"
