@@ -307,7 +307,7 @@ def test_limits_of_zero_have_no_scale() -> None:
             refuse_unreachable("y", values, readings)
             continue
         refuse_unreachable("y", values, replace(readings, error=np.full((20, 2), 0.1)))
-        with pytest.raises(DesignError, match="output 1 of 2: got .* censored at 0.*add 3.9e-05"):
+        with pytest.raises(DesignError, match=r"output 1 of 2: got .* censored at 0.*add 3.9e-05"):
             refuse_unreachable("y", values, readings)
 
 
