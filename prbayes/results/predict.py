@@ -235,13 +235,17 @@ def predict(
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
+    # Predictions of a response whose readings have an error, until another value is added.
+    of_readings = [s for s in sources if s.responses.function is response]
+    has_error = any(getattr(s.metric, "error", None) is not None for s in of_readings)
     attrs = {
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
         **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
-        "specimens_id": _array_digest(*drawn.specimens),
+        **({"without_error": array_digest(drawn.values)} if has_error else {}),
+        "specimens_id": array_digest(*drawn.specimens),
         "random_seed": str(seed),
         "findings": as_json(_prediction_findings(responses, drawn, result, model)),
         **_calibration_attributes(result, model),
@@ -751,7 +755,7 @@ def specimen_names(labels: ArrayLike) -> list[str]:
 
 def data_digest(observed: Floats) -> str:
     """Return a digest of measured values, (n,) or (n, m), that does not depend on their order."""
-    return _array_digest(observed[in_order(observed)])
+    return array_digest(observed[in_order(observed)])
 
 
 def in_order(observed: Floats) -> Indices:
@@ -761,7 +765,7 @@ def in_order(observed: Floats) -> Indices:
     return np.lexsort(observed.T[::-1])
 
 
-def _array_digest(*arrays: Floats) -> str:
+def array_digest(*arrays: Floats) -> str:
     """Return 16 hexadecimal digits of the bytes of arrays."""
     digest = hashlib.sha256()
     for array in arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ from prbayes._validate import Floats, Seed, share
 from prbayes.model.description import versions
 from prbayes.model.fingerprint import Identity, as_attributes
 from prbayes.model.locking import locked
-from prbayes.results.predict import data_digest
+from prbayes.results.predict import array_digest, data_digest
 from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
 from prbayes.validation.pit import DIRECTION, ByCondition, Case, Predicted, read_case
 
@@ -235,7 +236,7 @@ def area_test(
         _refuse_calibration_specimens(case)
     if case.shares_specimens:
         _require_same_samples(case)
-    report(*excluded_failures(case))
+    report(*excluded_failures(case), *_findings_of_errors(predicted))
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
@@ -274,6 +275,25 @@ def _refuse_calibration_specimens(case: Case) -> None:
             "hardly ever rejected on those it was fitted to; test others, or pass "
             "prb.predict(optimum, ...) and null=prb.validation.JointNull(optimum)"
         )
+
+
+def _findings_of_errors(predicted: Any) -> list[Finding]:
+    """Return findings of predictions from which a known reading error was left out."""
+    findings = []
+    for prediction in predicted.values() if isinstance(predicted, Mapping) else [predicted]:
+        digest = getattr(prediction, "attrs", {}).get("without_error")
+        if digest is not None and digest == array_digest(np.asarray(prediction)):
+            text = (
+                f"{prediction.name}: got a prediction without the error of readings that the model "
+                "has; readings with this error scatter more than is predicted; pass it to "
+                "prb.predict as an input, or ignore this if the tested values are exact."
+            )
+            findings.append(
+                Finding(
+                    "error-left-out", text, "measurement_error.md#testing-readings-against-readings"
+                )
+            )
+    return findings
 
 
 def excluded_failures(case: Case) -> list[Finding]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 from scipy import stats
@@ -211,3 +212,31 @@ def test_failures_that_no_population_has_are_reported(caplog: pytest.LogCaptureF
     caplog.clear()
     prb.area_test([0.2, 0.4, 0.8, np.inf], np.append(predicted, np.inf), progressbar=False)
     assert not caplog.text
+
+
+def test_a_reading_error_that_is_left_out_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    x = np.random.default_rng(3).normal(1.0, 0.3, 24)
+    error = 0.5 * np.random.default_rng(4).standard_normal(24)
+
+    def response(x: Any) -> Any:
+        return 2.0 * x
+
+    def reading(x: Any, e: Any) -> Any:
+        return response(x) + e
+
+    with pm.Model() as model:
+        population = pm.Normal.dist(pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0))
+        metric = prb.LogLikelihood(error=0.5)
+        observed = response(x) + error
+        prb.Simulator("y", response, population, observed=observed, metric=metric)
+        optimum = prb.minimize()
+    fresh = 2.0 + np.random.default_rng(5).normal(0.0, 0.8, 20)
+    without = prb.predict(optimum, response, population, model=model)
+    as_input = prb.predict(optimum, reading, population, pm.Normal.dist(0.0, 0.5), model=model)
+    added = without + 0.5 * np.random.default_rng(6).standard_normal(without.shape)
+    for predicted, is_reported in ((without, True), (as_input, False), (added, False)):
+        caplog.clear()
+        for given in (predicted, {"new": predicted}):
+            measured: Any = {"new": fresh} if isinstance(given, dict) else fresh
+            prb.area_test(measured, given)
+        assert caplog.text.count("without the error of readings") == 2 * is_reported
