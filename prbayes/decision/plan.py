@@ -30,7 +30,7 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
-from prbayes.metrics.readings import Readings, add_errors
+from prbayes.metrics.readings import Readings, add_errors, has_error
 from prbayes.model.description import labelled
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.locking import locked
@@ -482,7 +482,7 @@ class ReadingErrors:
                 "prb.decision.Condition"
             )
         unknown = variables[0] if variables else None
-        if not (readings.has_error.any() or readings.step.any() or likelihood.censored):
+        if not (has_error(readings).any() or readings.step.any() or likelihood.censored):
             return None
         size = sample.outputs[0].size
         size_of_model = readings.values.shape[1]

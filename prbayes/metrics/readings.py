@@ -63,11 +63,6 @@ class Readings:
         """Which readings are intervals, (N, m)."""
         return ~np.isnan(self.lower)
 
-    @property
-    def has_error(self) -> Bools:
-        """Which readings have an error of their own, known or unknown, (N, m)."""
-        return (self.error > 0) | (self.relative > 0)
-
     def error_sd(self, outputs: Any) -> Any:
         """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
         return np.hypot(self.error, self.relative * np.abs(outputs))
@@ -164,6 +159,11 @@ def _codes(readings: Readings) -> tuple[int, ...]:
 def _mapped(readings: Readings, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Readings:
     """Return the readings with a function applied to each array."""
     return Readings(*[function(getattr(readings, f.name)) for f in fields(readings)])
+
+
+def has_error(readings: Readings) -> Bools:
+    """Return which readings have an error of their own, known or unknown, (N, m)."""
+    return (readings.error > 0) | (readings.relative > 0)
 
 
 def located_values(readings: Readings) -> Floats:

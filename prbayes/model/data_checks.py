@@ -21,7 +21,13 @@ from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
 from prbayes._validate import Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
-from prbayes.metrics.readings import Readings, Repeats, located_values, relative_error
+from prbayes.metrics.readings import (
+    Readings,
+    Repeats,
+    has_error,
+    located_values,
+    relative_error,
+)
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.proposals import Modes, best_rows
 
@@ -508,9 +514,9 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
     is_constant = high - low <= 1e-9 * size
-    has_error = readings.has_error.all(axis=0) & (not is_constant.all())
+    is_inexact = has_error(readings).all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
-        if is_constant[j] and has_error[j]:
+        if is_constant[j] and is_inexact[j]:
             continue
         output, leave = "the output", ""
         if outputs.shape[1] > 1:
@@ -544,7 +550,7 @@ def refuse_unreached(name: str, outputs: Floats, readings: Readings) -> None:
     count = int(outside.any(axis=1).sum())
     order = "the order of the outputs, " if finite.shape[1] > 1 else ""
     if 2 * count > len(readings):
-        error = "a larger error=" if readings.has_error.any() else "prb.LogLikelihood(error=...)"
+        error = "a larger error=" if has_error(readings).any() else "prb.LogLikelihood(error=...)"
         raise DesignError(
             f"{name}: the readings of {count} of {len(readings)} specimens are outside the range "
             f"of all runs over the priors; check {order}the response, the priors and the units, or "

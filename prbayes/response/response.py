@@ -309,7 +309,7 @@ class Responses:
                 rows = responses.reshape(size, *responses.shape[len(batch) :])
                 self._refuse_state(specimens, rows)
                 self._refuse_late_change(specimens, rows)
-                self._refuse_other_times(specimens, rows)
+                _refuse_other_times(self, specimens, rows)
             self._is_checked = True
         # Keep the call for the next simulator with the same response. Before there is one, keep
         # only the trial at some points of the prior, because every simulator makes it.
@@ -497,39 +497,6 @@ class Responses:
                 "state from one specimen to the next, or write it for one specimen, in prb.scalar"
             )
 
-    def _refuse_other_times(self, specimens: Sequence[Floats], values: Floats) -> None:
-        """Raise if outputs of the last specimen change where the times of other outputs do.
-
-        Every second time, the last one among them, moves halfway to the time before it.
-        """
-        finite = finite_runs(values)
-        if self.times is None or not finite.size or self.repeats > 1:
-            return
-        row, arguments = finite[-1:], list(self.inputs.arguments)
-        times = arguments[self.times]
-        is_kept = np.arange(times.size)[::-1] % 2 == 1
-        is_kept[0] = True
-        arguments[self.times] = np.where(is_kept, times, (times + np.roll(times, 1)) / 2)
-        other = copy.copy(self)
-        other.inputs = copy.copy(self.inputs)
-        other.inputs.arguments = tuple(arguments)
-        try:
-            again = other._again(specimens, row)[0]
-        except ResponseError:  # because the response takes listed values alone
-            return
-        first = values[row[0]]
-        allowed = np.maximum(tolerance_of(values, 0.01), 1e-6 * np.abs(first))
-        is_changed = is_kept & (np.abs(again - first) > allowed)
-        if is_changed.any():
-            k = int(is_changed.argmax())
-            raise ResponseError(
-                f"{self.name}: got {first[k]:.6g} and {again[k]:.6g} at {times[k]:g}, "
-                f"{_place_of_specimen(self, specimens, row[0])} where other times change, "
-                "expected outputs that depend on their own time alone, because specimens have "
-                "different times; integrate on a grid of its own within the response, and return "
-                "values at the times"
-            )
-
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
         is_unchanged = written_form(self.function) == self._written_form
@@ -580,6 +547,40 @@ def _refuse_one_size(
             f"{responses.name}: the response takes {size} specimens, but not one or {few}, "
             f"expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
         ) from None
+
+
+def _refuse_other_times(responses: Responses, specimens: Sequence[Floats], values: Floats) -> None:
+    """Raise if outputs of the last specimen change where the times of other outputs do.
+
+    Every second time, the last one among them, moves halfway to the time before it.
+    """
+    finite = finite_runs(values)
+    if responses.times is None or not finite.size or responses.repeats > 1:
+        return
+    row, arguments = finite[-1:], list(responses.inputs.arguments)
+    times = arguments[responses.times]
+    is_kept = np.arange(times.size)[::-1] % 2 == 1
+    is_kept[0] = True
+    arguments[responses.times] = np.where(is_kept, times, (times + np.roll(times, 1)) / 2)
+    changed = copy.copy(responses)
+    changed.inputs = copy.copy(responses.inputs)
+    changed.inputs.arguments = tuple(arguments)
+    try:
+        again = changed._again(specimens, row)[0]
+    except ResponseError:  # because the response takes listed values alone
+        return
+    first = values[row[0]]
+    allowed = np.maximum(tolerance_of(values, 0.01), 1e-6 * np.abs(first))
+    is_changed = is_kept & (np.abs(again - first) > allowed)
+    if is_changed.any():
+        k = int(is_changed.argmax())
+        raise ResponseError(
+            f"{responses.name}: got {first[k]:.6g} and {again[k]:.6g} at {times[k]:g}, "
+            f"{_place_of_specimen(responses, specimens, row[0])} where other times change, "
+            "expected outputs that depend on their own time alone, because specimens have "
+            "different times; integrate on a grid of its own within the response, and return "
+            "values at the times"
+        )
 
 
 def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, tally: Tally) -> None:

@@ -235,16 +235,13 @@ def predict(
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
-    # Predictions of a response whose readings have an error, until another value is added.
-    of_readings = [s for s in sources if s.responses.function is response]
-    has_error = any(getattr(s.metric, "error", None) is not None for s in of_readings)
     attrs = {
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
         **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
-        **({"without_error": array_digest(drawn.values)} if has_error else {}),
+        **_left_out(sources, response, drawn.values),
         "specimens_id": array_digest(*drawn.specimens),
         "random_seed": str(seed),
         "findings": as_json(_prediction_findings(responses, drawn, result, model)),
@@ -675,6 +672,15 @@ def known_outputs(
 def _vectors(inputs: Inputs) -> list[list[float]]:
     """Return the arguments that are vectors of constants."""
     return [x.ravel().tolist() for x in inputs.arguments if isinstance(x, np.ndarray)]
+
+
+def _left_out(
+    simulators: Sequence[PopulationSimulator], response: Function, values: Floats
+) -> dict[str, str]:
+    """Return an attribute of predictions of a response whose readings have an error."""
+    of_response = (s.metric for s in simulators if s.responses.function is response)
+    has_error = any(getattr(metric, "error", None) is not None for metric in of_response)
+    return {"without_error": array_digest(values)} if has_error else {}
 
 
 def known_scatter(simulators: Sequence[PopulationSimulator], response: Function) -> float | None:

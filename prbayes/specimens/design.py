@@ -14,7 +14,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
 from prbayes._validate import ArrayFunction, Bools, Floats, Indices
-from prbayes.metrics.readings import located_values, relative_error
+from prbayes.metrics.readings import has_error, located_values, relative_error
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
@@ -690,7 +690,7 @@ def corrected(run: Run, data: SpecimenData, emulation: Emulation, population: No
 
 def refuse_at_end(data: SpecimenData, specimen: int) -> None:
     """Raise if a specimen with exact readings has an input nearer to an end than it is known."""
-    if data.readings.has_error[specimen].any():
+    if has_error(data.readings)[specimen].any():
         return
     label = specimen if data.labels is None else data.labels[specimen]
     raise DesignError(
