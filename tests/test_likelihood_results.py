@@ -451,7 +451,11 @@ def test_a_misfit_is_a_finding_up_to_half_the_level(
     result = PopulationTest(p, np.array([p]), np.array([0.5]), N)
     monkeypatch.setattr(f"{module}.population_test", lambda *_: result)
     monkeypatch.setattr(f"{module}._OPTIONS", CheckOptions(replicates=4))
-    checked = check_population(replace(optimum))  # a copy, because results are kept by optimum
+    optimum.evaluator.likelihoods[0].cache.pop("population", None)
+    checked = check_population(optimum)
+    monkeypatch.setattr(f"{module}.specimen_refits", None)  # the last test is kept
+    assert check_population(replace(optimum, theta=optimum.theta + 1e-5)) is checked
+    optimum.evaluator.likelihoods[0].cache.pop("population")
     codes = {key: [f.code for f in getattr(checked, key)] for key in ("findings", "remarks")}
     expected = {"findings": [], "remarks": []} | ({kind: ["population-misfit"]} if kind else {})
     assert codes == (expected if kind else expected | {"remarks": ["population-tested"]})

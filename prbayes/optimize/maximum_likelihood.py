@@ -104,14 +104,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         if latest is evaluator:
             break
         evaluator = latest
-    hyperparameters = evaluator.hyperparameters
+    modes, weights = _with_weights(evaluator, modes, prior=settings.prior)
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
-    if settings.prior or len(modes) == 1:
-        weights = mode_weights(modes)
-    else:
-        log_prior = hyperparameters.log_prior(thetas)
-        weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     preparations = map(prepared, evaluator.likelihoods)
     findings = [*spent, *(finding for p in preparations for finding in p.findings)]
     n_known = len(modes) if is_supported else 1  # the other modes are spurious
@@ -152,6 +147,26 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         local_optima=local_optima,
         findings=tuple(findings),
     )
+
+
+def _with_weights(
+    evaluator: Evaluator, modes: list[Mode], *, prior: bool
+) -> tuple[list[Mode], Floats]:
+    """Return optima, best first, and their shares in the posterior's mass.
+
+    Of optima that the likelihood does not separate, such as mirror populations, the best is the one
+    with the largest share: rounding would decide otherwise.
+    """
+    if prior or len(modes) == 1:
+        return modes, mode_weights(modes)
+    hyperparameters = evaluator.hyperparameters
+    log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
+    weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
+    errors = [likelihood.options.half_difference for likelihood in evaluator.likelihoods]
+    is_tied = [mode.value <= modes[0].value + np.linalg.norm(errors) for mode in modes]
+    first = int(np.argmax(np.where(is_tied, weights, -1.0)))
+    order = [first, *(k for k in range(len(modes)) if k != first)]
+    return [modes[k] for k in order], weights[order]
 
 
 _UNSUPPORTED = Finding(

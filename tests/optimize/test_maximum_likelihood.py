@@ -116,6 +116,13 @@ def test_a_folded_response_has_two_modes_and_a_start_selects_one(codes: list[str
     assert codes == ["flat-likelihood"] * 2
 
 
+@pytest.mark.parametrize("mean", [-0.3, 0.3])
+def test_of_mirror_populations_the_optimum_is_the_one_of_the_prior(mean: float) -> None:
+    optimum = fit(one_input(X**2, response=np.square, mu=(mean, 1), sigma=0.5))
+    assert np.sign(optimum.point["mu"]) == np.sign(mean)
+    assert optimum.local_optima[0]["weight"] < 0.5
+
+
 def quartic(theta: Floats) -> tuple[float, Floats]:
     """Return (|theta|^2 - 1)^2: a circle of minima, in one dimension two minima at distance 2."""
     away = float(theta @ theta) - 1
