@@ -18,6 +18,7 @@ from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import AT_ONCE, IN_CACHE, ArrayFunction, Bools, Floats, Indices
 from prbayes.emulators.runs import Runs
+from prbayes.metrics.readings import has_error
 from prbayes.model.data_checks import (
     check_failing_region,
     data_findings,
@@ -73,7 +74,7 @@ from prbayes.specimens.points import (
     of_all_specimens,
     specimen_points,
 )
-from prbayes.specimens.proposals import Proposals
+from prbayes.specimens.proposals import Normal, Proposals
 from prbayes.specimens.response_share import response_share
 from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
@@ -437,6 +438,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *coverage_findings(likelihood, data, points, draws.specimens()),
         *_end_findings(runs, data, emulation, points, draws),
         *_root_findings(data, proposals),
+        *_flat_findings(data, proposals, normal_of(draws.specimens()[:, data.free])),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
@@ -462,6 +464,39 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
         "missing; narrow the prior, or compare models with a prior around each."
     )
     return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
+
+
+def _flat_findings(
+    data: SpecimenData, proposals: Proposals, population: Normal, largest: float = 0.1
+) -> list[Finding]:
+    """Report an exact reading that hardly tells the input, because the emulator has an error."""
+    modes, readings = proposals.modes, data.readings
+    is_inexact = has_error(readings) | (readings.step > 0) | (readings.family >= 0)
+    is_exact = (~is_inexact | ~readings.is_measured).all(axis=1) & ~readings.is_censored.any(axis=1)
+    is_exact &= readings.is_measured.sum(axis=1) >= len(data.free)
+    if data.gross_errors or not is_exact.any():
+        return []
+    change = np.linalg.solve(proposals.residuals.population.root, population.root)
+    precision = np.linalg.svd(modes.slopes @ change, compute_uv=False)[:, -1]
+    best = np.zeros(len(readings))
+    np.maximum.at(best, modes.specimen, precision)
+    misfit = np.full(len(readings), np.inf)
+    np.minimum.at(misfit, modes.specimen, modes.misfit)
+    best[~is_exact | (misfit > 50)] = (
+        np.inf
+    )  # readings that no inputs reproduce are another finding
+    row = int(best.argmin())
+    if best[row] * largest >= 1:
+        return []
+    label = row if data.labels is None else data.labels[row]
+    text = (
+        f"{data.name}: got an exact reading of specimen {label} that gives the input to "
+        f"{1 / max(best[row], 0.1):.1g} standard deviations of the population, expected at most "
+        f"{largest}: the emulator has an error of a millionth of the readings' scatter at least; "
+        "take logarithms of readings and response that span orders of magnitude, or pass "
+        "metric=prb.LogLikelihood(error=...)."
+    )
+    return [Finding("emulator-error", text, "likelihood_findings.md#emulator-error")]
 
 
 def _part(likelihood: SpecimenLikelihood, size: int = 512) -> SpecimenData | None:

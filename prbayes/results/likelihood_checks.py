@@ -88,6 +88,7 @@ def _not_tested(subject: str, reason: str) -> Checked:
 _FAMILY = "The family of the population"
 _CONFLICT = "The conflict of prior and data"
 
+
 def emulator_remarks(evaluator: Evaluator) -> Checked:
     """Report the emulator and the points of each likelihood by specimen."""
     remarks = []

@@ -67,3 +67,16 @@ def test_modes_that_exist_stay() -> None:
     roots = found.reshape(shape[:2])
     np.testing.assert_allclose(np.nanmax(roots, axis=1), x[:, 0], atol=1e-3)
     np.testing.assert_allclose(np.nanmin(roots, axis=1), -x[:, 0], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("steepness", "error", "is_reported"),
+    [(1.0, None, False), (5.0, None, True), (5.0, 1.0, False)],
+)
+def test_exact_readings_that_leave_their_input_open_are_reported(
+    steepness: float, error: float | None, is_reported: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Small readings of a response over many orders of magnitude are within the emulator's error."""
+    x = np.random.default_rng(16).normal(1.0, 0.8, (40, 1))
+    points(lambda x: np.exp(steepness * x), (0.0, 2.0), x, error)
+    assert ("got an exact reading of specimen" in caplog.text) == is_reported
