@@ -249,14 +249,19 @@ def fit_surface(
     inside = near_readings(yg, readings)
     largest = np.abs(yg - center).max(axis=0)
     # If all outputs are within 100 standard deviations of the data, the unit is so large that they
-    # are not compressed.
-    unit = np.where(largest <= 100 * spread, 1e6 * np.maximum(largest, spread), 10 * spread)
-    compressed = np.arcsinh((yg - center) / unit)
+    # are not compressed. Otherwise compression makes a step of a response that is nearly linear.
+    plain = 1e6 * np.maximum(largest, spread)
+    is_far = largest > 100 * spread
     start = previous.surface if isinstance(previous, CompressedSurface) else None
     of_point = int(readings.is_measured.sum(axis=1).max())
-    emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
-    surface = CompressedSurface(emulator, center, unit)
-    errors = yg - surface.expanded(compressed - surface.surface.left_out)
+    fits = []
+    for unit in [plain, np.where(is_far, 10 * spread, plain)][: 1 + is_far.any()]:
+        compressed = np.arcsinh((yg - center) / unit)
+        emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
+        surface = CompressedSurface(emulator, center, unit)
+        errors = yg - surface.expanded(compressed - surface.surface.left_out)
+        fits.append((surface, errors))
+    surface, errors = min(fits, key=lambda fit: float(((fit[1] / spread)[inside] ** 2).sum()))
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = errors[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near
