@@ -51,14 +51,15 @@ def row(cell: str, number: int) -> dict[str, Any]:
         prb.Simulator("y", counted, population, observed=response(x))
         draws = prb.sample(draws=2000, random_seed=number).posterior
     cpu = time.process_time() - begun
-    mu = x.mean() + x.std() * np.linspace(-10, 10, 401) / np.sqrt(n)
+    steps = np.linspace(-5, 5, 401)
+    mu = x.mean() + x.std() * np.sinh(steps) / np.sqrt(n)
     log_sd = np.log(x.std()) + np.linspace(-6, 10, 401) / np.sqrt(n)
     mesh, logs = np.meshgrid(mu, log_sd, indexing="ij")
     spread = np.exp(logs)
     squares = n * (x.var() + (x.mean() - mesh) ** 2)
     density = -(n - 1) * logs - squares / (2 * spread**2)
     density += stats.norm(*prior).logpdf(mesh) + stats.halfnorm(scale=scale).logpdf(spread)
-    weights = np.exp(density - density.max())
+    weights = np.exp(density - density.max()) * np.cosh(steps)[:, None]
     weights /= weights.sum()
     figures: dict[str, Any] = {"runs": runs[0], "cpu": round(cpu, 2), "bias": 0.0, "n": n, "sd": sd}
     widths = []
