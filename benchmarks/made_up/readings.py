@@ -313,3 +313,305 @@ def a_combined_error_with_an_unknown_part() -> Iterator[tuple[str, float]]:
         b=np.linspace(0.02, 0.25, 32),
     )
     yield from moments(draws, *grid)
+
+
+# -- censored readings -------------------------------------------------------------------------------
+
+
+@problem
+def weibull_lives_of_which_most_are_censored() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(31)
+    life = 1e6 * rng.weibull(2.0, 25) ** 3
+    y = np.minimum(life, 2.5e5)
+    with pm.Model():
+        shape, scale = pm.LogNormal("shape", 0.5, 0.7), pm.LogNormal("scale", 0.0, 1.0)
+        draws = draws_of(
+            lambda x: 1e6 * x**3,
+            pm.Weibull.dist(shape, scale),
+            observed=y,
+            metric=prb.LogLikelihood(censored=(None, 2.5e5)),
+        )
+    x = (y / 1e6) ** (1 / 3)
+    is_censored = y == 2.5e5
+
+    def log_posterior(shape: Any, scale: Any) -> Any:
+        weibull = stats.weibull_min(shape[:, None], scale=scale[:, None])
+        logs = np.where(is_censored, weibull.logsf(x), weibull.logpdf(x)).sum(axis=1)
+        prior = stats.norm(0.5, 0.7).logpdf(np.log(shape)) + stats.norm.logpdf(np.log(scale))
+        return logs + prior - np.log(shape * scale)
+
+    grid = on_grid(
+        log_posterior, shape=np.linspace(0.2, 8.0, 201), scale=np.geomspace(0.4, 20.0, 401)
+    )
+    values, weights = grid
+    weights = weights * values["scale"]
+    yield from moments(draws, values, weights / weights.sum())
+
+
+@problem
+def a_fold_censored_at_both_sides() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(32)
+    y = np.clip((rng.normal(0.4, 0.7, 20) ** 2) + rng.normal(0, 0.1, 20), 0.1, 0.8)
+    with pm.Model():
+        mu, sigma = pm.HalfNormal("mu", 2.0), pm.HalfNormal("sigma", 2.0)
+        draws = draws_of(
+            lambda x: x**2,
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=0.1, censored=(0.1, 0.8)),
+        )
+    x = np.linspace(-12.0, 12.0, 4801)
+    reading = stats.norm(x[:, None] ** 2, 0.1)
+    logs = np.where(y <= 0.1, reading.logcdf(y), np.where(y >= 0.8, reading.logsf(y), 0.0))
+    logs = np.where((y > 0.1) & (y < 0.8), reading.logpdf(y), logs)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.halfnorm(scale=2).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+        return marginal(masses, logs) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(0.0, 2.5, 61), sigma=np.linspace(0.1, 3.0, 81))
+    yield from moments(draws, *grid)
+
+
+@problem
+def one_output_with_limits_by_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(33)
+    x, limit = rng.gamma(9.0, 0.2, 18), rng.choice([1.2, 1.8, 2.4], 18)
+    y = np.stack([np.log(x), x], axis=-1) + rng.normal(0, [0.2, 0.3], (18, 2))
+    limits = np.stack([np.full(18, 10.0), limit], axis=-1)
+    y = np.minimum(y, limits)
+    with pm.Model():
+        mean, sd = pm.LogNormal("mean", 0.0, 1.0), pm.HalfNormal("sd", 2.0)
+        draws = draws_of(
+            lambda x: np.stack([np.log(x), x], axis=-1),
+            pm.Gamma.dist(mu=mean, sigma=sd),
+            observed=y,
+            metric=prb.LogLikelihood(error=[0.2, 0.3], censored=(None, limits)),
+        )
+    x = np.linspace(0.001, 12.0, 4000)
+    first = stats.norm(np.log(x)[:, None], 0.2).logpdf(y[:, 0])
+    second = stats.norm(x[:, None], 0.3)
+    is_censored = y[:, 1] >= limit
+    logs = first + np.where(is_censored, second.logsf(limit), second.logpdf(y[:, 1]))
+
+    def log_posterior(mean: Any, sd: Any) -> Any:
+        population = stats.gamma((mean / sd)[:, None] ** 2, scale=(sd**2 / mean)[:, None])
+        prior = stats.lognorm(1.0).logpdf(mean) + stats.halfnorm(scale=2).logpdf(sd)
+        return marginal(population.pdf(x) * (x[1] - x[0]), logs) + prior
+
+    grid = on_grid(log_posterior, mean=np.linspace(1.2, 3.0, 61), sd=np.linspace(0.1, 2.0, 61))
+    yield from moments(draws, *grid)
+
+
+@problem
+def all_but_two_below_a_limit() -> Iterator[tuple[str, float]]:
+    y = np.concatenate([np.full(10, 0.05), [0.061, 0.112]])
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", -3.0, 1.0), pm.HalfNormal("sigma", 1.0)
+        draws = draws_of(
+            np.exp,
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=0.01, censored=(0.05, None)),
+        )
+    x = np.linspace(-12.0, 6.0, 6001)
+    reading = stats.norm(np.exp(x)[:, None], 0.01)
+    logs = np.where(y <= 0.05, reading.logcdf(y), reading.logpdf(y))
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.norm(-3, 1).logpdf(mu) + stats.halfnorm(scale=1).logpdf(sigma)
+        return marginal(masses, logs) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(-7.0, -1.0, 61), sigma=np.linspace(0.02, 4.0, 81))
+    yield from moments(draws, *grid)
+
+
+# -- rounded readings and histograms -----------------------------------------------------------------
+
+
+@problem
+def a_histogram_of_a_gamma_population() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(34)
+    edges = np.arange(0.0, 21.0, 2.0)
+    counts, _ = np.histogram(rng.gamma(2.0, 1.0, 120) ** 1.5, edges)
+    middles = (edges[1:] + edges[:-1]) / 2
+    with pm.Model():
+        alpha, beta = pm.LogNormal("alpha", 0.0, 1.0), pm.LogNormal("beta", 0.0, 1.0)
+        draws = draws_of(
+            lambda x: x**1.5,
+            pm.Gamma.dist(alpha, beta),
+            observed=middles,
+            weights=counts,
+            metric=prb.LogLikelihood(rounded=2.0),
+        )
+
+    def log_posterior(alpha: Any, beta: Any) -> Any:
+        population = stats.gamma(alpha[:, None], scale=1 / beta[:, None])
+        logs = np.log(np.diff(population.cdf(edges ** (2 / 3)), axis=1)) @ counts
+        return logs + stats.lognorm(1.0).logpdf(alpha) + stats.lognorm(1.0).logpdf(beta)
+
+    grid = on_grid(log_posterior, alpha=np.linspace(0.6, 5.0, 161), beta=np.linspace(0.2, 2.6, 161))
+    yield from moments(draws, *grid)
+
+
+@problem
+def steps_wider_than_the_population() -> Iterator[tuple[str, float]]:
+    y = 1e-9 * np.array([3.0, 3.0, 3.0, 4.0, 3.0, 3.0, 4.0, 3.0, 3.0, 3.0, 4.0, 3.0])
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 1.0, 2.0), pm.HalfNormal("sigma", 0.5)
+        draws = draws_of(
+            lambda x: 1e-9 * np.exp(x),
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(rounded=1e-9),
+        )
+    low, high = np.log(1e9 * y - 0.5), np.log(1e9 * y + 0.5)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        population = stats.norm(mu[:, None], sigma[:, None])
+        masses = population.cdf(high) - population.cdf(low)
+        logs = np.log(np.maximum(masses, 1e-300)).sum(axis=1)
+        return logs + stats.norm(1, 2).logpdf(mu) + stats.halfnorm(scale=0.5).logpdf(sigma)
+
+    grid = on_grid(log_posterior, mu=np.linspace(0.8, 1.6, 161), sigma=np.linspace(0.0005, 0.8, 400))
+    yield from moments(draws, *grid)
+
+
+@problem
+def rounded_readings_with_an_unknown_error() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(35)
+    x = rng.normal(1.5, 0.4, 15)
+    f = 1e3 * np.stack([np.sin(x), x**2], axis=-1)
+    y = 100.0 * np.round((f + rng.normal(0, 80.0, (15, 2))) / 100.0)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 1.0, 0.7), pm.HalfNormal("sigma", 0.5)
+        e = pm.HalfNormal("e", 150.0)
+        draws = draws_of(
+            lambda x: 1e3 * np.stack([np.sin(x), x**2], axis=-1),
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=e, rounded=100.0),
+        )
+    x = np.linspace(-3.0, 5.0, 1601)
+    f = 1e3 * np.stack([np.sin(x), x**2], axis=-1)[:, None]
+
+    def log_posterior(mu: Any, sigma: Any, e: Any) -> Any:
+        logs = np.empty(len(e))
+        for value in np.unique(e):
+            at, reading = e == value, stats.norm(f, value)
+            of_readings = np.log(reading.cdf(y + 50) - reading.cdf(y - 50) + 1e-300).sum(axis=-1)
+            masses = stats.norm(mu[at, None], sigma[at, None]).pdf(x)
+            logs[at] = marginal(masses, of_readings)
+        prior = stats.norm(1, 0.7).logpdf(mu) + stats.halfnorm(scale=0.5).logpdf(sigma)
+        return logs + prior + stats.halfnorm(scale=150).logpdf(e)
+
+    grid = on_grid(
+        log_posterior,
+        mu=np.linspace(0.9, 2.1, 41),
+        sigma=np.linspace(0.1, 1.1, 41),
+        e=np.linspace(10.0, 250.0, 41),
+    )
+    yield from moments(draws, *grid)
+
+
+# -- gross errors ------------------------------------------------------------------------------------
+
+
+@problem
+def a_known_share_of_gross_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(36)
+    y = np.exp(rng.normal(0.0, 0.2, 15)) + rng.normal(0, 0.05, 15)
+    y[3] = 9.0
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        draws = draws_of(
+            lambda x: x,
+            pm.LogNormal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=0.05, gross_errors=0.1),
+        )
+    x = np.linspace(-5.0, 5.0, 4001)
+    like = stats.norm(np.exp(x)[:, None], 0.05).pdf(y)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        logs = np.log(0.9 * masses @ like + 0.1 / (2 * np.ptp(y))).sum(axis=1)
+        return logs + stats.norm(0, 2).logpdf(mu) + stats.halfnorm(scale=1).logpdf(sigma)
+
+    grid = on_grid(log_posterior, mu=np.linspace(-0.6, 0.6, 81), sigma=np.linspace(0.02, 1.2, 119))
+    yield from moments(draws, *grid)
+
+
+@problem
+def an_unknown_share_of_gross_errors_of_two_outputs() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(37)
+    x = rng.normal([2.0, 1.0], [0.3, 0.2], (20, 2))
+    y = np.stack([x.prod(axis=1), x[:, 0] / x[:, 1]], axis=-1)
+    y[[2, 11], 0] = [0.2, 6.0]
+    with pm.Model():
+        mu, sd = pm.Normal("mu", 1.5, 1.0, shape=2), pm.HalfNormal("sd", 0.5, shape=2)
+        draws = draws_of(
+            lambda a, b: np.stack([a * b, a / b], axis=-1),
+            pm.LogNormal.dist(mu[0] - 1.0, sd[0]),
+            pm.LogNormal.dist(mu[1] - 1.5, sd[1]),
+            observed=y,
+            metric=prb.LogLikelihood(gross_errors=True),
+        )
+    u = np.log(y)
+    inputs, jacobian = np.stack([u.sum(axis=1), u[:, 0] - u[:, 1]], axis=-1) / 2, 0.5 / y.prod(axis=1)
+    ranges = np.prod(2 * np.ptp(y, axis=0))
+    rng = np.random.default_rng(1)
+    centre, spread = np.array([1.7, 1.5, 0.16, 0.2, 0.1]), np.array([0.05, 0.06, 0.05, 0.05, 0.07])
+    t = stats.t(4)
+    theta = centre + 1.5 * spread * t.rvs((400_000, 5), random_state=rng)
+    log_q = t.logpdf((theta - centre) / (1.5 * spread)).sum(axis=1)
+    theta = theta[is_valid := (theta[:, 2:] > 0).all(axis=1) & (theta[:, 4] < 1)]
+    log_q, (m0, m1, s0, s1, w) = log_q[is_valid], theta.T
+    logs = stats.norm([1.5, 1.5], 1.0).logpdf(theta[:, :2]).sum(axis=1)
+    logs += stats.halfnorm(scale=0.5).logpdf(theta[:, 2:4]).sum(axis=1) + stats.beta(1, 9).logpdf(w)
+    for x, factor in zip(inputs, jacobian, strict=True):
+        p = stats.norm(m0 - 1.0, s0).pdf(x[0]) * stats.norm(m1 - 1.5, s1).pdf(x[1]) * factor
+        logs += np.log((1 - w) * p + w / ranges)
+    weights = np.exp(logs - log_q - (logs - log_q).max())
+    names = {"m0": m0, "m1": m1, "s0": s0, "s1": s1, "w": w}
+    of_draws = dict(zip(("m0", "m1"), np.moveaxis(draws["mu"].values, -1, 0), strict=True))
+    of_draws |= dict(zip(("s0", "s1"), np.moveaxis(draws["sd"].values, -1, 0), strict=True))
+    of_draws["w"] = draws["y_gross_errors"].values
+    yield from moments(of_draws, names, weights / weights.sum())
+
+
+@problem
+def gross_errors_beside_a_fold() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(38)
+    y = 1e6 * (rng.normal(0.5, 0.5, 24) ** 2 + rng.normal(0, 0.05, 24))
+    y[[0, 7, 19]] = [-4e6, 6e6, 9e6]
+    with pm.Model():
+        mu, sigma = pm.HalfNormal("mu", 2.0), pm.HalfNormal("sigma", 2.0)
+        w = pm.Beta("w", 1, 4)
+        draws = draws_of(
+            lambda x: 1e6 * x**2,
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=5e4, gross_errors=w),
+        )
+    x = np.linspace(-9.0, 9.0, 6001)
+    like = stats.norm(1e6 * x[:, None] ** 2, 5e4).pdf(y)
+
+    def log_posterior(mu: Any, sigma: Any, w: Any) -> Any:
+        at = np.stack([mu, sigma], axis=-1)
+        at, index = np.unique(at, axis=0, return_inverse=True)
+        density = (stats.norm(at[:, :1], at[:, 1:]).pdf(x) * (x[1] - x[0])) @ like
+        share = w[:, None]
+        logs = np.log((1 - share) * density[index] + share / (2 * np.ptp(y))).sum(axis=1)
+        prior = stats.halfnorm(scale=2).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+        return logs + prior + stats.beta(1, 4).logpdf(w)
+
+    grid = on_grid(
+        log_posterior,
+        mu=np.linspace(0.0, 1.8, 41),
+        sigma=np.linspace(0.15, 2.0, 61),
+        w=np.linspace(0.005, 0.6, 61),
+    )
+    yield from moments(draws, *grid)
