@@ -72,6 +72,7 @@ from prbayes.specimens.points import (
     normal_of,
     of_all_specimens,
     specimen_points,
+    typical_specimens,
 )
 from prbayes.specimens.proposals import Proposals
 from prbayes.specimens.response_share import response_share
@@ -435,7 +436,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error, data.remedies),
         *coverage_findings(likelihood, data, points, draws.specimens()),
-        *_end_findings(runs, data, emulation, points, draws),
+        *_end_findings(runs, data, emulation, points, proposals, draws),
         *_root_findings(data, proposals),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
@@ -452,7 +453,10 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     z = proposals.residuals.coordinates(modes.specimen, modes.a)[:, data.free]
     low, high = np.quantile(data.prior[:, data.free], [0.1, 0.9], axis=0)
     is_central = ((z >= low) & (z <= high)).all(axis=1)
-    counts = np.bincount(modes.specimen, is_central)
+    # Proposals between the modes, which cover the inside of a fold, are no further values.
+    pull = np.einsum("kmd,km->kd", modes.slopes, modes.errors)[:, 0]
+    is_mode = np.abs(pull) < 0.1 * np.sqrt(1 + (modes.slopes[:, :, 0] ** 2).sum(axis=1))
+    counts = np.bincount(modes.specimen, is_central & is_mode)
     share = (counts > 2).mean()
     if share < 0.1:
         return []
@@ -482,6 +486,7 @@ def _end_findings(
     data: SpecimenData,
     emulation: Emulation,
     points: SpecimenPoints,
+    proposals: Proposals,
     draws: Draws,
 ) -> list[Finding]:
     """Report specimens whose inputs are known worse than their distances from an end of the range.
@@ -489,7 +494,8 @@ def _end_findings(
     The end of an input with a logarithmic coordinate is zero. The error of such an input counts by
     the change of the populations' log-densities over posterior draws, from .1 nats on. It is zero
     of a density that is finite at the end. Raise DesignError if the error is nine tenths of the
-    distance. A few runs are computed at inputs that are far below all others.
+    distance. A few runs are computed at inputs that are far below all others. Specimens that look
+    like gross errors do not count.
     """
     likelihood, coordinates = runs.likelihood, runs.likelihood.coordinates
     weights = likely_weights(data, points, normal_of(draws.specimens()[:, data.free]))
@@ -519,6 +525,8 @@ def _end_findings(
     if shares.max() <= 0.03:
         return []
     tilts = shares * log_density_changes(likelihood, draws.thetas, two_sides(z, distance, ended))
+    if data.gross_errors:
+        tilts = np.where(typical_specimens(proposals.modes, len(z)), tilts, 0.0)
     worst = int(tilts.argmax())
     if not np.sqrt((tilts**2).sum()) > 0.1:
         return []
