@@ -29,11 +29,6 @@ def marginal(masses: Any, logs: Any) -> Any:
     return np.log(masses @ np.exp(logs - top) + 1e-300).sum(axis=1) + top.sum()
 
 
-def halves(x: Any) -> Any:
-    """Return masses of the cells of an equidistant grid, times a density."""
-    return x[1] - x[0]
-
-
 # -- a known error -----------------------------------------------------------------------------------
 
 
@@ -614,4 +609,285 @@ def gross_errors_beside_a_fold() -> Iterator[tuple[str, float]]:
         sigma=np.linspace(0.15, 2.0, 61),
         w=np.linspace(0.005, 0.6, 61),
     )
+    yield from moments(draws, *grid)
+
+
+# -- counts ------------------------------------------------------------------------------------------
+
+
+@problem
+def counts_of_which_most_are_zero() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(41)
+    hours = 1e6 * rng.uniform(0.2, 5.0, 30)
+    y = rng.poisson(hours * 1e-7 * np.exp(rng.normal(0.0, 1.5, 30)))
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", -16.0, 3.0), pm.HalfNormal("sigma", 3.0)
+        draws = draws_of(
+            lambda rate: rate,
+            pm.LogNormal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=prb.readings.Poisson(hours)),
+        )
+    x = np.linspace(-60.0, 10.0, 3501)
+    with np.errstate(over="ignore"):
+        logs = stats.poisson(hours * np.exp(x)[:, None]).logpmf(y)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.norm(-16, 3).logpdf(mu) + stats.halfnorm(scale=3).logpdf(sigma)
+        return marginal(masses, logs) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(-26, -12.5, 91), sigma=np.linspace(0.03, 8, 81))
+    yield from moments(draws, *grid)
+
+
+@problem
+def clustered_counts_at_two_conditions() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(42)
+    f = rng.gamma(3.0, 1.0, 12)[:, None] * np.array([2.0, 10.0])
+    y = rng.poisson(f * rng.gamma(2.0, 0.5, f.shape))
+    with pm.Model():
+        shape, rate = pm.LogNormal("shape", 0.5, 1.0), pm.LogNormal("rate", 0.0, 1.0)
+        alpha = pm.LogNormal("alpha", 0.5, 0.7)
+        draws = draws_of(
+            lambda x: np.stack([2 * x, 10 * x], axis=-1),
+            pm.Gamma.dist(shape, rate),
+            observed=y,
+            metric=prb.LogLikelihood(error=prb.readings.NegativeBinomial(alpha)),
+        )
+    x = np.exp(np.linspace(-6.0, 4.0, 501))
+    f = x[:, None, None] * np.array([2.0, 10.0])
+
+    def log_posterior(shape: Any, rate: Any, alpha: Any) -> Any:
+        logs = np.empty(len(alpha))
+        for value in np.unique(alpha):
+            at = alpha == value
+            density = stats.gamma(shape[at, None], scale=1 / rate[at, None]).pdf(x)
+            counts = stats.nbinom(value, value / (value + f)).logpmf(y).sum(axis=-1)
+            logs[at] = marginal(density * x * 0.02, counts)
+        prior = stats.norm(0.5, 1).logpdf(np.log(shape)) + stats.norm.logpdf(np.log(rate))
+        return logs + prior + stats.norm(0.5, 0.7).logpdf(np.log(alpha))
+
+    axes = {"shape": (-0.8, 3.8), "rate": (-2.0, 3.0), "alpha": (-0.8, 3.0)}
+    values, weights = on_grid(
+        lambda **logs: log_posterior(**{name: np.exp(u) for name, u in logs.items()}),
+        **{name: np.linspace(*ends, 45) for name, ends in axes.items()},
+    )
+    values = {name: np.exp(u) for name, u in values.items()}
+    yield from moments({name: np.asarray(draws[name]) for name in axes}, values, weights)
+
+
+@problem
+def single_trials_at_a_threshold_of_two_inputs() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(43)
+    p = 1 / (1 + np.exp(-rng.normal(0.7, np.hypot(1.0, 0.5), 40)))
+    y, n = rng.binomial(np.repeat([1, 3], 20), p), np.repeat([1, 3], 20)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 2.0)
+        draws = draws_of(
+            lambda load, offset: 1 / (1 + np.exp(-load - offset)),
+            pm.Normal.dist(mu, sigma),
+            pm.Normal.dist(0.0, 0.5),
+            observed=y,
+            metric=prb.LogLikelihood(error=prb.readings.Binomial(n)),
+        )
+    x = np.linspace(-25.0, 25.0, 2001)
+    logs = stats.binom(n, 1 / (1 + np.exp(-x[:, None]))).logpmf(y)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        sd = np.hypot(sigma, 0.5)[:, None]
+        masses = stats.norm(mu[:, None], sd).pdf(x) * (x[1] - x[0])
+        prior = stats.norm(0, 2).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+        return marginal(masses, logs) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(-2.0, 4.5, 81), sigma=np.linspace(0, 6.5, 100))
+    yield from moments(draws, *grid)
+
+
+# -- selection ---------------------------------------------------------------------------------------
+
+
+@problem
+def weibull_strengths_that_passed_a_proof_test() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(44)
+    y = 3e8 * np.sqrt(rng.weibull(4.0, 40))
+    y = y[y > 2.7e8]
+    with pm.Model():
+        shape, scale = pm.LogNormal("shape", 1.2, 0.5), pm.LogNormal("scale", 0.0, 0.3)
+        draws = draws_of(
+            lambda x: 3e8 * np.sqrt(x),
+            pm.Weibull.dist(shape, scale),
+            observed=y,
+            metric=prb.LogLikelihood(selected=(2.7e8, None)),
+        )
+    x, least = (y / 3e8) ** 2, 0.81
+
+    def log_posterior(shape: Any, scale: Any) -> Any:
+        population = stats.weibull_min(shape[:, None], scale=scale[:, None])
+        logs = (population.logpdf(x) - population.logsf(least)).sum(axis=1)
+        prior = stats.norm(1.2, 0.5).logpdf(np.log(shape)) + stats.norm(0, 0.3).logpdf(np.log(scale))
+        return logs + prior - np.log(shape * scale)
+
+    grid = on_grid(log_posterior, shape=np.linspace(0.5, 12, 201), scale=np.linspace(0.3, 2.0, 201))
+    yield from moments(draws, *grid)
+
+
+@problem
+def a_window_before_a_fold() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(45)
+    y = np.cos(rng.normal(0.6, 0.5, 60)) + rng.normal(0, 0.1, 60)
+    y = y[(y > 0.5) & (y < 0.95)]
+    with pm.Model():
+        mu, sigma = pm.HalfNormal("mu", 1.0), pm.HalfNormal("sigma", 1.0)
+        draws = draws_of(
+            np.cos,
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(error=0.1, selected=(0.5, 0.95)),
+        )
+    x = np.linspace(-40.0, 40.0, 8001)
+    reading = stats.norm(np.cos(x)[:, None], 0.1)
+    logs, seen = reading.logpdf(y), (reading.sf(0.5) - reading.sf(0.95))[:, 0]
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.halfnorm(scale=1).logpdf(mu) + stats.halfnorm(scale=1).logpdf(sigma)
+        return marginal(masses, logs) - len(y) * np.log(masses @ seen) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(0.0, 4.0, 81), sigma=np.linspace(0.1, 6.0, 119))
+    yield from moments(draws, *grid)
+
+
+@problem
+def two_outputs_of_which_one_selects() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(46)
+    x = rng.lognormal(0.3, 0.4, 45)
+    y = np.stack([x, 1 / x], axis=-1) + rng.normal(0, [0.1, 0.05], (45, 2))
+    y = y[(y[:, 0] < 1.6) & (y[:, 1] > 0.3)]
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 1.0), pm.HalfNormal("sigma", 0.7)
+        draws = draws_of(
+            lambda x: np.stack([x, 1 / x], axis=-1),
+            pm.LogNormal.dist(mu, sigma),
+            observed=y,
+            metric=prb.LogLikelihood(
+                error=[0.1, 0.05], selected=([-np.inf, 0.3], [1.6, np.inf])
+            ),
+        )
+    x = np.linspace(-8.0, 12.0, 5001)
+    of_each = [stats.norm(np.exp(sign * x)[:, None], e) for sign, e in ((1, 0.1), (-1, 0.05))]
+    logs = of_each[0].logpdf(y[:, 0]) + of_each[1].logpdf(y[:, 1])
+    seen = (of_each[0].cdf(1.6) * of_each[1].sf(0.3))[:, 0]
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.norm(0, 1).logpdf(mu) + stats.halfnorm(scale=0.7).logpdf(sigma)
+        return marginal(masses, logs) - len(y) * np.log(masses @ seen) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(-0.5, 2.5, 81), sigma=np.linspace(0.08, 1.6, 81))
+    yield from moments(draws, *grid)
+
+
+# -- replicates and repeated readings ----------------------------------------------------------------
+
+
+@problem
+def repeats_of_unequal_number_with_an_unknown_error() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(47)
+    labels = np.repeat([f"rod {i}" for i in range(12)], rng.integers(1, 6, 12))
+    order = rng.permutation(len(labels))
+    names, index = np.unique(labels[order], return_inverse=True)
+    x = rng.normal(1.0, 0.4, 12)
+    y = 1e-9 * (np.exp(x)[index] + rng.normal(0, 0.5, len(index)))
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        e = pm.HalfNormal("e", 2e-9)
+        draws = draws_of(
+            lambda x: 1e-9 * np.exp(x),
+            pm.Normal.dist(mu, sigma),
+            observed=y,
+            specimens=labels[order],
+            metric=prb.LogLikelihood(error=e),
+        )
+    x = np.linspace(-7.0, 6.0, 1301)
+    member = (index[:, None] == np.arange(len(names))).astype(float)
+
+    def log_posterior(mu: Any, sigma: Any, e: Any) -> Any:
+        logs = np.empty(len(e))
+        for value in np.unique(e):
+            at = e == value
+            masses = stats.norm(mu[at, None], sigma[at, None]).pdf(x)
+            readings = stats.norm(1e-9 * np.exp(x)[:, None], value).logpdf(y) @ member
+            logs[at] = marginal(masses, readings)
+        prior = stats.norm(0, 2).logpdf(mu) + stats.halfnorm(scale=1).logpdf(sigma)
+        return logs + prior + stats.halfnorm(scale=2e-9).logpdf(e)
+
+    grid = on_grid(
+        log_posterior,
+        mu=np.linspace(0.2, 1.8, 45),
+        sigma=np.linspace(0.05, 1.4, 45),
+        e=1e-9 * np.linspace(0.25, 1.2, 45),
+    )
+    yield from moments(draws, *grid)
+
+
+@problem
+def two_rigs_with_common_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(48)
+    x = rng.weibull(2.0, 16) * 2.0
+    first, second = np.arange(12), np.array([14, 3, 9, 15, 0, 13, 12, 7])
+    y, z = x[first] ** 2, np.log(x[second]) + rng.normal(0, 0.2, 8)
+    y = y * (1 + 0.1 * rng.normal(size=12))
+    with pm.Model():
+        shape, scale = pm.LogNormal("shape", 0.5, 0.5), pm.LogNormal("scale", 0.5, 1.0)
+        of_rod = pm.Weibull.dist(shape, scale)
+        relative = prb.LogLikelihood(error=0.1, relative=True)
+        prb.Simulator(
+            "rig", lambda x: x**2, of_rod, observed=y, specimens=first, metric=relative
+        )
+        draws = draws_of(
+            np.log, of_rod, observed=z, specimens=second, metric=prb.LogLikelihood(error=0.2)
+        )
+    u = np.linspace(-6.0, 3.0, 3001)
+    x = np.exp(u)
+    logs = np.zeros((len(x), 16))
+    logs[:, first] += stats.norm(x[:, None] ** 2, 0.1 * x[:, None] ** 2).logpdf(y)
+    logs[:, second] += stats.norm(u[:, None], 0.2).logpdf(z)
+
+    def log_posterior(shape: Any, scale: Any) -> Any:
+        density = stats.weibull_min(shape[:, None], scale=scale[:, None]).pdf(x)
+        prior = stats.norm(0.5, 0.5).logpdf(np.log(shape)) + stats.norm(0.5, 1).logpdf(np.log(scale))
+        return marginal(density * x * (u[1] - u[0]), logs) + prior - np.log(shape * scale)
+
+    grid = on_grid(log_posterior, shape=np.linspace(0.6, 5.0, 81), scale=np.linspace(0.9, 3.6, 81))
+    yield from moments(draws, *grid)
+
+
+@problem
+def repeats_with_an_error_each_beside_gross_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(49)
+    labels, error = np.repeat(np.arange(10), 3), np.tile([0.1, 0.2, 0.4], 10)
+    y = np.repeat(rng.uniform(1.0, 2.5, 10) ** 2, 3) + error * rng.normal(size=30)
+    y[12:15] += 20.0
+    with pm.Model():
+        low, width = pm.Normal("low", 0.5, 1.0), pm.HalfNormal("width", 3.0)
+        draws = draws_of(
+            lambda x: x**2,
+            pm.Uniform.dist(low, low + width),
+            observed=y,
+            specimens=labels,
+            metric=prb.LogLikelihood(error=error, gross_errors=0.2),
+        )
+    x = np.linspace(-4.0, 8.0, 12001)
+    logs = stats.norm(x[:, None] ** 2, error).logpdf(y)
+    like = np.exp(logs.reshape(len(x), 10, 3).sum(axis=2))
+    total = np.concatenate([np.zeros((1, 10)), np.cumsum(like, axis=0)]) * (x[1] - x[0])
+
+    def log_posterior(low: Any, width: Any) -> Any:
+        first, last = (np.round((x + 4.0) * 1000).astype(int) for x in (low, low + width))
+        p = 0.8 * (total[last] - total[first]) / width[:, None] + 0.2 / (2 * np.ptp(y)) ** 3
+        prior = stats.norm(0.5, 1).logpdf(low) + stats.halfnorm(scale=3).logpdf(width)
+        return np.log(p).sum(axis=1) + prior
+
+    grid = on_grid(log_posterior, low=np.linspace(-3.5, 2.0, 551), width=np.linspace(0.3, 5.5, 521))
     yield from moments(draws, *grid)
