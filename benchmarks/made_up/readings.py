@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 from scipy import stats
 
 import prbayes as prb
-from benchmarks.made_up import difference, moments, on_grid, problem
+from benchmarks.made_up import moments, on_grid, problem
 
 
 def draws_of(response: Any, *inputs: Any, **arguments: Any) -> Any:
@@ -470,7 +471,9 @@ def steps_wider_than_the_population() -> Iterator[tuple[str, float]]:
         logs = np.log(np.maximum(masses, 1e-300)).sum(axis=1)
         return logs + stats.norm(1, 2).logpdf(mu) + stats.halfnorm(scale=0.5).logpdf(sigma)
 
-    grid = on_grid(log_posterior, mu=np.linspace(0.8, 1.6, 161), sigma=np.linspace(0.0005, 0.8, 400))
+    grid = on_grid(
+        log_posterior, mu=np.linspace(0.8, 1.6, 161), sigma=np.linspace(0.0005, 0.8, 400)
+    )
     yield from moments(draws, *grid)
 
 
@@ -555,7 +558,10 @@ def an_unknown_share_of_gross_errors_of_two_outputs() -> Iterator[tuple[str, flo
             metric=prb.LogLikelihood(gross_errors=True),
         )
     u = np.log(y)
-    inputs, jacobian = np.stack([u.sum(axis=1), u[:, 0] - u[:, 1]], axis=-1) / 2, 0.5 / y.prod(axis=1)
+    inputs, jacobian = (
+        np.stack([u.sum(axis=1), u[:, 0] - u[:, 1]], axis=-1) / 2,
+        0.5 / y.prod(axis=1),
+    )
     ranges = np.prod(2 * np.ptp(y, axis=0))
     rng = np.random.default_rng(1)
     centre, spread = np.array([1.7, 1.5, 0.16, 0.2, 0.1]), np.array([0.05, 0.06, 0.05, 0.05, 0.07])
@@ -725,7 +731,9 @@ def weibull_strengths_that_passed_a_proof_test() -> Iterator[tuple[str, float]]:
     def log_posterior(shape: Any, scale: Any) -> Any:
         population = stats.weibull_min(shape[:, None], scale=scale[:, None])
         logs = (population.logpdf(x) - population.logsf(least)).sum(axis=1)
-        prior = stats.norm(1.2, 0.5).logpdf(np.log(shape)) + stats.norm(0, 0.3).logpdf(np.log(scale))
+        prior = stats.norm(1.2, 0.5).logpdf(np.log(shape)) + stats.norm(0, 0.3).logpdf(
+            np.log(scale)
+        )
         return logs + prior - np.log(shape * scale)
 
     grid = on_grid(log_posterior, shape=np.linspace(0.5, 12, 201), scale=np.linspace(0.3, 2.0, 201))
@@ -770,9 +778,7 @@ def two_outputs_of_which_one_selects() -> Iterator[tuple[str, float]]:
             lambda x: np.stack([x, 1 / x], axis=-1),
             pm.LogNormal.dist(mu, sigma),
             observed=y,
-            metric=prb.LogLikelihood(
-                error=[0.1, 0.05], selected=([-np.inf, 0.3], [1.6, np.inf])
-            ),
+            metric=prb.LogLikelihood(error=[0.1, 0.05], selected=([-np.inf, 0.3], [1.6, np.inf])),
         )
     x = np.linspace(-8.0, 12.0, 5001)
     of_each = [stats.norm(np.exp(sign * x)[:, None], e) for sign, e in ((1, 0.1), (-1, 0.05))]
@@ -842,9 +848,7 @@ def two_rigs_with_common_specimens() -> Iterator[tuple[str, float]]:
         shape, scale = pm.LogNormal("shape", 0.5, 0.5), pm.LogNormal("scale", 0.5, 1.0)
         of_rod = pm.Weibull.dist(shape, scale)
         relative = prb.LogLikelihood(error=0.1, relative=True)
-        prb.Simulator(
-            "rig", lambda x: x**2, of_rod, observed=y, specimens=first, metric=relative
-        )
+        prb.Simulator("rig", lambda x: x**2, of_rod, observed=y, specimens=first, metric=relative)
         draws = draws_of(
             np.log, of_rod, observed=z, specimens=second, metric=prb.LogLikelihood(error=0.2)
         )
@@ -856,7 +860,9 @@ def two_rigs_with_common_specimens() -> Iterator[tuple[str, float]]:
 
     def log_posterior(shape: Any, scale: Any) -> Any:
         density = stats.weibull_min(shape[:, None], scale=scale[:, None]).pdf(x)
-        prior = stats.norm(0.5, 0.5).logpdf(np.log(shape)) + stats.norm(0.5, 1).logpdf(np.log(scale))
+        prior = stats.norm(0.5, 0.5).logpdf(np.log(shape)) + stats.norm(0.5, 1).logpdf(
+            np.log(scale)
+        )
         return marginal(density * x * (u[1] - u[0]), logs) + prior - np.log(shape * scale)
 
     grid = on_grid(log_posterior, shape=np.linspace(0.6, 5.0, 81), scale=np.linspace(0.9, 3.6, 81))
@@ -890,4 +896,294 @@ def repeats_with_an_error_each_beside_gross_errors() -> Iterator[tuple[str, floa
         return np.log(p).sum(axis=1) + prior
 
     grid = on_grid(log_posterior, low=np.linspace(-3.5, 2.0, 551), width=np.linspace(0.3, 5.5, 521))
+    yield from moments(draws, *grid)
+
+
+# -- missing outputs ---------------------------------------------------------------------------------
+
+
+@problem
+def a_third_of_three_outputs_is_missing() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(51)
+    x, units = rng.lognormal(0.0, 0.4, 14), np.array([1e-9, 1.0, 1e6])
+    f = np.stack([x, np.sqrt(x), 1 / x], axis=-1)
+    y = units * (f + rng.normal(0, [0.2, 0.1, 0.3], (14, 3)))
+    y[rng.random((14, 3)) < 0.35] = np.nan
+    y = y[np.isfinite(y).any(axis=1)]
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 3.0), pm.HalfNormal("sigma", 2.0)
+        draws = draws_of(
+            lambda x: {"charge": 1e-9 * x, "root": np.sqrt(x), "load": 1e6 / x},
+            pm.LogNormal.dist(mu, sigma),
+            observed=dict(zip(("root", "load", "charge"), y.T[[1, 2, 0]], strict=True)),
+            metric=prb.LogLikelihood(error=[0.1, 0.3e6, 0.2e-9]),
+        )
+    x = np.linspace(-8.0, 8.0, 4001)
+    f = np.stack([np.exp(x), np.exp(x / 2), np.exp(-x)], axis=-1)[:, None]
+    logs = np.nan_to_num(stats.norm(f, [0.2, 0.1, 0.3]).logpdf(y / units)).sum(axis=-1)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+        prior = stats.norm(0, 3).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+        return marginal(masses, logs) + prior
+
+    grid = on_grid(log_posterior, mu=np.linspace(-0.9, 0.9, 91), sigma=np.linspace(0.03, 1.6, 91))
+    yield from moments(draws, *grid)
+
+
+@problem
+def exact_outputs_of_two_inputs_half_of_them_missing() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(52)
+    a, b = rng.normal(1.0, 0.3, 16), rng.normal(0.5, 0.4, 16)
+    y = np.stack([np.exp(a + b), (a - b) ** 3 + a - b], axis=-1)
+    y[:5, 0], y[5:10, 1] = np.nan, np.nan
+    with pm.Model():
+        mu = pm.Normal("mu", 0.5, 1.0, shape=2)
+        sigma = pm.HalfNormal("sigma", 0.5, shape=2)
+        draws = draws_of(
+            lambda a, b: np.stack([np.exp(a + b), (a - b) ** 3 + a - b], axis=-1),
+            pm.Normal.dist(mu[0], sigma[0]),
+            pm.Normal.dist(mu[1], sigma[1]),
+            observed=y,
+        )
+    u = np.stack([a + b, a - b], axis=-1)  # normal coordinates of the two outputs
+    rng, t = np.random.default_rng(1), stats.t(5)
+    centre, scale = np.array([1.0, 0.5, -1.1, -1.1]), np.array([0.13, 0.13, 0.55, 0.55])
+    theta = centre + scale * t.rvs((400_000, 4), random_state=rng)
+    log_q, (m0, m1, l0, l1) = t.logpdf((theta - centre) / scale).sum(axis=1), theta.T
+    s0, s1 = np.exp(l0), np.exp(l1)
+    total, apart = s0**2 + s1**2, s0**2 - s1**2
+    logs = stats.norm(0.5, 1).logpdf(theta[:, :2]).sum(axis=1) + l0 + l1
+    logs += stats.halfnorm(scale=0.5).logpdf(s0) + stats.halfnorm(scale=0.5).logpdf(s1)
+    for i in range(16):
+        z = u[i] - np.stack([m0 + m1, m0 - m1], axis=-1)
+        if i < 10:
+            logs += stats.norm(0, np.sqrt(total)).logpdf(z[:, 1 if i < 5 else 0])
+        else:
+            determinant = total**2 - apart**2
+            square = total * (z**2).sum(axis=1) - 2 * apart * z.prod(axis=1)
+            logs += -0.5 * square / determinant - 0.5 * np.log(determinant)
+    logs = np.nan_to_num(logs - log_q, nan=-np.inf)
+    weights = np.exp(logs - logs.max())
+    names = [(name, k) for name in ("mu", "sigma") for k in (0, 1)]
+    of_draws = {f"{name}[{k}]": draws[name].values[..., k] for name, k in names}
+    values = dict(zip(of_draws, (m0, m1, s0, s1), strict=True))
+    yield from moments(of_draws, values, weights / weights.sum())
+
+
+@problem
+def a_curve_of_which_specimens_failed_early() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(53)
+    times, x = np.array([0.5, 1.0, 2.0, 3.0]), rng.gamma(6.0, 0.1, 12)
+    f = np.exp(-x[:, None] * times)
+    y = f + rng.normal(0, 0.05, f.shape)
+    y[f < 0.25] = np.nan
+    table = pd.DataFrame(y, columns=times)
+    with pm.Model():
+        mean, sd = pm.HalfNormal("mean", 2.0), pm.HalfNormal("sd", 2.0)
+        e = pm.HalfNormal("e", 0.2)
+        draws = draws_of(
+            lambda x: np.exp(-x[..., None] * times),
+            pm.Gamma.dist(mu=mean, sigma=sd),
+            observed=table.dropna(how="all"),
+            metric=prb.LogLikelihood(error=e),
+        )
+    x = np.linspace(0.0005, 4.0, 4000)
+    f, y = np.exp(-x[:, None] * times)[:, None], y[np.isfinite(y).any(axis=1)]
+
+    def log_posterior(mean: Any, sd: Any, e: Any) -> Any:
+        logs = np.empty(len(e))
+        for value in np.unique(e):
+            at = e == value
+            shape, scale = (mean[at] / sd[at])[:, None] ** 2, (sd[at] ** 2 / mean[at])[:, None]
+            of_readings = np.nan_to_num(stats.norm(f, value).logpdf(y)).sum(axis=-1)
+            logs[at] = marginal(stats.gamma(shape, scale=scale).pdf(x), of_readings)
+        prior = stats.halfnorm(scale=2).logpdf(mean) + stats.halfnorm(scale=2).logpdf(sd)
+        return logs + prior + stats.halfnorm(scale=0.2).logpdf(e)
+
+    grid = on_grid(
+        log_posterior,
+        mean=np.linspace(0.2, 1.4, 41),
+        sd=np.linspace(0.05, 1.0, 41),
+        e=np.linspace(0.02, 0.13, 31),
+    )
+    yield from moments(draws, *grid)
+
+
+# -- known nuisance inputs ---------------------------------------------------------------------------
+
+
+@problem
+def a_known_tolerance_to_the_third_power() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(54)
+    modulus, h = rng.lognormal(np.log(2e11), 0.03, 20), rng.lognormal(np.log(2e-3), 0.04, 20)
+    y = 1e3 / (modulus * h**3)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 26.0, 1.0), pm.HalfNormal("sigma", 0.3)
+        draws = draws_of(
+            lambda modulus, h: 1e3 / (modulus * h**3),
+            pm.LogNormal.dist(mu, sigma),
+            pm.LogNormal.dist(np.log(2e-3), 0.04),
+            observed=y,
+        )
+    z = np.log(1e3 / y) - 3 * np.log(2e-3)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(mu[:, None], np.hypot(sigma, 0.12)[:, None]).logpdf(z).sum(axis=1)
+        return logs + stats.norm(26, 1).logpdf(mu) + stats.halfnorm(scale=0.3).logpdf(sigma)
+
+    grid = on_grid(log_posterior, mu=np.linspace(25.7, 26.3, 241), sigma=np.linspace(0, 0.4, 400))
+    yield from moments(draws, *grid)
+
+
+@problem
+def a_phase_of_which_nothing_is_known() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(55)
+    x, phase = rng.normal(2.0, 0.2, 24), rng.uniform(0.0, 1.0, 24)
+    y = x + 0.5 * np.sin(2 * np.pi * phase)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 5.0), pm.HalfNormal("sigma", 1.0)
+        draws = draws_of(
+            lambda x, phase: x + 0.5 * np.sin(2 * np.pi * phase),
+            pm.Normal.dist(mu, sigma),
+            pm.Uniform.dist(0.0, 1.0),
+            observed=y,
+        )
+    shift = 0.5 * np.sin(2 * np.pi * (np.arange(2000) + 0.5) / 2000)
+    edges = np.linspace(-0.5 - 1e-9, 0.5 + 1e-9, 801)
+    share, middle = np.histogram(shift, edges)[0] / 2000, (edges[1:] + edges[:-1]) / 2
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = np.empty(len(mu))
+        for m in np.unique(mu):
+            at = mu == m
+            square = (y[:, None] - middle - m) ** 2
+            for s, place in zip(sigma[at], np.flatnonzero(at), strict=True):
+                logs[place] = np.log(np.exp(-square / (2 * s * s)) @ share / s).sum()
+        return logs + stats.norm(0, 5).logpdf(mu) + stats.halfnorm(scale=1).logpdf(sigma)
+
+    grid = on_grid(log_posterior, mu=np.linspace(1.7, 2.5, 41), sigma=np.linspace(0.03, 0.8, 60))
+    yield from moments(draws, *grid)
+
+
+@problem
+def a_known_gain_of_readings_with_an_unknown_error() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(56)
+    x, gain = rng.weibull(3.0, 15), rng.uniform(0.8, 1.2, 15)
+    f = np.stack([x * gain, gain], axis=-1)
+    y = 1e6 * (f + rng.normal(0, 0.05, f.shape))
+    with pm.Model():
+        shape, scale = pm.LogNormal("shape", 1.0, 0.7), pm.LogNormal("scale", 0.0, 1.0)
+        e = pm.HalfNormal("e", 2e5)
+        draws = draws_of(
+            lambda x, gain: 1e6 * np.stack([x * gain, gain], axis=-1),
+            pm.Weibull.dist(shape, scale),
+            pm.Uniform.dist(0.8, 1.2),
+            observed=y,
+            metric=prb.LogLikelihood(error=e),
+        )
+    x, gain = np.linspace(0.01, 4.0, 500), 0.8 + 0.4 * (np.arange(160) + 0.5) / 160
+    y = y / 1e6
+
+    def log_posterior(shape: Any, scale: Any, e: Any) -> Any:
+        logs = np.empty(len(e))
+        for value in np.unique(e):
+            at = e == value
+            first = stats.norm(x[:, None, None] * gain[:, None], value).pdf(y[:, 0])
+            like = (first * stats.norm(gain[:, None], value).pdf(y[:, 1])).mean(axis=1)
+            masses = stats.weibull_min(shape[at, None], scale=scale[at, None]).pdf(x)
+            logs[at] = np.log(masses @ like + 1e-300).sum(axis=1)
+        prior = stats.norm(1, 0.7).logpdf(np.log(shape)) + stats.norm.logpdf(np.log(scale))
+        return logs + prior - np.log(shape * scale) + stats.halfnorm(scale=0.2).logpdf(e)
+
+    grid = on_grid(
+        log_posterior,
+        shape=np.linspace(1.2, 6.5, 45),
+        scale=np.linspace(0.6, 1.4, 45),
+        e=np.linspace(0.002, 0.25, 63),
+    )
+    draws = {"shape": draws["shape"], "scale": draws["scale"], "e": draws["e"] / 1e6}
+    yield from moments(draws, *grid)
+
+
+# -- fewer readings than inputs ----------------------------------------------------------------------
+
+
+@problem
+def the_radius_of_two_centred_inputs() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(57)
+    y = np.hypot(*rng.normal(0.0, 2.0, (2, 15)))
+    with pm.Model():
+        sigma = pm.HalfNormal("sigma", 10.0)
+        draws = draws_of(
+            np.hypot, pm.Normal.dist(0.0, sigma), pm.Normal.dist(0.0, sigma), observed=y
+        )
+
+    def log_posterior(sigma: Any) -> Any:
+        return stats.rayleigh(scale=sigma[:, None]).logpdf(y).sum(axis=1) + stats.halfnorm(
+            scale=10
+        ).logpdf(sigma)
+
+    yield from moments(draws, *on_grid(log_posterior, sigma=np.linspace(0.8, 5.0, 2001)))
+
+
+@problem
+def a_product_of_lognormal_inputs() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(58)
+    y = 1e-9 * np.exp(rng.normal(1.0, 0.5, 12))
+    with pm.Model():
+        mu = pm.Normal("mu", 0.0, [2.0, 0.3], shape=2)
+        sigma = pm.HalfNormal("sigma", [1.0, 0.5], shape=2)
+        draws = draws_of(
+            lambda a, b: 1e-9 * a * b,
+            pm.LogNormal.dist(mu[0], sigma[0]),
+            pm.LogNormal.dist(mu[1], sigma[1]),
+            observed=y,
+        )
+    z = np.log(1e9 * y)
+
+    def log_posterior(s0: Any, s1: Any) -> Any:
+        variance, between = s0**2 + s1**2, 2.0**2 + 0.3**2
+        total = variance + 12 * between
+        square = ((z - z.mean()) ** 2).sum() / variance + 12 * z.mean() ** 2 / total
+        logs = -0.5 * square - 5.5 * np.log(variance) - 0.5 * np.log(total)
+        return logs + stats.halfnorm(scale=1).logpdf(s0) + stats.halfnorm(scale=0.5).logpdf(s1)
+
+    values, weights = on_grid(
+        log_posterior, s0=np.linspace(0.001, 2.5, 400), s1=np.linspace(0.001, 1.5, 400)
+    )
+    of_draws = {f"s{k}": draws["sigma"].values[..., k] for k in (0, 1)}
+    yield from moments(of_draws, values, weights)
+
+
+@problem
+def the_largest_load_of_three_smooth_ones() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(59)
+    loads = rng.gamma(4.0, 1.0, (40, 3))
+    y = (loads**3).sum(axis=1) + rng.normal(0, 20.0, 40)
+    with pm.Model():
+        shape, scale = pm.LogNormal("shape", 1.0, 0.5), pm.LogNormal("scale", 0.0, 0.5)
+        inputs = [pm.Gamma.dist(shape, 1 / scale) for _ in range(3)]
+        draws = draws_of(
+            lambda a, b, c: a**3 + b**3 + c**3,
+            *inputs,
+            observed=y,
+            metric=prb.LogLikelihood(error=20.0),
+        )
+    # The density of a sum of cubes by two convolutions on a grid
+    step, size = 1.0, 2**14
+    edges = step * np.arange(size + 1)
+
+    def log_posterior(shape: Any, scale: Any) -> Any:
+        noise = np.exp(-0.5 * (2 * np.pi * np.fft.rfftfreq(size, step) * 20.0) ** 2)
+        result = np.empty(len(shape))
+        for k, (a, s) in enumerate(zip(shape, scale, strict=True)):
+            masses = np.diff(stats.gamma(a, scale=s).cdf(np.cbrt(edges)))
+            density = np.fft.irfft(np.fft.rfft(masses) ** 3 * noise, size)
+            at = np.interp(y - 1.5 * step, edges[:-1], density)
+            result[k] = np.log(np.maximum(at, 1e-300)).sum()
+        prior = stats.norm(1, 0.5).logpdf(np.log(shape)) + stats.norm(0, 0.5).logpdf(np.log(scale))
+        return result + prior - np.log(shape * scale)
+
+    grid = on_grid(log_posterior, shape=np.linspace(1.0, 9.0, 41), scale=np.linspace(0.3, 2.6, 47))
     yield from moments(draws, *grid)
