@@ -75,7 +75,7 @@ from prbayes.specimens.points import (
     typical_specimens,
 )
 from prbayes.specimens.proposals import Proposals
-from prbayes.specimens.response_share import response_share
+from prbayes.specimens.response_share import renewed_share, response_share
 from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
@@ -258,15 +258,12 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
 
-        refined, share = response_share(
-            # Calls of a table's surface do not count as runs.
-            OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
-            data,
-            first.emulation,
-            posterior,
-            selection,
-        )
-        if refined is not first.emulation and not likelihood.has_table:
+        # Calls of a table's surface do not count as runs.
+        run = OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs
+        for _ in range(4):
+            refined, share = response_share(run, data, first.emulation, posterior, selection)
+            if refined is first.emulation or likelihood.has_table:
+                break
             # The refined emulator is accurate beside the region where runs fail, so that points of
             # specimens there are on the right side of its boundary. Populations of a selection are
             # wider than those of the measured specimens.
@@ -274,6 +271,24 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                 of_share = partial(SpecimenPopulations(likelihood).posterior, share=share)
                 data = replace(data, posterior=of_share)
             first = _emulate(runs, data, refined)
+            if selection is None or share is None:
+                break
+            # Wider populations reach inputs at which the earlier emulator was wrong.
+            draws = PopulationDraws(SpecimenPopulations(likelihood), first.thetas)
+            specimens = draws.specimens()
+            renewed = renewed_share(data, first.emulation, specimens, share, selection)
+            change = float(np.std(draws.log_share(renewed) - draws.log_share(share)))
+            if change <= 2 * data.options.half_difference:
+                break
+            points = first.points
+        else:
+            raise DesignError(
+                f"{likelihood.name}: got limits of selected= for which the probability of being "
+                f"measured still changes the log-likelihood by {change:.2g} nats after "
+                f"{len(first.emulation.z)} runs, expected at most "
+                f"{2 * data.options.half_difference:.2g}: the likely populations reach far beyond "
+                f"the runs; narrow the priors"
+            )
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
         if likelihood.has_table:

@@ -38,6 +38,27 @@ def test_probabilities_of_being_seen() -> None:
 
 
 @pytest.mark.long
+def test_the_probability_of_being_seen_is_that_of_the_last_emulator() -> None:
+    """A response that oscillates, so that populations far wider than the specimens are likely."""
+    rng = np.random.default_rng(45)
+    y = np.cos(rng.normal(0.6, 0.5, 60)) + rng.normal(0, 0.1, 60)
+    y = y[(y > 0.5) & (y < 0.95)]
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.HalfNormal("mu", 1.0), pm.HalfNormal("sigma", 1.0))
+        metric = prb.LogLikelihood(error=0.1, selected=(0.5, 0.95))
+        prb.Simulator("y", np.cos, x, observed=y, metric=metric)
+    evaluator = Evaluator.of(model)
+    mu, sigma = (a.ravel() for a in np.meshgrid([0.3, 1.0, 2.0], [0.5, 1.0, 2.0, 3.0]))
+    x = np.linspace(-25.0, 25.0, 5001)
+    reading = stats.norm(np.cos(x)[:, None], 0.1)
+    masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+    seen = masses @ (reading.sf(0.5) - reading.sf(0.95))
+    exact = np.log(masses @ reading.pdf(y) / seen).sum(axis=1)
+    found = evaluator(np.column_stack([np.log(mu), np.log(sigma)])).log_other
+    assert np.abs(found - exact).max() < 0.5
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("error", [0.0, 0.9])
 def test_log_likelihoods_of_a_selection_are_exact(error: float) -> None:
     case, limit = study.case_of(0.6, error, 0)
