@@ -13,7 +13,7 @@ import prbayes as prb
 from benchmarks import selection as study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import selection_of
-from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_likelihood import draw_readings, measurements_of
 from prbayes.response.compile import PLAIN
 from prbayes.specimens.selection import Selection
 
@@ -122,7 +122,7 @@ def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
     [
         ({"selected": (None, None)}, "expected \\(lower, upper\\)"),
         ({"selected": 1.0}, "expected \\(lower, upper\\)"),
-        ({"selected": (1.5, None)}, "got the reading 1 of specimen 0"),
+        ({"selected": (1.5, None)}, "^y: metric: selected: got the reading 1 of specimen 0"),
         ({"selected": (None, 2.5)}, "got the reading 3 of specimen 2"),
         ({"selected": ([0.0, 0.0], None)}, "got limits of shape"),
         ({"selected": (0.5, None), "error": [0.1, 0.2, 0.3]}, "the same for all"),
@@ -135,6 +135,18 @@ def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
 def test_refused_selections(options: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         simulator(**options)
+
+
+def test_an_output_without_a_limit() -> None:
+    """None beside the limit of another output is no limit."""
+    y = np.array([[1.0, 2.0], [2.0, np.nan], [3.0, 4.0]])
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        metric = prb.LogLikelihood(error=0.1, selected=([0.5, None], [None, 5.0]))
+        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y, metric=metric)
+    selection = selection_of(list(measurements_of(model).values()))
+    assert selection is not None
+    np.testing.assert_array_equal([selection.low, selection.high], [[0.5, -np.inf], [np.inf, 5.0]])
 
 
 def test_a_model_without_limits_has_no_selection() -> None:
