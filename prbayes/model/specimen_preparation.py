@@ -75,7 +75,8 @@ from prbayes.specimens.points import (
     typical_specimens,
 )
 from prbayes.specimens.proposals import Proposals
-from prbayes.specimens.response_share import renewed_share, response_share
+from prbayes.specimens.response_share import ResponseShare, renewed_share, response_share
+from prbayes.specimens.selection import Selection
 from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
@@ -242,19 +243,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             return replace(first, findings=report(*runs.findings, *first.findings))
 
         def posterior(share: PopulationShare | None) -> PopulationDraws:
-            has_own = likelihood.inputs.conditions or data.columns is not None
-            if share is not None and has_own:
-                got, advice = (
-                    "NaN from the response for a share of the population that is not negligible",
-                    "return inf there if these specimens fail, or a number beside all readings",
-                )
-                if selection is not None:
-                    got, advice = "selected=", "pass the condition as a constant, or no limits"
-                raise DesignError(
-                    f"{likelihood.name}: got {got}, expected a response of all specimens with "
-                    "conditions or functions of their own, on which that share depends; "
-                    f"{advice}"
-                )
+            if share is not None:
+                _refuse_own_responses(likelihood, data, selection)
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
 
@@ -274,20 +264,16 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             if selection is None or share is None:
                 break
             # Wider populations reach inputs at which the earlier emulator was wrong.
-            draws = PopulationDraws(SpecimenPopulations(likelihood), first.thetas)
-            specimens = draws.specimens()
-            renewed = renewed_share(data, first.emulation, specimens, share, selection)
-            change = float(np.std(draws.log_share(renewed) - draws.log_share(share)))
+            change = _share_change(likelihood, data, first, share, selection)
             if change <= 2 * data.options.half_difference:
                 break
             points = first.points
         else:
             raise DesignError(
-                f"{likelihood.name}: got limits of selected= for which the probability of being "
-                f"measured still changes the log-likelihood by {change:.2g} nats after "
-                f"{len(first.emulation.z)} runs, expected at most "
-                f"{2 * data.options.half_difference:.2g}: the likely populations reach far beyond "
-                f"the runs; narrow the priors"
+                f"{likelihood.name}: got a probability of being measured that still changes the "
+                f"log-likelihood by {change:.2g} nats after {len(first.emulation.z)} runs, "
+                f"expected at most {2 * data.options.half_difference:.2g}: the likely populations "
+                "reach far beyond the limits of selected=; narrow the priors"
             )
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
@@ -304,6 +290,37 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     finally:
         for response in responses:
             response.on_start = None
+
+
+def _share_change(
+    likelihood: SpecimenLikelihood,
+    data: SpecimenData,
+    preparation: Preparation,
+    share: ResponseShare,
+    selection: Selection,
+) -> float:
+    """Return by how much the log share of a selection changes with the last emulator, in nats."""
+    draws = PopulationDraws(SpecimenPopulations(likelihood), preparation.thetas)
+    renewed = renewed_share(data, preparation.emulation, draws.specimens(), share, selection)
+    return float(np.std(draws.log_share(renewed) - draws.log_share(share)))
+
+
+def _refuse_own_responses(
+    likelihood: SpecimenLikelihood, data: SpecimenData, selection: Selection | None
+) -> None:
+    """Raise if specimens have conditions or functions of their own, beside a share."""
+    if not likelihood.inputs.conditions and data.columns is None:
+        return
+    got, advice = (
+        "NaN from the response for a share of the population that is not negligible",
+        "return inf there if these specimens fail, or a number beside all readings",
+    )
+    if selection is not None:
+        got, advice = "selected=", "pass the condition as a constant, or no limits"
+    raise DesignError(
+        f"{likelihood.name}: got {got}, expected a response of all specimens with conditions or "
+        f"functions of their own, on which that share depends; {advice}"
+    )
 
 
 def _refuse_missing_outputs(

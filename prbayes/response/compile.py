@@ -33,7 +33,6 @@ from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.type import TensorType
 from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 
@@ -242,7 +241,7 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
 def with_leading_axis(symbols: Sequence[TensorVariable]) -> list[TensorVariable]:
     """Return symbols of the same names with a leading axis for batches."""
     # `pytensor.tensor.tensor` refuses names such as "half" and "double", which are types of NumPy.
-    types = [TensorType(s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+    types = [pt.TensorType(s.dtype, shape=(None, *s.type.shape)) for s in symbols]
     return [type_(name=s.name) for type_, s in zip(types, symbols, strict=True)]
 
 
