@@ -11,7 +11,7 @@ import pymc as pm
 from scipy import stats
 
 import prbayes as prb
-from benchmarks.made_up import moments, on_grid, problem
+from benchmarks.made_up import difference, moments, on_grid, problem
 
 
 def draws_of(response: Any, *inputs: Any, **arguments: Any) -> Any:
@@ -1118,6 +1118,11 @@ def the_radius_of_two_centred_inputs() -> Iterator[tuple[str, float]]:
         draws = draws_of(
             np.hypot, pm.Normal.dist(0.0, sigma), pm.Normal.dist(0.0, sigma), observed=y
         )
+        optimum = prb.minimize()
+    best = np.sqrt((y**2).mean() / 2)
+    stderr = best / (2 * np.sqrt(15))
+    yield difference("optimum", optimum.point["sigma"], best, 0.1 * stderr)
+    yield difference("its standard error", optimum.stderr["sigma"], stderr, 0.1 * stderr)
 
     def log_posterior(sigma: Any) -> Any:
         return stats.rayleigh(scale=sigma[:, None]).logpdf(y).sum(axis=1) + stats.halfnorm(
