@@ -106,6 +106,8 @@ def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
     variables = measurement.unknown
     prior = PriorSampler(list(variables.values()))(draws, seed=0) if variables else []
     samples = dict(zip(variables, prior, strict=True))
+    for role, sample in samples.items():
+        _refuse_by_reading(role, sample.shape[1:], measurement.event)
     bias = samples.pop("bias", np.zeros(1))
     middle = np.median(bias, axis=0)
     scatter = np.quantile(np.abs(bias - middle), prob, axis=0)
@@ -115,6 +117,17 @@ def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
     unknown |= {"bias": middle} if "bias" in variables else {}
     readings = measurement.metric.readings(measurement.rows, unknown, measurement.event)
     return replace(readings, error=np.hypot(readings.error, scatter))
+
+
+def _refuse_by_reading(role: str, shape: Shape, event: Shape) -> None:
+    """Raise if an unknown parameter of the readings has a shape other than (), (1,) and (m,)."""
+    if shape in ((), (1,), event):
+        return
+    of_outputs = f", or of shape {event}, one for each output" if event else ""
+    raise ValueError(
+        f"LogLikelihood: {'bias' if role == 'bias' else 'error'}: got a variable of shape {shape}, "
+        f"expected a scalar one{of_outputs}; pass numbers for single readings"
+    )
 
 
 def unit_readings(measurement: Measurement) -> Readings:
@@ -134,6 +147,11 @@ def selection_of(measurements: Sequence[Measurement]) -> Selection | None:
         readings, shape = unit_readings(m), m.rows.shape
         try:
             limits = [np.broadcast_to(np.asarray(x, float), shape[1:]) for x in (low, high)]
+            # None for one of the outputs has become NaN.
+            limits = [
+                np.where(np.isnan(x), default, x)
+                for x, default in zip(limits, (-np.inf, np.inf), strict=True)
+            ]
         except ValueError:
             raise ValueError(
                 f"{m.name}: metric: selected: got limits of shape {np.shape(low)} and "

@@ -495,9 +495,10 @@ def _joint_likelihood(
     """
     name = measurement.name
     try:
-        _ = measurement.readings, selection_of([measurement])
+        _ = measurement.readings
     except ValueError as error:
         raise ValueError(f"{name}: metric: {error}") from None
+    selection_of([measurement])
     joined = {m for partner in partners for m in partner.measurements}
     earlier = [m for m in measurements_of(model).values() if m in joined]
     likelihood = SpecimenLikelihood((*earlier, measurement), weakref.ref(model))

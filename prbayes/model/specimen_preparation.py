@@ -73,9 +73,11 @@ from prbayes.specimens.points import (
     normal_of,
     of_all_specimens,
     specimen_points,
+    typical_specimens,
 )
 from prbayes.specimens.proposals import Normal, Proposals
-from prbayes.specimens.response_share import response_share
+from prbayes.specimens.response_share import ResponseShare, renewed_share, response_share
+from prbayes.specimens.selection import Selection
 from prbayes.specimens.shared_points import PointMass, PopulationShare
 from prbayes.specimens.weighted_points import WeightedPoints
 
@@ -242,31 +244,17 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             return replace(first, findings=report(*runs.findings, *first.findings))
 
         def posterior(share: PopulationShare | None) -> PopulationDraws:
-            has_own = likelihood.inputs.conditions or data.columns is not None
-            if share is not None and has_own:
-                got, advice = (
-                    "NaN from the response for a share of the population that is not negligible",
-                    "return inf there if these specimens fail, or a number beside all readings",
-                )
-                if selection is not None:
-                    got, advice = "selected=", "pass the condition as a constant, or no limits"
-                raise DesignError(
-                    f"{likelihood.name}: got {got}, expected a response of all specimens with "
-                    "conditions or functions of their own, on which that share depends; "
-                    f"{advice}"
-                )
+            if share is not None:
+                _refuse_own_responses(likelihood, data, selection)
             populations = SpecimenPopulations(likelihood)
             return populations.posterior(points.z, points.log_a, share=share)
 
-        refined, share = response_share(
-            # Calls of a table's surface do not count as runs.
-            OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs,
-            data,
-            first.emulation,
-            posterior,
-            selection,
-        )
-        if refined is not first.emulation and not likelihood.has_table:
+        # Calls of a table's surface do not count as runs.
+        run = OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs
+        for _ in range(4):
+            refined, share = response_share(run, data, first.emulation, posterior, selection)
+            if refined is first.emulation or likelihood.has_table:
+                break
             # The refined emulator is accurate beside the region where runs fail, so that points of
             # specimens there are on the right side of its boundary. Populations of a selection are
             # wider than those of the measured specimens.
@@ -274,6 +262,20 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
                 of_share = partial(SpecimenPopulations(likelihood).posterior, share=share)
                 data = replace(data, posterior=of_share)
             first = _emulate(runs, data, refined)
+            if selection is None or share is None:
+                break
+            # Wider populations reach inputs at which the earlier emulator was wrong.
+            change = _share_change(likelihood, data, first, share, selection)
+            if change <= 2 * data.options.half_difference:
+                break
+            points = first.points
+        else:
+            raise DesignError(
+                f"{likelihood.name}: got a probability of being measured that still changes the "
+                f"log-likelihood by {change:.2g} nats after {len(first.emulation.z)} runs, "
+                f"expected at most {2 * data.options.half_difference:.2g}: the likely populations "
+                "reach far beyond the limits of selected=; narrow the priors"
+            )
         return replace(first, findings=report(*runs.findings, *first.findings), share=share)
     except DesignError as error:
         if likelihood.has_table:
@@ -289,6 +291,37 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     finally:
         for response in responses:
             response.on_start = None
+
+
+def _share_change(
+    likelihood: SpecimenLikelihood,
+    data: SpecimenData,
+    preparation: Preparation,
+    share: ResponseShare,
+    selection: Selection,
+) -> float:
+    """Return by how much the log share of a selection changes with the last emulator, in nats."""
+    draws = PopulationDraws(SpecimenPopulations(likelihood), preparation.thetas)
+    renewed = renewed_share(data, preparation.emulation, draws.specimens(), share, selection)
+    return float(np.std(draws.log_share(renewed) - draws.log_share(share)))
+
+
+def _refuse_own_responses(
+    likelihood: SpecimenLikelihood, data: SpecimenData, selection: Selection | None
+) -> None:
+    """Raise if specimens have conditions or functions of their own, beside a share."""
+    if not likelihood.inputs.conditions and data.columns is None:
+        return
+    got, advice = (
+        "NaN from the response for a share of the population that is not negligible",
+        "return inf there if these specimens fail, or a number beside all readings",
+    )
+    if selection is not None:
+        got, advice = "selected=", "pass the condition as a constant, or no limits"
+    raise DesignError(
+        f"{likelihood.name}: got {got}, expected a response of all specimens with conditions or "
+        f"functions of their own, on which that share depends; {advice}"
+    )
 
 
 def _refuse_missing_outputs(
@@ -436,7 +469,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *misfit_findings(name, readings, proposals.modes, error, gross_errors=gross_errors),
         *emulator_findings(name, readings, error, data.remedies),
         *coverage_findings(likelihood, data, points, draws.specimens()),
-        *_end_findings(runs, data, emulation, points, draws),
+        *_end_findings(runs, data, emulation, points, proposals, draws),
         *_root_findings(data, proposals),
         *_flat_findings(data, proposals, normal_of(draws.specimens()[:, data.free])),
     )
@@ -454,7 +487,10 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     z = proposals.residuals.coordinates(modes.specimen, modes.a)[:, data.free]
     low, high = np.quantile(data.prior[:, data.free], [0.1, 0.9], axis=0)
     is_central = ((z >= low) & (z <= high)).all(axis=1)
-    counts = np.bincount(modes.specimen, is_central)
+    # Proposals between the modes, which cover the inside of a fold, are no further values.
+    pull = np.einsum("kmd,km->kd", modes.slopes, modes.errors)[:, 0]
+    is_mode = np.abs(pull) < 0.1 * np.sqrt(1 + (modes.slopes[:, :, 0] ** 2).sum(axis=1))
+    counts = np.bincount(modes.specimen, is_central & is_mode)
     share = (counts > 2).mean()
     if share < 0.1:
         return []
@@ -517,6 +553,7 @@ def _end_findings(
     data: SpecimenData,
     emulation: Emulation,
     points: SpecimenPoints,
+    proposals: Proposals,
     draws: Draws,
 ) -> list[Finding]:
     """Report specimens whose inputs are known worse than their distances from an end of the range.
@@ -524,7 +561,8 @@ def _end_findings(
     The end of an input with a logarithmic coordinate is zero. The error of such an input counts by
     the change of the populations' log-densities over posterior draws, from .1 nats on. It is zero
     of a density that is finite at the end. Raise DesignError if the error is nine tenths of the
-    distance. A few runs are computed at inputs that are far below all others.
+    distance. A few runs are computed at inputs that are far below all others. Specimens that look
+    like gross errors do not count.
     """
     likelihood, coordinates = runs.likelihood, runs.likelihood.coordinates
     weights = likely_weights(data, points, normal_of(draws.specimens()[:, data.free]))
@@ -554,6 +592,8 @@ def _end_findings(
     if shares.max() <= 0.03:
         return []
     tilts = shares * log_density_changes(likelihood, draws.thetas, two_sides(z, distance, ended))
+    if data.gross_errors:
+        tilts = np.where(typical_specimens(proposals.modes, len(z)), tilts, 0.0)
     worst = int(tilts.argmax())
     if not np.sqrt((tilts**2).sum()) > 0.1:
         return []

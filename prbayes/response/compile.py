@@ -240,7 +240,9 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
 
 def with_leading_axis(symbols: Sequence[TensorVariable]) -> list[TensorVariable]:
     """Return symbols of the same names with a leading axis for batches."""
-    return [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+    # `pytensor.tensor.tensor` refuses names such as "half" and "double", which are types of NumPy.
+    types = [pt.TensorType(s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+    return [type_(name=s.name) for type_, s in zip(types, symbols, strict=True)]
 
 
 def expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:

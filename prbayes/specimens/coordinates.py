@@ -60,10 +60,14 @@ class Coordinates:
         # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
         from_middle = np.abs(flat - 0.5)
         is_share = (from_middle <= 0.5).all(axis=0) & (high > 0.5)
-        is_log = (flat > 0).all(axis=0) & (high > 10 * low) & ~is_share
+        # Draws of a gamma density that is infinite at zero may underflow.
+        is_positive = (flat >= 0).all(axis=0) & ((flat > 0).mean(axis=0) > 0.99)
+        is_log = is_positive & (high > 10 * low) & ~is_share
         # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
         is_infinite = is_share & ((from_middle > 0.499).mean(axis=0) > 0.01)
-        low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
+        logs = _logs(flat, is_log)
+        logs = logs[np.isfinite(logs).all(axis=1)]
+        low, high = np.quantile(logs, [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
         is_condition = np.zeros(center.size, dtype=bool)

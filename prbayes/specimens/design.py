@@ -610,7 +610,8 @@ def without_spurious_modes(
     improbable, but those of all specimens together may be a population.
     """
     proposals, scale = likely.proposals, likely.scale(data)
-    if proposals.is_open():
+    # With an unknown error the prior's largest would leave all inputs open.
+    if proposals.is_open(likely_scale(data, likely.points, emulation.error)):
         return emulation
     spread = data.readings.spread()
     # As `is_rough`, and far less certain than at most likely inputs

@@ -72,6 +72,33 @@ def test_readings_with_several_roots_in_the_priors_centre_are_reported(
     assert [finding.code for finding in prepared(likelihood).findings] == codes
 
 
+def test_inaccurate_readings_inside_a_fold_have_two_roots() -> None:
+    rng = np.random.default_rng(38)
+    y = rng.normal(0.5, 0.5, 24) ** 2 + rng.normal(0, 0.05, 24)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.HalfNormal("mu", 2), pm.HalfNormal("sigma", 2))
+        metric = prb.LogLikelihood(error=0.05)
+        prb.Simulator("y", np.square, x, observed=y, metric=metric)
+    (likelihood,) = specimen_likelihoods(model).values()
+    assert not prepared(likelihood).findings
+
+
+def test_a_gross_error_near_an_end_is_not_reported() -> None:
+    rng = np.random.default_rng(37)
+    x = rng.normal([2.0, 1.0], [0.3, 0.2], (20, 2))
+    y = np.stack([x.prod(axis=1), x[:, 0] / x[:, 1]], axis=-1)
+    y[[2, 11], 0] = [0.2, 6.0]
+    with pm.Model() as model:
+        mu, sd = pm.Normal("mu", 0.5, 1.0, shape=2), pm.HalfNormal("sd", 0.5, shape=2)
+        a, b = (pm.LogNormal.dist(mu[k], sd[k]) for k in range(2))
+        metric = prb.LogLikelihood(gross_errors=True)
+        prb.Simulator(
+            "y", lambda a, b: np.stack([a * b, a / b], axis=-1), a, b, observed=y, metric=metric
+        )
+    (likelihood,) = specimen_likelihoods(model).values()
+    assert not prepared(likelihood).findings
+
+
 def test_smoothing_widens_populations() -> None:
     model = normal_model()
     populations = populations_of(model)

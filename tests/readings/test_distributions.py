@@ -154,6 +154,23 @@ def test_refused_arguments(make: Any, text: str) -> None:
         make()
 
 
+@pytest.mark.parametrize(
+    "metric",
+    [
+        lambda e: prb.LogLikelihood(error=e),
+        lambda e: prb.LogLikelihood(error=Combined(0.1, e)),
+        lambda e: prb.LogLikelihood(error=1.0, bias=e),
+        lambda e: prb.LogLikelihood(error=NegativeBinomial(e)),
+    ],
+)
+def test_an_unknown_parameter_of_each_reading_is_refused(metric: Any) -> None:
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        unknown = metric(pm.HalfNormal("e", 1.0, shape=3))
+        with pytest.raises(ValueError, match=r"got a variable of shape \(3,\), expected a scalar"):
+            prb.Simulator("y", np.exp, x, observed=[1, 2, 5], metric=unknown)
+
+
 def test_exposures_in_another_order_are_refused() -> None:
     observed = pd.Series([1.0, 2.0, 5.0], index=["a", "b", "c"])
     hours = pd.Series([3.0, 2.0, 1.0], index=["c", "b", "a"])

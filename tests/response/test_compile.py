@@ -51,6 +51,12 @@ def test_a_batch_gives_what_single_calls_do() -> None:
     np.testing.assert_array_equal(sums, vs.sum(axis=1) + xs)
 
 
+@pytest.mark.parametrize("name", ["half", "double", "single"])
+def test_a_variable_has_the_name_of_a_type(name: str) -> None:
+    x = pt.dscalar(name)
+    np.testing.assert_array_equal(compile_batched([x], [2 * x])([1.0, 2.0]), [[2.0, 4.0]])
+
+
 def test_a_mixture_has_no_loop_over_the_rows_of_a_batch() -> None:
     mu, weight = pt.dscalar("mu"), pt.dscalar("weight")
     components = [pm.Normal.dist(mu, 1.0), pm.Normal.dist(mu + 3, 1.0)]

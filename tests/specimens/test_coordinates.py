@@ -89,6 +89,7 @@ def test_the_bounds_are_those_of_data_sets_of_the_prior() -> None:
         (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # ratio of the ends exp(1.03) = 2.8
         (lambda f: pm.LogNormal.dist(0.0, 0.5 * f), True),  # exp(2.6) = 13
         (lambda f: pm.Normal.dist(0.0, 100.0 * f), False),  # has negative values
+        (lambda f: pm.Gamma.dist(0.008 * f, 1.0), True),  # a few draws underflow
     ],
 )
 def test_positive_inputs_over_more_than_a_decade_are_logarithms(dist: Any, is_log: bool) -> None:

@@ -13,7 +13,7 @@ import prbayes as prb
 from benchmarks import selection as study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import selection_of
-from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_likelihood import draw_readings, measurements_of
 from prbayes.response.compile import PLAIN
 from prbayes.specimens.selection import Selection
 
@@ -35,6 +35,27 @@ def test_probabilities_of_being_seen() -> None:
     np.testing.assert_allclose(exact, first * (outputs[:, 1] < 3.0), rtol=1e-9)
     assert limits.is_seen(np.array([[1.5, 2.0], [0.9, 2.0], [1.5, 3.5]])).tolist() == [1, 0, 0]
     assert limits.is_seen(np.array([[np.nan, 2.0]])).all()
+
+
+@pytest.mark.long
+def test_the_probability_of_being_seen_is_that_of_the_last_emulator() -> None:
+    """A response that oscillates, so that populations far wider than the specimens are likely."""
+    rng = np.random.default_rng(45)
+    y = np.cos(rng.normal(0.6, 0.5, 60)) + rng.normal(0, 0.1, 60)
+    y = y[(y > 0.5) & (y < 0.95)]
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.HalfNormal("mu", 1.0), pm.HalfNormal("sigma", 1.0))
+        metric = prb.LogLikelihood(error=0.1, selected=(0.5, 0.95))
+        prb.Simulator("y", np.cos, x, observed=y, metric=metric)
+    evaluator = Evaluator.of(model)
+    mu, sigma = (a.ravel() for a in np.meshgrid([0.3, 1.0, 2.0], [0.5, 1.0, 2.0, 3.0]))
+    x = np.linspace(-25.0, 25.0, 5001)
+    reading = stats.norm(np.cos(x)[:, None], 0.1)
+    masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
+    seen = masses @ (reading.sf(0.5) - reading.sf(0.95))
+    exact = np.log(masses @ reading.pdf(y) / seen).sum(axis=1)
+    found = evaluator(np.column_stack([np.log(mu), np.log(sigma)])).log_other
+    assert np.abs(found - exact).max() < 0.5
 
 
 @pytest.mark.long
@@ -101,7 +122,7 @@ def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
     [
         ({"selected": (None, None)}, "expected \\(lower, upper\\)"),
         ({"selected": 1.0}, "expected \\(lower, upper\\)"),
-        ({"selected": (1.5, None)}, "got the reading 1 of specimen 0"),
+        ({"selected": (1.5, None)}, "^y: metric: selected: got the reading 1 of specimen 0"),
         ({"selected": (None, 2.5)}, "got the reading 3 of specimen 2"),
         ({"selected": ([0.0, 0.0], None)}, "got limits of shape"),
         ({"selected": (0.5, None), "error": [0.1, 0.2, 0.3]}, "the same for all"),
@@ -114,6 +135,18 @@ def simulator(observed: Any = (1.0, 2.0, 3.0), **options: Any) -> None:
 def test_refused_selections(options: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         simulator(**options)
+
+
+def test_an_output_without_a_limit() -> None:
+    """None beside the limit of another output is no limit."""
+    y = np.array([[1.0, 2.0], [2.0, np.nan], [3.0, 4.0]])
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        metric = prb.LogLikelihood(error=0.1, selected=([0.5, None], [None, 5.0]))
+        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y, metric=metric)
+    selection = selection_of(list(measurements_of(model).values()))
+    assert selection is not None
+    np.testing.assert_array_equal([selection.low, selection.high], [[0.5, -np.inf], [np.inf, 5.0]])
 
 
 def test_a_model_without_limits_has_no_selection() -> None:

@@ -50,6 +50,22 @@ def test_readings_with_errors_have_inputs_beside_the_true_ones() -> None:
     np.testing.assert_array_less(np.nan_to_num(abs(found.reshape(shape[:2]) - x)), 0.2)
 
 
+def test_an_unknown_error_leaves_no_inputs_that_only_the_emulator_has() -> None:
+    rng = np.random.default_rng(47)
+    specimens = np.repeat(np.arange(12), rng.integers(1, 6, 12))
+    y = np.exp(rng.normal(1.0, 0.4, 12))[specimens] + rng.normal(0, 0.5, len(specimens))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        metric = prb.LogLikelihood(error=pm.HalfNormal("e", 2))
+        prb.Simulator("y", np.exp, x, observed=y, specimens=specimens, metric=metric)
+    (simulator,) = emulated_simulators(model)
+    found = prepared(simulator.likelihood)
+    is_point = np.isfinite(found.points.log_a)
+    (inputs,) = simulator.likelihood.coordinates.inputs(found.points.z[is_point])
+    away = abs(found.points.outputs[is_point][:, 0] - np.exp(inputs))
+    np.testing.assert_array_less(away[inputs > -5], 0.2)
+
+
 def test_two_inputs_have_one_mode_for_each_specimen() -> None:
     def response(a: Any, b: Any) -> Any:
         return np.stack([np.exp(0.5 * a), np.log1p(np.exp(b)) + 0.5 * a], axis=-1)
