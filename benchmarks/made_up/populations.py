@@ -1,0 +1,790 @@
+"""Made-up problems of populations of many kinds, under the log-likelihood by specimen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+from scipy import optimize, special, stats
+from scipy.stats import qmc
+
+import prbayes as prb
+from benchmarks.made_up import difference, moments, on_grid, problem
+
+
+def by_importance(
+    log_posterior: Callable[[Any], Any], start: Any, n: int = 15
+) -> tuple[Any, Any]:
+    """Return points, (2^n, d), with normalised importance weights of a density of one mode.
+
+    The proposal is a t distribution with 5 degrees of freedom about the mode, at Sobol points.
+    ``log_posterior`` takes (S, d).
+    """
+
+    def loss(theta: Any) -> float:
+        value = -float(log_posterior(theta[None])[0])
+        return value if np.isfinite(value) else 1e10
+
+    options = {"xatol": 1e-6, "fatol": 1e-8, "maxiter": 20000, "maxfev": 20000}
+    mode = np.asarray(start, dtype=float)
+    for _ in range(3):
+        mode = optimize.minimize(loss, mode, method="Nelder-Mead", options=options).x
+    d = len(mode)
+    cube = np.clip(qmc.Sobol(d + 1, seed=1).random_base2(n), 1e-9, 1 - 1e-9)
+    t = special.ndtri(cube[:, :d]) / np.sqrt(stats.chi2(5).ppf(cube[:, d:]) / 5)
+    # The scale starts from differences at the mode, and is adapted twice.
+    step = 1e-3 * np.maximum(1.0, np.abs(mode))
+    scale = [(2 * loss(mode) - loss(mode + e) - loss(mode - e)) for e in np.diag(step)]
+    root = np.diag(step / np.sqrt(np.maximum(-np.asarray(scale), 1e-12)))
+    centre = mode
+    for _ in range(4):
+        points = centre + t @ root.T
+        logs = log_posterior(points) + (5 + d) / 2 * np.log1p((t**2).sum(axis=1) / 5)
+        logs = np.where(np.isfinite(logs), logs, -np.inf)
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        centre_next = weights @ points
+        covariance = np.cov(points.T, aweights=weights).reshape(d, d)
+        if 1 / (weights**2).sum() > 0.3 * len(weights):
+            break
+        centre, root = centre_next, np.linalg.cholesky(covariance + 1e-12 * np.eye(d))
+    assert 1 / (weights**2).sum() > 0.1 * len(weights), "the reference has too few points"
+    return points, weights
+
+
+def normal_nodes(n: int, reach: float = 8.0) -> tuple[Any, Any]:
+    """Return equidistant standard normal scores and their probabilities."""
+    z = np.linspace(-reach, reach, n)
+    weights = stats.norm.pdf(z)
+    return z, weights / weights.sum()
+
+
+# -- correlated inputs -----------------------------------------------------------------------------
+
+
+@problem
+def correlated_inputs_in_odd_units() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(21)
+    x = rng.multivariate_normal([1.0, -0.5], [[0.09, 0.042], [0.042, 0.04]], 12)
+
+    def response(x: Any) -> Any:
+        first, second = np.exp(x[..., 0]), np.exp(x[..., 1] - x[..., 0] / 2)
+        return np.stack([1e6 * first, 1e-9 * second], axis=-1)
+
+    with pm.Model():
+        mean = pm.Normal("mean", [0.0, 0.0], [2.0, 2.0])
+        sds = pm.HalfNormal.dist([1.0, 1.0])
+        chol, _, _ = pm.LKJCholeskyCov("chol", n=2, eta=2, sd_dist=sds)
+        prb.Simulator("y", response, pm.MvNormal.dist(mean, chol=chol), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(theta: Any) -> Any:
+        m, s, rho = theta[:, :2], np.exp(theta[:, 2:4]), np.tanh(theta[:, 4])
+        z = (x[:, None] - m) / s
+        square = (z[..., 0] ** 2 - 2 * rho * z[..., 0] * z[..., 1] + z[..., 1] ** 2) / (1 - rho**2)
+        logs = -0.5 * square.sum(axis=0) - 12 * (theta[:, 2] + theta[:, 3])
+        logs -= 6 * np.log1p(-(rho**2))
+        logs += stats.norm(0, 2).logpdf(m).sum(axis=1)
+        logs += (stats.halfnorm.logpdf(s) + theta[:, 2:4]).sum(axis=1)
+        return logs + 2 * np.log1p(-(rho**2))  # LKJ with eta = 2, and the change to atanh
+
+    points, weights = by_importance(log_posterior, [1.0, -0.5, -1.2, -1.6, 0.7])
+    sd = draws["chol_stds"].values
+    got = {
+        "mean 0": draws["mean"].values[..., 0],
+        "mean 1": draws["mean"].values[..., 1],
+        "log sd 0": np.log(sd[..., 0]),
+        "log sd 1": np.log(sd[..., 1]),
+        "atanh": np.arctanh(draws["chol_corr"].values[..., 0, 1]),
+    }
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def one_output_of_two_inputs_of_known_correlation() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(22)
+    covariance = np.array([[0.25, -0.135], [-0.135, 0.09]])
+    x = rng.multivariate_normal([2.0, 1.0], covariance, 20)
+
+    def response(x: Any) -> Any:
+        return x[..., 0] + x[..., 1] ** 2
+
+    y = response(x)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 5.0), pm.HalfNormal("sigma", 2.0)
+        c = -0.9 * 0.3 * sigma
+        rows = [pm.math.stack([sigma**2, c]), pm.math.stack([c, 0.09])]
+        population = pm.MvNormal.dist(pm.math.stack([mu, 1.0]), pm.math.stack(rows))
+        prb.Simulator("y", response, population, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    z, p = normal_nodes(301)
+    left = y[:, None] - (1.0 + 0.3 * z) ** 2  # of the first input
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(0, 5).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+        for k in range(len(mu)):
+            density = stats.norm.pdf(left, mu[k] - 0.9 * sigma[k] * z, np.sqrt(0.19) * sigma[k])
+            logs[k] += np.log(density @ p).sum()
+        return logs
+
+    axes = {"mu": np.linspace(0.9, 3.1, 45), "sigma": np.linspace(0.1, 2.0, 60)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def three_correlated_inputs_with_missing_readings() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(23)
+    scale = np.array([0.3, 0.5, 2e5])
+    correlation = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+    covariance = scale[:, None] * correlation * scale
+    x = rng.multivariate_normal([1.0, 2.0, 1e6], covariance, 10)
+    x[[0, 3, 5], [1, 2, 0]] = np.nan
+    x[7, :2] = np.nan
+
+    def response(x: Any) -> Any:
+        a, b, c = np.moveaxis(np.asarray(x), -1, 0)
+        return np.stack([1e-9 * np.exp(a), b + b**3 / 10, np.cbrt(c)], axis=-1)
+
+    with pm.Model():
+        mean = pm.Normal("mean", [0.0, 0.0, 0.0], [10.0, 10.0, 3e6])
+        prb.Simulator("y", response, pm.MvNormal.dist(mean, covariance), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior["mean"].values.reshape(-1, 3)
+
+    precision, shift = np.diag(1 / np.array([10.0, 10.0, 3e6]) ** 2), np.zeros(3)
+    for row in x:
+        seen = np.flatnonzero(np.isfinite(row))
+        inverse = np.linalg.inv(covariance[np.ix_(seen, seen)])
+        precision[np.ix_(seen, seen)] += inverse
+        shift[seen] += inverse @ row[seen]
+    exact = np.linalg.inv(precision)
+    sd = np.sqrt(np.diag(exact))
+    yield difference("means", draws.mean(axis=0), exact @ shift, 0.1 * sd)
+    yield difference("sds", draws.std(axis=0), sd, 0.1 * sd)
+    correlations = np.corrcoef(draws.T) - exact / np.outer(sd, sd)
+    yield difference("correlations", correlations, 0.0, 0.1)
+
+
+# -- sinh-arcsinh families -------------------------------------------------------------------------
+
+
+def sinh_arcsinh(x: Any, mu: Any, s: Any, skew: Any, tail: Any) -> Any:
+    """Return the log-density, by the derivative of the score."""
+    u = (x - mu) / (s * tail)
+    score = np.sinh(tail * np.arcsinh(u) - skew)
+    slope = np.sqrt(1 + score**2) / np.sqrt(1 + u**2) / s
+    return stats.norm.logpdf(score) + np.log(slope)
+
+
+@problem
+def four_parameters_of_a_sinh_arcsinh_input() -> Iterator[tuple[str, float]]:
+    x = 3.0 - np.random.default_rng(24).gamma(2.0, 0.5, 40)
+
+    def response(x: Any) -> Any:
+        return np.expm1(0.8 * x)
+
+    with pm.Model():
+        mu, s = pm.Normal("mu", 0.0, 10.0), pm.HalfNormal("s", 3.0)
+        population = prb.families.SinhArcsinh.dist(mu, s, name="x")
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(theta: Any) -> Any:
+        mu, s, skew, tail = theta[:, 0], np.exp(theta[:, 1]), theta[:, 2], np.exp(theta[:, 3])
+        logs = sinh_arcsinh(x[:, None], mu, s, skew, tail).sum(axis=0)
+        logs += stats.norm(0, 10).logpdf(mu) + stats.halfnorm(scale=3).logpdf(s) + theta[:, 1]
+        logs += stats.norm(0, 0.35).logpdf(skew) + stats.norm(0, 0.25).logpdf(theta[:, 3])
+        return logs
+
+    points, weights = by_importance(log_posterior, [2.0, -0.5, 0.0, 0.0])
+    got = {
+        "mu": draws["mu"].values,
+        "log s": np.log(draws["s"].values),
+        "skew": draws["x_skew"].values,
+        "log tail": np.log(draws["x_tail"].values),
+    }
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def tiny_log_sinh_arcsinh_input_of_known_shape() -> Iterator[tuple[str, float]]:
+    z = np.random.default_rng(25).normal(size=15)
+    x = np.exp(-20.0 + 0.4 * 0.7 * np.sinh((np.arcsinh(z) + 0.5) / 0.7))
+
+    def response(x: Any) -> Any:
+        return 1e-3 / x
+
+    with pm.Model():
+        mu, s = pm.Normal("mu", -20.0, 3.0), pm.HalfNormal("s", 2.0)
+        population = prb.families.LogSinhArcsinh.dist(mu, s, name="x", skew=0.5, tail=0.7)
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mu: Any, s: Any) -> Any:
+        logs = sinh_arcsinh(np.log(x)[:, None], mu, s, 0.5, 0.7).sum(axis=0)
+        return logs + stats.norm(-20, 3).logpdf(mu) + stats.halfnorm(scale=2).logpdf(s)
+
+    axes = {"mu": np.linspace(-20.8, -19.2, 401), "s": np.linspace(0.1, 1.2, 401)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def skewness_from_ten_readings_with_an_error() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(26)
+    x = 0.6 * rng.standard_t(4, 10) + 0.5
+
+    def response(x: Any) -> Any:
+        return x + x**3
+
+    y = response(x) + 0.5 * rng.normal(size=10)
+    with pm.Model():
+        mu, s = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("s", 1.0)
+        skew = pm.Normal("skew", 0.0, 0.5)
+        population = prb.families.SinhArcsinh.dist(mu, s, name="x", skew=skew, tail=0.8)
+        metric = prb.LogLikelihood(error=0.5)
+        prb.Simulator("y", response, population, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    # One specimen is at x = -11.7, where its reading determines x to .001.
+    about = x.min() + np.linspace(-0.01, 0.01, 201)
+    nodes = np.sort(np.r_[np.linspace(-14, 6, 1401), about])
+    of_reading = stats.norm.pdf(y[:, None], response(nodes), 0.5) * np.gradient(nodes)
+
+    def log_posterior(mu: Any, s: Any, skew: Any) -> Any:
+        logs = stats.norm(0, 2).logpdf(mu) + stats.halfnorm(scale=1).logpdf(s)
+        logs += stats.norm(0, 0.5).logpdf(skew)
+        for block in np.array_split(np.arange(len(mu)), 60):
+            parts = (v[block, None] for v in (mu, s, skew))
+            density = np.exp(sinh_arcsinh(nodes, *parts, 0.8))
+            logs[block] += np.log(density @ of_reading.T + 1e-300).sum(axis=1)
+        return logs
+
+    axes = {
+        "mu": np.linspace(-0.5, 3.0, 31),
+        "s": np.linspace(0.05, 3.2, 41),
+        "skew": np.linspace(-2.2, 0.8, 25),
+    }
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+# -- mixtures --------------------------------------------------------------------------------------
+
+
+@problem
+def share_of_the_second_kind_of_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(31)
+    x = np.where(rng.random(25) < 0.3, rng.normal(4.0, 0.3, 25), rng.normal(1.0, 0.5, 25))
+
+    def response(x: Any) -> Any:
+        return 1e6 * (x + 0.1 * x**2)
+
+    with pm.Model():
+        w = pm.Beta("w", 1.0, 1.0)
+        mu = pm.Normal("mu", 0.0, 5.0)
+        population = pm.NormalMixture.dist(
+            pm.math.stack([1 - w, w]), mu=pm.math.stack([mu, 4.0]), sigma=[0.5, 0.3]
+        )
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(w: Any, mu: Any) -> Any:
+        population = stats.norm(mu[:, None], 0.5)
+        first = population.pdf(x) + population.pdf(-10.0 - x)  # both roots of a reading
+        density = (1 - w[:, None]) * first + w[:, None] * stats.norm(4.0, 0.3).pdf(x)
+        return np.log(density).sum(axis=1) + stats.norm(0, 5).logpdf(mu)
+
+    axes = {"w": np.linspace(0.0025, 0.9975, 200), "mu": np.linspace(-12.0, 2.0, 1401)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def lognormal_and_weibull_specimens_with_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(32)
+    x = np.where(rng.random(30) < 0.4, rng.lognormal(0.0, 0.3, 30), 4.0 * rng.weibull(6, 30))
+
+    def response(x: Any) -> Any:
+        return x**1.5
+
+    y = response(x) + 0.2 * rng.normal(size=30)
+    with pm.Model():
+        w, mu = pm.Beta("w", 2.0, 2.0), pm.Normal("mu", 0.0, 1.0)
+        parts = [pm.LogNormal.dist(mu, 0.3), pm.Weibull.dist(6.0, 4.0)]
+        population = pm.Mixture.dist(pm.math.stack([w, 1 - w]), parts)
+        metric = prb.LogLikelihood(error=0.2)
+        prb.Simulator("y", response, population, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = (np.arange(4000) + 0.5) * 0.0025
+    of_reading = stats.norm.pdf(y[:, None], response(nodes), 0.2) * 0.0025
+    second = of_reading @ stats.weibull_min(6, scale=4).pdf(nodes)
+
+    def log_posterior(w: Any, mu: Any) -> Any:
+        places, index = np.unique(mu, return_inverse=True)
+        first = of_reading @ stats.lognorm(0.3, scale=np.exp(places)).pdf(nodes[:, None])
+        density = w * first[:, index] + (1 - w) * second[:, None]
+        logs = np.log(density).sum(axis=0) + stats.norm(0, 1).logpdf(mu)
+        return logs + stats.beta(2, 2).logpdf(w)
+
+    axes = {"w": np.linspace(0.005, 0.995, 199), "mu": np.linspace(-0.8, 1.6, 241)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def two_exchangeable_kinds_of_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(33)
+    x = np.where(rng.random(16) < 0.5, rng.normal(-1.5, 0.4, 16), rng.normal(1.0, 0.4, 16))
+
+    def response(x: Any) -> Any:
+        return np.exp(x) - 3.0
+
+    with pm.Model():
+        mu = pm.Normal("mu", [0.0, 0.0], 3.0)
+        population = pm.NormalMixture.dist([0.5, 0.5], mu=mu, sigma=0.4)
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior["mu"].values.reshape(-1, 2)
+
+    def log_posterior(low: Any, high: Any) -> Any:
+        density = stats.norm(low[:, None], 0.4).pdf(x) + stats.norm(high[:, None], 0.4).pdf(x)
+        return np.log(density).sum(axis=1) + stats.norm(0, 3).logpdf([low, high]).sum(axis=0)
+
+    axes = {"low": np.linspace(-2.5, -0.5, 301), "high": np.linspace(0.0, 2.0, 301)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments({"low": draws.min(axis=1), "high": draws.max(axis=1)}, values, weights)
+    yield difference("share of labels", (draws[:, 0] < draws[:, 1]).mean(), 0.5, 0.1)
+
+
+# -- truncated and bounded populations -------------------------------------------------------------
+
+
+@problem
+def normal_population_truncated_near_its_mean() -> Iterator[tuple[str, float]]:
+    x = stats.truncnorm(-0.5, np.inf, loc=0.5, scale=1.0).rvs(30, random_state=34)
+
+    def response(x: Any) -> Any:
+        return np.log1p(x) * 1e-9
+
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 1.0), pm.HalfNormal("sigma", 2.0)
+        population = pm.TruncatedNormal.dist(mu, sigma, lower=0.0)
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(x).sum(axis=1)
+        logs -= 30 * stats.norm.logcdf(mu / sigma)
+        return logs + stats.norm(0, 1).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+
+    axes = {"mu": np.linspace(-4.0, 2.0, 301), "sigma": np.linspace(0.3, 3.5, 321)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def truncated_gamma_of_a_folded_response() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(35)
+    x = rng.gamma(3.0, 1.0, 60)
+    x = x[x < 4.0][:25]
+
+    def response(x: Any) -> Any:
+        return (x - 1.5) ** 2 + 0.2 * x
+
+    y = response(x)
+    with pm.Model():
+        alpha, beta = pm.LogNormal("alpha", 1.0, 0.7), pm.LogNormal("beta", 0.0, 0.7)
+        population = pm.Truncated.dist(pm.Gamma.dist(alpha, beta), upper=4.0)
+        prb.Simulator("y", response, population, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    # Roots of x^2 - 2.8 x + 2.25 - y.
+    half = np.sqrt(1.4**2 - 2.25 + y)
+    roots, slope = np.stack([1.4 - half, 1.4 + half]), 2 * half
+
+    def log_posterior(alpha: Any, beta: Any) -> Any:
+        gamma = stats.gamma(alpha[:, None, None], scale=1 / beta[:, None, None])
+        density = np.where((roots > 0) & (roots < 4.0), gamma.pdf(np.maximum(roots, 1e-9)), 0.0)
+        logs = np.log(density.sum(axis=1) / slope).sum(axis=1)
+        logs -= len(y) * np.log(special.gammainc(alpha, 4.0 * beta))
+        logs += stats.norm(1, 0.7).logpdf(np.log(alpha)) - np.log(alpha)
+        return logs + stats.norm(0, 0.7).logpdf(np.log(beta)) - np.log(beta)
+
+    axes = {"alpha": np.linspace(0.3, 14.0, 180), "beta": np.linspace(0.02, 6.0, 180)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def uniform_population_of_an_unknown_end() -> Iterator[tuple[str, float]]:
+    x = np.random.default_rng(36).uniform(0.0, 3.0, 8)
+
+    def response(x: Any) -> Any:
+        return 1e6 / (1.0 + x)
+
+    with pm.Model():
+        end = pm.HalfNormal("end", 10.0)
+        prb.Simulator("y", response, pm.Uniform.dist(0.0, end), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    ends = np.linspace(x.max(), 40.0, 200001)
+    logs = stats.halfnorm(scale=10).logpdf(ends) - 8 * np.log(ends)
+    weights = np.exp(logs - logs.max())
+    yield from moments(draws, {"end": ends}, weights / weights.sum())
+
+
+@problem
+def beta_population_of_a_share() -> Iterator[tuple[str, float]]:
+    x = np.random.default_rng(37).beta(2.0, 5.0, 20)
+
+    def response(x: Any) -> Any:
+        return x / (1.0 - x)
+
+    with pm.Model():
+        mean, nu = pm.Beta("mean", 1.0, 1.0), pm.LogNormal("nu", 2.0, 1.0)
+        population = pm.Beta.dist(mean * nu, (1 - mean) * nu)
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mean: Any, nu: Any) -> Any:
+        population = stats.beta((mean * nu)[:, None], ((1 - mean) * nu)[:, None])
+        logs = population.logpdf(x).sum(axis=1)
+        return logs + stats.norm(2, 1).logpdf(np.log(nu)) - np.log(nu)
+
+    axes = {"mean": np.linspace(0.1, 0.6, 251), "nu": np.linspace(0.5, 40.0, 300)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+# -- groups ----------------------------------------------------------------------------------------
+
+
+@problem
+def groups_of_very_different_sizes() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(41)
+    names = ["A", "B", "C", "D"]
+    who = np.repeat([0, 1, 2, 3], [1, 2, 15, 6])
+    x = rng.normal(rng.normal(2.0, 0.5, 4)[who], 0.3)
+
+    def response(x: Any) -> Any:
+        return np.sinh(x) * 1e-9
+
+    data = pd.Series(response(x), index=pd.Index(np.array(names)[who], name="maker"))
+    with pm.Model(coords={"maker": names}):
+        m, tau = pm.Normal("m", 0.0, 5.0), pm.HalfNormal("tau", 1.0)
+        mu = pm.Normal("mu", m, tau, dims="maker")
+        another = pm.Normal("another", m, tau)
+        sigma = pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu[prb.response.group("maker")], sigma)
+        prb.Simulator("y", response, population, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    assert another.name in draws
+    n, total = np.bincount(who, minlength=5), np.bincount(who, x, minlength=5)
+    within = sum(((x[who == g] - x[who == g].mean()) ** 2).sum() for g in range(4))
+    middle = total / np.maximum(n, 1)
+
+    def log_posterior(m: Any, tau: Any, sigma: Any) -> Any:
+        logs = stats.norm(0, 5).logpdf(m) + stats.halfnorm.logpdf(tau)
+        logs += stats.halfnorm.logpdf(sigma) - within / (2 * sigma**2) - 20 * np.log(sigma)
+        for g in range(4):
+            logs += stats.norm.logpdf(middle[g], m, np.sqrt(tau**2 + sigma**2 / n[g]))
+        return logs
+
+    axes = {
+        "m": np.linspace(-1.0, 5.0, 121),
+        "tau": np.linspace(0.005, 3.5, 140),
+        "sigma": np.linspace(0.15, 0.7, 80),
+    }
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+    m, tau, sigma = values.values()
+    for g, name in enumerate([*names, another.name]):
+        variance = 1 / (1 / tau**2 + n[g] / sigma**2)
+        centre = variance * (m / tau**2 + total[g] / sigma**2)
+        mean = weights @ centre
+        sd = np.sqrt(weights @ (variance + (centre - mean) ** 2))
+        drawn = (draws[name] if name in draws else draws["mu"].sel(maker=name)).values
+        yield difference(f"mean of {name}", drawn.mean(), mean, 0.1 * sd)
+        yield difference(f"sd of {name}", drawn.std(), sd, 0.1 * sd)
+
+
+@problem
+def weibull_groups_of_five_with_a_common_shape() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(42)
+    scales, who = np.array([1.0, 1.5, 4.0]), np.repeat([0, 1, 2], 5)
+    x = scales[who] * rng.weibull(3.0, 15)
+
+    def response(x: Any) -> Any:
+        return 1e3 * x**2 / (1.0 + x)
+
+    index = pd.Index(np.array(["a", "b", "c"])[who], name="lot")
+    data = pd.DataFrame({"y": response(x)}, index=index)["y"]
+    with pm.Model(coords={"lot": ["a", "b", "c"]}):
+        alpha = pm.LogNormal("alpha", 1.0, 1.0)
+        beta = pm.LogNormal("beta", 0.0, 2.0, dims="lot")
+        population = pm.Weibull.dist(alpha, beta[prb.response.group("lot")])
+        prb.Simulator("y", response, population, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    alphas, logs_beta = np.linspace(0.8, 7.0, 250), np.linspace(-3.0, 4.0, 1401)
+    total = stats.norm(1, 1).logpdf(np.log(alphas)) - np.log(alphas)
+    conditional = []
+    for g in range(3):
+        population = stats.weibull_min(alphas[:, None, None], scale=np.exp(logs_beta)[:, None])
+        logs = population.logpdf(x[who == g]).sum(axis=-1) + stats.norm(0, 2).logpdf(logs_beta)
+        total += special.logsumexp(logs, axis=1)
+        conditional.append(special.softmax(logs, axis=1))
+    weights = special.softmax(total)
+    yield from moments(draws, {"alpha": alphas}, weights)
+    for g in range(3):
+        drawn = {"log beta": np.log(draws["beta"].values[..., g])}
+        yield from moments(drawn, {"log beta": logs_beta}, weights @ conditional[g])
+
+
+@problem
+def groups_with_two_outputs_and_missing_readings() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(43)
+    who = np.repeat([0, 1], [8, 14])
+    x = rng.normal(np.array([0.0, 0.6])[who], 0.3)
+    error = np.array([0.1, 0.4])
+
+    def response(x: Any) -> Any:
+        return np.stack([np.exp(x), (x - 0.3) ** 2 * 4], axis=-1)
+
+    y = response(x) + error * rng.normal(size=(22, 2))
+    y[::3, 0] = np.nan
+    y[1::6, 1] = np.nan
+    index = pd.Index(np.array(["old", "new"])[who], name="rig")
+    data = pd.DataFrame(y, index=index, columns=["force", "heat"])
+    with pm.Model(coords={"rig": ["new", "old"]}):
+        mu = pm.Normal("mu", 0.0, 1.0, dims="rig")
+        sigma = pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu[prb.response.group("rig")], sigma)
+        metric = prb.LogLikelihood(error=error)
+        prb.Simulator("y", response, population, metric=metric, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = np.linspace(-4.0, 5.0, 3001)
+    logs = stats.norm.logpdf(y[:, None], response(nodes), error)
+    of_reading = np.exp(np.where(np.isnan(y)[:, None], 0.0, logs).sum(axis=-1)) * 0.003
+    mus, sigmas = np.linspace(-2.0, 2.5, 181), np.linspace(0.02, 1.2, 119)
+    table = np.zeros((2, 119, 181))
+    for k, sigma in enumerate(sigmas):
+        density = np.log(of_reading @ stats.norm.pdf(nodes[:, None], mus, sigma) + 1e-300)
+        for g in range(2):
+            table[g, k] = density[who == g].sum(axis=0) + stats.norm.logpdf(mus)
+    totals = special.logsumexp(table, axis=2).sum(axis=0) + stats.halfnorm.logpdf(sigmas)
+    weights = special.softmax(totals)
+    yield from moments(draws, {"sigma": sigmas}, weights)
+    for g, name in enumerate(["old", "new"]):
+        drawn = {f"mu {name}": draws["mu"].sel(rig=name).values}
+        conditional = special.softmax(table[g], axis=1)
+        yield from moments(drawn, {f"mu {name}": mus}, weights @ conditional)
+
+
+# -- covariates and conditions ---------------------------------------------------------------------
+
+
+@problem
+def regression_of_an_input_on_a_pressure_in_pascal() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(44)
+    pressure, load = rng.uniform(1e6, 5e6, 15), rng.uniform(1.0, 3.0, 15)
+    x = 0.5 + 2e-7 * pressure + rng.normal(0, 0.2, 15)
+
+    def response(x: Any, load: Any) -> Any:
+        return load * x + 0.3 * x**3
+
+    with pm.Model():
+        a, b = pm.Normal("a", 0.0, 10.0), pm.Normal("b", 0.0, 1e-5)
+        sigma = pm.HalfNormal("sigma", 1.0)
+        p = prb.response.condition("pressure", pressure)
+        population = pm.Normal.dist(a + b * p, sigma)
+        given = prb.response.condition("load", load)
+        prb.Simulator("y", response, population, given, observed=response(x, load))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(theta: Any) -> Any:
+        a, b, sigma = theta[:, 0], theta[:, 1] * 1e-6, np.exp(theta[:, 2])
+        logs = stats.norm.logpdf(x[:, None], a + b * pressure[:, None], sigma).sum(axis=0)
+        logs += stats.norm(0, 10).logpdf(a) + stats.norm(0, 1e-5).logpdf(b)
+        return logs + stats.halfnorm.logpdf(sigma) + theta[:, 2]
+
+    points, weights = by_importance(log_posterior, [0.5, 0.2, -1.5])
+    got = {
+        "a": draws["a"].values,
+        "b": draws["b"].values * 1e6,
+        "log sigma": np.log(draws["sigma"].values),
+    }
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def decay_at_times_of_each_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(45)
+    x = rng.lognormal(-7.0, 0.5, 10)
+    times = np.sort(rng.permuted(np.tile([100.0, 300.0, 700.0, 1500.0, 4000.0], (10, 1)), axis=1)[:, :3])
+    times[2:5, 2] = np.nan
+    times[7, 1:] = np.nan
+
+    def response(rate: Any, time: Any) -> Any:
+        return 5.0 * np.exp(-np.asarray(rate)[..., None] * time)
+
+    readings = response(x, times) + 0.3 * rng.normal(size=(10, 3))
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", -6.0, 3.0), pm.HalfNormal("sigma", 1.0)
+        time = prb.response.condition("time", times)
+        metric = prb.LogLikelihood(error=0.3)
+        rate = pm.LogNormal.dist(mu, sigma)
+        prb.Simulator("y", response, rate, time, metric=metric, observed=readings)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = np.linspace(-16.0, 2.0, 2401)
+    fitted = 5.0 * np.exp(-np.exp(nodes)[:, None] * times[:, None])
+    logs = stats.norm.logpdf(readings[:, None], fitted, 0.3)
+    of_reading = np.exp(np.nansum(logs, axis=-1)) * 0.0075
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(-6, 3).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+        for block in np.array_split(np.arange(len(mu)), 40):
+            density = stats.norm.pdf(nodes[:, None], mu[block], sigma[block])
+            logs[block] += np.log(of_reading @ density).sum(axis=0)
+        return logs
+
+    axes = {"mu": np.linspace(-9.0, -5.0, 101), "sigma": np.linspace(0.02, 2.5, 125)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def gamma_population_whose_mean_has_a_covariate() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(46)
+    age = rng.integers(1, 8, 24).astype(float)
+    means = np.exp(0.2 + 0.15 * age)
+    x = rng.gamma(8.0, means / 8.0)
+
+    def response(x: Any) -> Any:
+        return 1.0 / (0.5 + x)
+
+    with pm.Model():
+        a, b = pm.Normal("a", 0.0, 3.0), pm.Normal("b", 0.0, 1.0)
+        shape = pm.LogNormal("shape", 1.5, 1.0)
+        mean = pm.math.exp(a + b * prb.response.condition("age", age))
+        population = pm.Gamma.dist(shape, shape / mean)
+        prb.Simulator("y", response, population, observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(theta: Any) -> Any:
+        shape = np.exp(theta[:, 2])
+        mean = np.exp(theta[:, 0] + theta[:, 1] * age[:, None])
+        logs = stats.gamma.logpdf(x[:, None], shape, scale=mean / shape).sum(axis=0)
+        logs += stats.norm(0, 3).logpdf(theta[:, 0]) + stats.norm.logpdf(theta[:, 1])
+        return logs + stats.norm(1.5, 1).logpdf(theta[:, 2])
+
+    points, weights = by_importance(log_posterior, [0.2, 0.15, 2.0])
+    got = {"a": draws["a"].values, "b": draws["b"].values, "s": np.log(draws["shape"].values)}
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+# -- functions of each specimen --------------------------------------------------------------------
+
+
+@problem
+def exact_readings_of_functions_of_each_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(47)
+    x, powers = rng.lognormal(0.5, 0.4, 12), np.linspace(-2.0, 3.0, 12)
+
+    def power(p: float) -> Callable[[Any], Any]:
+        return lambda x: 1e-9 * np.asarray(x) ** p
+
+    functions = [power(p) for p in powers]
+    y = np.array([function(v) for function, v in zip(functions, x, strict=True)])
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        population = pm.LogNormal.dist(mu, sigma)
+        prb.Simulator("y", prb.response.by_specimen(functions), population, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(np.log(x)).sum(axis=1)
+        return logs + stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    axes = {"mu": np.linspace(-0.3, 1.3, 301), "sigma": np.linspace(0.1, 1.4, 301)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def records_of_each_specimen_with_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(48)
+    x = 2.0 * rng.weibull(2.5, 9)
+    readings = np.full((9, 3), np.nan)
+    records = [{"at": rng.uniform(0.2, 3.0, rng.integers(1, 4))} for _ in range(9)]
+
+    def response(x: Any, record: Any) -> Any:
+        return np.sin(np.asarray(x)[..., None] * record["at"] / 4) * 10
+
+    for row, v, record in zip(readings, x, records, strict=True):
+        count = len(record["at"])
+        row[:count] = response(v, record) + 1.0 * rng.normal(size=count)
+    with pm.Model():
+        alpha, beta = pm.LogNormal("alpha", 1.0, 0.5), pm.LogNormal("beta", 0.5, 0.5)
+        metric = prb.LogLikelihood(error=1.0)
+        population = pm.Weibull.dist(alpha, beta)
+        own = prb.response.by_specimen(response, records)
+        prb.Simulator("y", own, population, metric=metric, observed=readings)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = (np.arange(4000) + 0.5) * 0.004
+    of_reading = np.empty((9, 4000))
+    for i, (row, record) in enumerate(zip(readings, records, strict=True)):
+        fitted = response(nodes, record)
+        density = stats.norm.logpdf(row[: fitted.shape[1]], fitted, 1.0)
+        of_reading[i] = np.exp(density.sum(axis=1)) * 0.004
+
+    def log_posterior(alpha: Any, beta: Any) -> Any:
+        logs = stats.norm(1, 0.5).logpdf(np.log(alpha)) - np.log(alpha)
+        logs += stats.norm(0.5, 0.5).logpdf(np.log(beta)) - np.log(beta)
+        for block in np.array_split(np.arange(len(alpha)), 40):
+            population = stats.weibull_min(alpha[block], scale=beta[block])
+            logs[block] += np.log(of_reading @ population.pdf(nodes[:, None])).sum(axis=0)
+        return logs
+
+    axes = {"alpha": np.linspace(0.4, 24.0, 119), "beta": np.linspace(0.6, 5.0, 100)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def folded_functions_of_some_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(49)
+    x = rng.normal(0.5, 1.0, 14)
+
+    def folded(x: float) -> float:
+        return x**2
+
+    def straight(x: float) -> float:
+        return 3.0 * x
+
+    functions = [prb.scalar(folded)] * 9 + [prb.scalar(straight)] * 5
+    y = np.r_[x[:9] ** 2, 3.0 * x[9:]]
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 3.0), pm.HalfNormal("sigma", 2.0)
+        population = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", prb.response.by_specimen(functions), population, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        population = stats.norm(mu[:, None], sigma[:, None])
+        logs = np.log(population.pdf(x[:9]) + population.pdf(-x[:9])).sum(axis=1)
+        logs += population.logpdf(x[9:]).sum(axis=1)
+        return logs + stats.norm(0, 3).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+
+    axes = {"mu": np.linspace(-2.5, 2.5, 301), "sigma": np.linspace(0.3, 3.0, 301)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
