@@ -103,6 +103,8 @@ class Coordinates:
             high.append(upper.ravel())
             closed.append(np.full(lower.size, is_closed))
         flat = np.stack([np.concatenate(low), np.concatenate(high)])
+        # A logarithm has no lower end, also where the family as such has negative numbers.
+        flat[0, self.is_log] = np.maximum(flat[0, self.is_log], 0.0)
         support = (_logs(flat, self.is_log) - self.center) / self.half_width
         support[:, self.is_condition] = [[-np.inf], [np.inf]]
         is_end = np.concatenate(closed) | np.isinf(support)
