@@ -788,3 +788,504 @@ def folded_functions_of_some_specimens() -> Iterator[tuple[str, float]]:
     axes = {"mu": np.linspace(-2.5, 2.5, 301), "sigma": np.linspace(0.3, 3.0, 301)}
     values, weights = on_grid(log_posterior, **axes)
     yield from moments(draws, values, weights)
+
+
+# -- random responses ------------------------------------------------------------------------------
+
+# The emulator of a random response has an error of .3 exact standard deviations (its page).
+OF_RANDOM_MEAN, OF_RANDOM_SD = 1.0, 0.35
+
+
+def random_moments(draws: Any, values: Any, weights: Any) -> Iterator[tuple[str, float]]:
+    """Yield differences with those that the page of random responses states."""
+    for name, share in moments(draws, values, weights):
+        yield name, share * (0.1 / (OF_RANDOM_MEAN if "mean of" in name else OF_RANDOM_SD))
+
+
+@problem
+def random_line_with_normal_noise() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(51)
+
+    def response(x: Any, rng: Any) -> Any:
+        return 1e6 * (2.0 * x + 0.8 * rng.normal(size=np.shape(x)))
+
+    y = response(rng.normal(3.0, 0.7, 30), rng)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 2.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        random = prb.response.Stochastic(response, random_seed=1)
+        prb.Simulator("y", random, pm.Normal.dist(mu, sigma), observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        spread = np.sqrt(4 * sigma**2 + 0.64)
+        logs = stats.norm(2 * mu[:, None], spread[:, None]).logpdf(y / 1e6).sum(axis=1)
+        return logs + stats.norm(2, 2).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    axes = {"mu": np.linspace(1.5, 4.5, 201), "sigma": np.linspace(0.003, 1.8, 200)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from random_moments(draws, values, weights)
+
+
+@problem
+def random_lifetimes_of_a_lognormal_stress() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(52)
+
+    def response(stress: Any, rng: Any) -> Any:
+        """Return the logarithm of a Weibull lifetime."""
+        return 12.0 - 3.0 * np.log(stress) + np.log(rng.weibull(2.0, np.shape(stress)))
+
+    y = response(rng.lognormal(1.0, 0.4, 25), rng)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 1.0, 1.0), pm.HalfNormal("sigma", 0.5)
+        random = prb.response.Stochastic(response, random_seed=2)
+        prb.Simulator("y", random, pm.LogNormal.dist(mu, sigma), observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = np.linspace(-4.0, 6.0, 2001)
+    v = y[:, None] - 12.0 + 3.0 * nodes  # logarithm of a Weibull number
+    of_reading = np.exp(np.log(2.0) + 2 * v - np.exp(np.minimum(2 * v, 600))) * 0.005
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(1, 1).logpdf(mu) + stats.halfnorm(scale=0.5).logpdf(sigma)
+        for block in np.array_split(np.arange(len(mu)), 20):
+            density = stats.norm.pdf(nodes[:, None], mu[block], sigma[block])
+            logs[block] += np.log(of_reading @ density + 1e-300).sum(axis=0)
+        return logs
+
+    axes = {"mu": np.linspace(0.3, 1.7, 81), "sigma": np.linspace(0.01, 1.2, 80)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from random_moments(draws, values, weights)
+
+
+@problem
+def random_outputs_with_common_noise_and_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(53)
+    root = np.array([[0.5, 0.0], [0.3, 0.4]])
+
+    def response(x: Any, rng: Any) -> Any:
+        x = np.asarray(x)
+        noise = rng.normal(size=(*x.shape, 2)) @ root.T
+        return np.stack([x, -2.0 * x], axis=-1) + noise
+
+    y = response(rng.normal(1.0, 0.5, 20), rng) + [0.2, 0.3] * rng.normal(size=(20, 2))
+    y[[2, 5, 11], [0, 1, 1]] = np.nan
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        random = prb.response.Stochastic(response, random_seed=3)
+        metric = prb.LogLikelihood(error=[0.2, 0.3])
+        prb.Simulator("y", random, pm.Normal.dist(mu, sigma), metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    slope, own = np.array([1.0, -2.0]), root @ root.T + np.diag([0.04, 0.09])
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+        for row in y:
+            seen = np.isfinite(row)
+            a, r = slope[seen], row[seen] - mu[:, None] * slope[seen]
+            covariance = own[np.ix_(seen, seen)] + sigma[:, None, None] ** 2 * np.outer(a, a)
+            solved = np.linalg.solve(covariance, r[..., None])[..., 0]
+            logs -= 0.5 * ((r * solved).sum(axis=1) + np.linalg.slogdet(covariance)[1])
+        return logs
+
+    axes = {"mu": np.linspace(-0.5, 2.5, 121), "sigma": np.linspace(0.004, 1.6, 120)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from random_moments(draws, values, weights)
+
+
+# -- model discrepancy -----------------------------------------------------------------------------
+
+
+def normal_populations(samples: Any, priors: Any, draws: Any) -> Iterator[tuple[str, float]]:
+    """Yield differences for independent normal populations of known inputs.
+
+    ``samples`` has inputs by the names of mean and standard deviation; ``priors`` the mean and
+    standard deviation of the former's normal prior, and the scale of the latter's half-normal one.
+    """
+    for (mean, sd), x in samples.items():
+        middle, width, scale = priors[mean, sd]
+        center, spread, n = x.mean(), x.std(), len(x)
+        spread = max(spread, 1e-3 * scale)
+
+        def log_posterior(m: Any, s: Any, x: Any = x, prior: Any = priors[mean, sd]) -> Any:
+            logs = stats.norm(m[:, None], s[:, None]).logpdf(x).sum(axis=1)
+            logs += stats.norm(prior[0], prior[1]).logpdf(m)
+            return logs + stats.halfnorm(scale=prior[2]).logpdf(s)
+
+        reach = 12 * spread / np.sqrt(n)
+        of_m = np.linspace(center - reach, center + reach, 401)
+        of_s = np.linspace(spread / 4, spread * 6, 801)
+        values, weights = on_grid(log_posterior, m=of_m, s=of_s)
+        yield from moments(draws, {mean: values["m"], sd: values["s"]}, weights)
+
+
+@problem
+def additive_discrepancy_from_exact_curves() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(54)
+    loads = np.array([1e6, 2e6, 5e6])
+    x, b = rng.lognormal(0.0, 0.3, 12), rng.normal(5.0, 1.0, 12)
+
+    def response(x: Any) -> Any:
+        return 1e-6 * loads * np.asarray(x)[..., None] ** 2
+
+    growing = prb.response.Additive(loads)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 1.0), pm.HalfNormal("sigma", 1.0)
+        size, scatter = pm.Normal("size", 0.0, 10.0), pm.HalfNormal("scatter", 3.0)
+        inputs = pm.LogNormal.dist(mu, sigma), pm.Normal.dist(size, scatter)
+        with_discrepancy = growing.of(response, loads)
+        y = response(x) + b[:, None] * (loads - 1e6) / 4e6
+        y[4, 1], y[7, 2] = np.nan, np.nan
+        prb.Simulator("y", with_discrepancy, *inputs, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    samples = {("mu", "sigma"): np.log(x), ("size", "scatter"): b}
+    priors = {("mu", "sigma"): (0, 1, 1), ("size", "scatter"): (0, 10, 3)}
+    yield from normal_populations(samples, priors, draws)
+
+
+@problem
+def multiplicative_discrepancy_with_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(55)
+    ages = np.array([0.0, 1.0, 3.0])
+    x, b = rng.normal(2.0, 0.3, 15), rng.normal(-0.4, 0.1, 15)
+    curves = x[:, None] * np.exp(b[:, None] * (ages / 3.0) ** 2)
+    y = curves * np.array([1.0, 1.1, 1.2]) + 0.1 * rng.normal(size=(15, 3))
+    y[::4, 1] = np.nan
+
+    def response(x: Any) -> Any:
+        return np.asarray(x)[..., None] * np.array([1.0, 1.1, 1.2])
+
+    ageing = prb.response.Multiplicative(ages, lambda age: (age / 3.0) ** 2)
+    with pm.Model():
+        mu, size = pm.Normal("mu", 0.0, 5.0), pm.Normal("size", 0.0, 1.0)
+        inputs = pm.Normal.dist(mu, 0.3), pm.Normal.dist(size, 0.1)
+        metric = prb.LogLikelihood(error=0.1)
+        prb.Simulator("y", ageing.of(response, ages), *inputs, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    of_x, of_b = np.linspace(0.2, 4.0, 191), np.linspace(-1.2, 0.4, 161)
+    fitted = of_x[:, None, None] * np.exp(of_b[:, None] * (ages / 3) ** 2) * [1.0, 1.1, 1.2]
+    logs = np.nansum(stats.norm.logpdf(y[:, None, None], fitted, 0.1), axis=-1)
+    mus, sizes = np.linspace(1.5, 2.5, 101), np.linspace(-0.7, -0.1, 91)
+    first, second = stats.norm.pdf(of_x, mus[:, None], 0.3), stats.norm.pdf(of_b, sizes[:, None], 0.1)
+    density = np.einsum("mx,ixb,sb->ims", first, np.exp(logs), second, optimize=True)
+    total = np.log(density).sum(axis=0) + stats.norm(0, 5).logpdf(mus)[:, None]
+    weights = special.softmax(total + stats.norm.logpdf(sizes))
+    yield from moments(draws, {"mu": mus}, weights.sum(axis=1))
+    yield from moments(draws, {"size": sizes}, weights.sum(axis=0))
+
+
+@problem
+def smooth_discrepancy_of_each_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(56)
+    loads = np.array([0.5, 1.0, 2.0])
+    stiffening = prb.response.Additive(loads, prb.response.Smooth(zero_at=0.0))
+    (n,) = stiffening.event
+    basis = np.stack([stiffening.value(row, loads) for row in np.eye(n)], axis=-1)  # (3, n)
+    x = rng.normal(5.0, 0.5, 12)
+    y = x[:, None] * loads + 0.8 * rng.normal(size=(12, n)) @ basis.T
+    y = y + 0.1 * rng.normal(size=y.shape)
+
+    def response(x: Any) -> Any:
+        return np.asarray(x)[..., None] * loads
+
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 10.0), pm.HalfNormal("sigma", 1.0)
+        b = pm.MvNormal.dist(np.zeros(n), 0.8**2 * np.eye(n))
+        metric = prb.LogLikelihood(error=0.1)
+        inputs = pm.Normal.dist(mu, sigma), b
+        prb.Simulator("y", stiffening.of(response, loads), *inputs, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    own = 0.64 * basis @ basis.T + 0.01 * np.eye(3)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        covariance = own + sigma[:, None, None] ** 2 * np.outer(loads, loads)
+        r = y[:, None] - mu[:, None] * loads  # (N, S, 3)
+        square = np.einsum("isj,sjk,isk->s", r, np.linalg.inv(covariance), r)
+        logs = -0.5 * square - 6 * np.linalg.slogdet(covariance)[1]
+        return logs + stats.norm(0, 10).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    axes = {"mu": np.linspace(3.5, 6.5, 121), "sigma": np.linspace(0.01, 2.0, 100)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+# -- tables of runs and surrogates -----------------------------------------------------------------
+
+
+def known_normals(x: Any, mean: float, sd: float, scale: float) -> Any:
+    """Return values and weights of a normal population whose inputs are known exactly."""
+    middle, spread = x.mean(), x.std()
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(x).sum(axis=1)
+        return logs + stats.norm(mean, sd).logpdf(mu) + stats.halfnorm(scale=scale).logpdf(sigma)
+
+    reach = 8 * spread / np.sqrt(len(x)) + spread / 2
+    axes = {
+        "mu": np.linspace(middle - reach, middle + reach, 401),
+        "sigma": np.linspace(spread / 4, 5 * spread, 501),
+    }
+    return on_grid(log_posterior, **axes)
+
+
+@problem
+def table_of_one_input_in_nanometres() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(57)
+    runs = rng.uniform(100e-9, 900e-9, 40)
+
+    def response(x: Any) -> Any:
+        return np.log(x / 1e-9) + 1e6 * x
+
+    x = rng.normal(500e-9, 40e-9, 15)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 450e-9, 100e-9), pm.HalfNormal("sigma", 50e-9)
+        table = prb.Runs(pd.DataFrame({"d": runs}), pd.Series(response(runs), name="y"))
+        prb.Simulator("y", table, pm.Normal.dist(mu, sigma), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    values, weights = known_normals(x, 450e-9, 100e-9, 50e-9)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def table_with_empty_cells_and_missing_readings() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(58)
+    design = np.column_stack([rng.uniform(0.0, 6.0, 90), rng.uniform(-2.0, 4.0, 90)])
+
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([np.exp(a / 3) + b, a - b + 0.1 * b**2], axis=-1)
+
+    outputs = pd.DataFrame(response(*design.T), columns=["p", "q"])
+    outputs.iloc[[3, 40]] = np.nan
+    a, b = rng.normal(3.0, 0.4, 14), rng.normal(1.0, 0.3, 14)
+    y = pd.DataFrame(response(a, b) + 0.05 * rng.normal(size=(14, 2)), columns=["p", "q"])
+    y.iloc[[1, 6], [0, 1]] = y.iloc[[1, 6], [0, 1]]
+    y.iloc[2, 0], y.iloc[9, 1] = np.nan, np.nan
+    with pm.Model():
+        m, n = pm.Normal("m", 3.0, 1.0), pm.Normal("n", 1.0, 1.0)
+        inputs = pm.Normal.dist(m, 0.4), pm.Normal.dist(n, 0.3)
+        table = prb.Runs(pd.DataFrame(design, columns=["a", "b"]), outputs)
+        metric = prb.LogLikelihood(error=0.05)
+        prb.Simulator("y", table, *inputs, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    of_a, of_b = np.linspace(0.8, 5.2, 441), np.linspace(-1.0, 3.0, 401)
+    fitted = response(of_a[:, None], of_b)
+    ms, ns = np.linspace(2.4, 3.6, 81), np.linspace(0.5, 1.5, 81)
+    first, second = stats.norm.pdf(of_a, ms[:, None], 0.4), stats.norm.pdf(of_b, ns[:, None], 0.3)
+    total = stats.norm(3, 1).logpdf(ms)[:, None] + stats.norm(1, 1).logpdf(ns)
+    for row in y.values:
+        density = np.exp(np.nansum(stats.norm.logpdf(row, fitted, 0.05), axis=-1))
+        total += np.log(first @ density @ second.T)
+    weights = special.softmax(total)
+    yield from moments(draws, {"m": ms}, weights.sum(axis=1))
+    yield from moments(draws, {"n": ns}, weights.sum(axis=0))
+
+
+@problem
+def surrogate_of_an_oscillating_response() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(59)
+
+    def response(x: Any) -> Any:
+        return x + 0.6 * np.sin(1.5 * x)
+
+    x = rng.normal(1.0, 0.5, 12)
+    surrogate = prb.Surrogate.fit(response, {"x": (-8.0, 10.0)}, 60, progressbar=False)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 1.5), pm.HalfNormal("sigma", 1.0)
+        prb.Simulator("y", surrogate, pm.Normal.dist(mu, sigma), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior
+
+    values, weights = known_normals(x, 0.0, 1.5, 1.0)  # the response is monotone: 1 - .9 > 0
+    yield from moments(draws, values, weights)
+
+
+# -- updates ---------------------------------------------------------------------------------------
+
+
+@problem
+def updates_of_five_one_and_twenty_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(61)
+    x = 2.0 * rng.weibull(3.0, 32)
+
+    def response(x: Any) -> Any:
+        return 1e-9 * x**2
+
+    y = response(x) + 0.3e-9 * rng.normal(size=32)
+    with pm.Model() as model:
+        alpha, beta = pm.LogNormal("alpha", 1.0, 0.7), pm.LogNormal("beta", 0.5, 0.7)
+        metric = prb.LogLikelihood(error=0.3e-9)
+        prb.Simulator("y", response, pm.Weibull.dist(alpha, beta), metric=metric, observed=y[:6])
+        result = prb.sample(random_seed=1)
+        for part in (y[6:11], y[11:12], y[12:]):
+            result = prb.update(result, observed=part, model=model, random_seed=1)
+
+    nodes = (np.arange(3000) + 0.5) * 0.003
+    of_reading = stats.norm.pdf(y[:, None] * 1e9, nodes**2, 0.3) * 0.003
+
+    def log_posterior(alpha: Any, beta: Any) -> Any:
+        logs = stats.norm(1, 0.7).logpdf(np.log(alpha)) - np.log(alpha)
+        logs += stats.norm(0.5, 0.7).logpdf(np.log(beta)) - np.log(beta)
+        for block in np.array_split(np.arange(len(alpha)), 20):
+            population = stats.weibull_min(alpha[block], scale=beta[block])
+            logs[block] += np.log(of_reading @ population.pdf(nodes[:, None])).sum(axis=0)
+        return logs
+
+    axes = {"alpha": np.linspace(1.2, 6.5, 70), "beta": np.linspace(1.3, 2.9, 70)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(result.posterior, values, weights)
+
+
+@problem
+def update_of_two_outputs_with_missing_readings() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(62)
+    x = rng.lognormal(1.0, 0.3, 18)
+
+    def response(x: Any) -> Any:
+        return {"force": 1e6 / x, "heat": 3.0 * x}
+
+    y = pd.DataFrame(response(x))
+    y.iloc[[2, 10, 13], 0] = np.nan
+    y.iloc[[4, 9, 14], 1] = np.nan
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        population = pm.LogNormal.dist(mu, sigma)
+        metric = prb.LogLikelihood(error=0.01, relative=True)
+        prb.Simulator("y", response, population, metric=metric, observed=y.iloc[:8])
+        result = prb.sample(random_seed=1)
+        result = prb.update(result, observed=y.iloc[8:], model=model)
+
+    nodes = np.linspace(-1.5, 3.5, 5001)
+    fitted = np.stack([1e6 / np.exp(nodes), 3 * np.exp(nodes)], axis=-1)
+    logs = stats.norm.logpdf(y.values[:, None], fitted, 0.01 * fitted)
+    of_reading = np.exp(np.nansum(logs, axis=-1)) * 0.001
+    scale = of_reading.max(axis=1, keepdims=True)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+        for block in np.array_split(np.arange(len(mu)), 40):
+            density = stats.norm.pdf(nodes[:, None], mu[block], sigma[block])
+            logs[block] += np.log(of_reading / scale @ density).sum(axis=0)
+        return logs
+
+    axes = {"mu": np.linspace(0.6, 1.5, 81), "sigma": np.linspace(0.12, 0.8, 80)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(result.posterior, values, weights)
+
+
+@problem
+def update_by_specimens_far_from_the_first() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(63)
+    x = np.r_[rng.normal(10.0, 0.5, 8), 16.0, 4.5]
+
+    def response(x: Any) -> Any:
+        return 200.0 / (1.0 + np.exp(-(x - 10.0) / 3.0))
+
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 30.0), pm.HalfNormal("sigma", 5.0)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), observed=response(x[:8]))
+        result = prb.sample(random_seed=1)
+        result = prb.update(result, observed=response(x[8:]), model=model)
+
+    values, weights = known_normals(x, 0.0, 30.0, 5.0)
+    yield from moments(result.posterior, values, weights)
+
+
+# -- fleets ----------------------------------------------------------------------------------------
+
+
+def of_few_normals(x: Any, mean: float, sd: float, scale: float) -> Any:
+    """Return values and weights of a normal population of known inputs, by conditional moments.
+
+    With the spread given the mean is normal, so that a grid of its scores serves few specimens.
+    """
+    s, z = np.linspace(0.002, 5.0, 4000) * scale, np.linspace(-6.0, 6.0, 121)
+    n, center = len(x), x.mean()
+    logs = -((x - center) ** 2).sum() / (2 * s**2) - (n - 1) * np.log(s)
+    logs += stats.norm.logpdf(center, mean, np.hypot(sd, s / np.sqrt(n)))
+    weights = special.softmax(logs + stats.halfnorm(scale=scale).logpdf(s))
+    variance = 1 / (1 / sd**2 + n / s**2)
+    middle = variance * (mean / sd**2 + n * center / s**2)
+    of_z = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
+    mu = middle[:, None] + np.sqrt(variance)[:, None] * z
+    values = {"mu": mu.ravel(), "sigma": np.repeat(s, len(z))}
+    return values, (weights[:, None] * of_z).ravel()
+
+
+@problem
+def fleet_with_vague_priors_of_an_exponential_response() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(64)
+    places = [-2.0, 0.0, 1.0, 3.0, 3.5, 6.0]
+    x = {f"p{i}": rng.normal(m, 0.3 + 0.1 * i, 5 + 3 * i) for i, m in enumerate(places)}
+
+    def response(x: Any) -> Any:
+        return np.exp(x / 2.0)
+
+    data = {name: response(v) for name, v in x.items()}
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 10.0), pm.HalfNormal("sigma", 2.0)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), observed=data["p0"])
+    fleet = prb.calibrate_each(data, model=model, random_seed=1, progressbar=False)
+    for name, v in x.items():
+        found = of_few_normals(v, 0.0, 10.0, 2.0)
+        of_product = fleet["posterior"].dataset.sel(product=name)
+        for label, share in moments(of_product, *found):
+            yield f"{name}: {label}", share
+
+
+@problem
+def fleet_of_a_folded_response_with_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(65)
+    x = {name: rng.normal(m, 0.6, 9) for name, m in [("a", 0.3), ("b", 1.5), ("c", 3.0)]}
+
+    def response(x: Any) -> Any:
+        return (x - 1.0) ** 2
+
+    data = {name: response(v) + 0.2 * rng.normal(size=9) for name, v in x.items()}
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2.0, 3.0), pm.HalfNormal("sigma", 2.0)
+        metric = prb.LogLikelihood(error=0.2)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), metric=metric, observed=data["a"])
+    fleet = prb.calibrate_each(data, model=model, random_seed=1, progressbar=False)
+
+    nodes = np.linspace(-9.0, 11.0, 4001)
+    for name, y in data.items():
+        of_reading = stats.norm.pdf(y[:, None], response(nodes), 0.2) * 0.005
+
+        def log_posterior(mu: Any, sigma: Any, of_reading: Any = of_reading) -> Any:
+            logs = stats.norm(2, 3).logpdf(mu) + stats.halfnorm(scale=2).logpdf(sigma)
+            for block in np.array_split(np.arange(len(mu)), 20):
+                density = stats.norm.pdf(nodes[:, None], mu[block], sigma[block])
+                logs[block] += np.log(of_reading @ density + 1e-300).sum(axis=0)
+            return logs
+
+        axes = {"mu": np.linspace(-3.0, 5.0, 121), "sigma": np.linspace(0.02, 4.5, 112)}
+        values, weights = on_grid(log_posterior, **axes)
+        of_product = fleet["posterior"].dataset.sel(product=name)
+        for label, share in moments(of_product, values, weights):
+            yield f"{name}: {label}", share
+
+
+@problem
+def fleet_of_two_outputs_with_a_single_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(66)
+    sizes = {"two": 2, "three": 3, "ten": 10}
+    x = {k: rng.multivariate_normal([1.0, 2.0], np.diag([0.04, 0.09]), n) for k, n in sizes.items()}
+
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([1e6 * np.exp(a), a * b + b], axis=-1)
+
+    data = {name: response(*v.T) for name, v in x.items()}
+    with pm.Model() as model:
+        inputs = [pm.Normal.dist(pm.Normal(k, 0, 10), pm.HalfNormal(f"s{k}", 1)) for k in "ab"]
+        prb.Simulator("y", response, *inputs, observed=data["ten"])
+    fleet = prb.calibrate_each(data, model=model, random_seed=1, progressbar=False)
+    for name, v in x.items():
+        of_product = fleet["posterior"].dataset.sel(product=name)
+        for k, values in zip("ab", v.T, strict=True):
+            renamed = {"mu": of_product[k].values, "sigma": of_product[f"s{k}"].values}
+            for label, share in moments(renamed, *of_few_normals(values, 0.0, 10.0, 1.0)):
+                yield f"{name} {k}: {label}", share
