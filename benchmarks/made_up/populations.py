@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import arviz as az
 import numpy as np
 import pandas as pd
 import pymc as pm
@@ -15,9 +16,7 @@ import prbayes as prb
 from benchmarks.made_up import difference, moments, on_grid, problem
 
 
-def by_importance(
-    log_posterior: Callable[[Any], Any], start: Any, n: int = 15
-) -> tuple[Any, Any]:
+def by_importance(log_posterior: Callable[[Any], Any], start: Any, n: int = 15) -> tuple[Any, Any]:
     """Return points, (2^n, d), with normalised importance weights of a density of one mode.
 
     The proposal is a t distribution with 5 degrees of freedom about the mode, at Sobol points.
@@ -628,7 +627,9 @@ def regression_of_an_input_on_a_pressure_in_pascal() -> Iterator[tuple[str, floa
 def decay_at_times_of_each_specimen() -> Iterator[tuple[str, float]]:
     rng = np.random.default_rng(45)
     x = rng.lognormal(-7.0, 0.5, 10)
-    times = np.sort(rng.permuted(np.tile([100.0, 300.0, 700.0, 1500.0, 4000.0], (10, 1)), axis=1)[:, :3])
+    times = np.sort(
+        rng.permuted(np.tile([100.0, 300.0, 700.0, 1500.0, 4000.0], (10, 1)), axis=1)[:, :3]
+    )
     times[2:5, 2] = np.nan
     times[7, 1:] = np.nan
 
@@ -903,9 +904,7 @@ def normal_populations(samples: Any, priors: Any, draws: Any) -> Iterator[tuple[
     standard deviation of the former's normal prior, and the scale of the latter's half-normal one.
     """
     for (mean, sd), x in samples.items():
-        middle, width, scale = priors[mean, sd]
         center, spread, n = x.mean(), x.std(), len(x)
-        spread = max(spread, 1e-3 * scale)
 
         def log_posterior(m: Any, s: Any, x: Any = x, prior: Any = priors[mean, sd]) -> Any:
             logs = stats.norm(m[:, None], s[:, None]).logpdf(x).sum(axis=1)
@@ -968,7 +967,10 @@ def multiplicative_discrepancy_with_errors() -> Iterator[tuple[str, float]]:
     fitted = of_x[:, None, None] * np.exp(of_b[:, None] * (ages / 3) ** 2) * [1.0, 1.1, 1.2]
     logs = np.nansum(stats.norm.logpdf(y[:, None, None], fitted, 0.1), axis=-1)
     mus, sizes = np.linspace(1.5, 2.5, 101), np.linspace(-0.7, -0.1, 91)
-    first, second = stats.norm.pdf(of_x, mus[:, None], 0.3), stats.norm.pdf(of_b, sizes[:, None], 0.1)
+    first, second = (
+        stats.norm.pdf(of_x, mus[:, None], 0.3),
+        stats.norm.pdf(of_b, sizes[:, None], 0.1),
+    )
     density = np.einsum("mx,ixb,sb->ims", first, np.exp(logs), second, optimize=True)
     total = np.log(density).sum(axis=0) + stats.norm(0, 5).logpdf(mus)[:, None]
     weights = special.softmax(total + stats.norm.logpdf(sizes))
@@ -1289,3 +1291,334 @@ def fleet_of_two_outputs_with_a_single_specimen() -> Iterator[tuple[str, float]]
             renamed = {"mu": of_product[k].values, "sigma": of_product[f"s{k}"].values}
             for label, share in moments(renamed, *of_few_normals(values, 0.0, 10.0, 1.0)):
                 yield f"{name} {k}: {label}", share
+
+
+# -- two simulators in one model -------------------------------------------------------------------
+
+
+@problem
+def two_tests_of_partly_the_same_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(71)
+    x = rng.normal(3.0, 0.5, 14)
+    first, second = rng.permutation(14)[:9], rng.permutation(14)[:10]
+    y = 1e6 * x[first] + 2e5 * rng.normal(size=9)
+    z = 1e-3 * x[second] + 4e-4 * rng.normal(size=10)
+    labels = np.array([f"s{i}" for i in range(14)])
+
+    def heavy(x: Any) -> Any:
+        return 1e6 * x
+
+    def light(x: Any) -> Any:
+        return 1e-3 * x
+
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 10.0), pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu, sigma)
+        of_y, of_z = prb.LogLikelihood(error=2e5), prb.LogLikelihood(error=4e-4)
+        prb.Simulator("y", heavy, population, metric=of_y, observed=y, specimens=labels[first])
+        prb.Simulator("z", light, population, metric=of_z, observed=z, specimens=labels[second])
+        draws = prb.sample(random_seed=1).posterior
+
+    precision, weighted, square = np.zeros(14), np.zeros(14), np.zeros(14)
+    for rows, readings, error in ((first, y / 1e6, 0.2), (second, z / 1e-3, 0.4)):
+        precision[rows] += error**-2
+        weighted[rows] += readings / error**2
+        square[rows] += readings**2 / error**2
+    seen = precision > 0
+    middle, variance = weighted[seen] / precision[seen], 1 / precision[seen]
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        spread = np.sqrt(variance + sigma[:, None] ** 2)
+        logs = stats.norm(mu[:, None], spread).logpdf(middle).sum(axis=1)
+        return logs + stats.norm(0, 10).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    axes = {"mu": np.linspace(2.0, 4.0, 201), "sigma": np.linspace(0.003, 1.8, 200)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def two_kinds_of_specimens_with_a_common_parameter() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(72)
+    x, z = rng.lognormal(0.5, 0.4, 7), rng.gamma(4.0, np.exp(0.5) / 4.0, 25)
+
+    def first(x: Any) -> Any:
+        return 1e9 * np.sqrt(x)
+
+    def second(x: Any) -> Any:
+        return x**2 - 0.3 * x**1.5
+
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 3.0), pm.HalfNormal("sigma", 1.0)
+        shape = pm.LogNormal("shape", 1.0, 1.0)
+        gamma = pm.Gamma.dist(shape, shape * pm.math.exp(-mu))
+        prb.Simulator("a", first, pm.LogNormal.dist(mu, sigma), observed=first(x))
+        prb.Simulator("b", second, gamma, observed=second(z))
+        draws = prb.sample(random_seed=1).posterior
+
+    # z^2 - .3 z^1.5 has its minimum, -.00027, at .0506, so that readings of 0 and more have one
+    # root.
+    assert (second(z) > 0).all()
+
+    def log_posterior(theta: Any) -> Any:
+        mu, sigma, shape = theta[:, 0], np.exp(theta[:, 1]), np.exp(theta[:, 2])
+        logs = stats.norm.logpdf(np.log(x)[:, None], mu, sigma).sum(axis=0)
+        logs += stats.gamma.logpdf(z[:, None], shape, scale=np.exp(mu) / shape).sum(axis=0)
+        logs += stats.norm(0, 3).logpdf(mu) + stats.halfnorm.logpdf(sigma) + theta[:, 1]
+        return logs + stats.norm(1, 1).logpdf(theta[:, 2])
+
+    points, weights = by_importance(log_posterior, [0.5, -0.8, 1.0])
+    names = {"mu": "mu", "sigma": "log sigma", "shape": "log shape"}
+    got = {v: draws[k].values if k == "mu" else np.log(draws[k].values) for k, v in names.items()}
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def curve_and_folded_response_of_the_same_specimens() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(73)
+    a, b = rng.normal(1.0, 0.4, 16), rng.normal(-0.5, 0.3, 16)
+    labels = [f"no. {i}" for i in range(16)]
+
+    def folded(a: Any, b: Any) -> Any:
+        return a**2 + 0.0 * b
+
+    def curve(a: Any, b: Any) -> Any:
+        return np.stack([a + b, np.exp(a - b)], axis=-1)
+
+    y = folded(a, b) + 0.1 * rng.normal(size=16)
+    z = pd.DataFrame(curve(a, b), columns=["u", "v"]) + 0.3 * rng.normal(size=(16, 2))
+    z.iloc[[1, 5], 0] = np.nan
+    z.iloc[[5, 7], 1] = np.nan
+    z = z.drop(index=5)
+    with pm.Model():
+        m, n = pm.Normal("m", 0.0, 2.0), pm.Normal("n", 0.0, 2.0)
+        inputs = pm.Normal.dist(m, 0.4), pm.Normal.dist(n, 0.3)
+        of_y, of_z = prb.LogLikelihood(error=0.1), prb.LogLikelihood(error=0.3)
+        prb.Simulator("y", folded, *inputs, metric=of_y, observed=y, specimens=labels)
+        others = [label for label in labels if label != "no. 5"]
+        prb.Simulator("z", curve, *inputs, metric=of_z, observed=z.values, specimens=others)
+        draws = prb.sample(random_seed=1).posterior
+
+    of_a, of_b = np.linspace(-4.0, 4.0, 401), np.linspace(-3.0, 2.5, 221)
+    mesh = np.meshgrid(of_a, of_b, indexing="ij")
+    ms, ns = np.linspace(-2.0, 2.0, 161), np.linspace(-1.3, 0.5, 91)
+    first, second = stats.norm.pdf(of_a, ms[:, None], 0.4), stats.norm.pdf(of_b, ns[:, None], 0.3)
+    total = stats.norm(0, 2).logpdf(ms)[:, None] + stats.norm(0, 2).logpdf(ns)
+    for i in range(16):
+        logs = stats.norm.logpdf(y[i], folded(*mesh), 0.1)
+        if i in z.index:
+            of_curve = stats.norm.logpdf(z.loc[i].values, curve(*mesh), 0.3)
+            logs = logs + np.nansum(of_curve, axis=-1)
+        total += np.log(first @ np.exp(logs) @ second.T + 1e-300)
+    weights = special.softmax(total)
+    yield from moments(draws, {"m": ms}, weights.sum(axis=1))
+    yield from moments(draws, {"n": ns}, weights.sum(axis=0))
+
+
+# -- inputs of each specimen -----------------------------------------------------------------------
+
+
+def specimens_by_quadrature(of_reading: Any, density: Any, nodes: Any, weights: Any) -> Any:
+    """Return mean and standard deviation of each specimen's input over a posterior of populations.
+
+    ``of_reading`` is (N, n), the density of the populations (S, n), their weights (S,).
+    """
+    joint = of_reading[:, None] * density  # (N, S, n)
+    joint /= joint.sum(axis=-1, keepdims=True)
+    of_nodes = np.einsum("s,isn->in", weights, joint)
+    mean = of_nodes @ nodes
+    return mean, np.sqrt(of_nodes @ nodes**2 - mean**2)
+
+
+@problem
+def individuals_with_errors_of_their_own() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(74)
+    x, errors = rng.normal(5.0, 0.5, 8), np.geomspace(0.02, 3.0, 8)
+
+    def response(x: Any) -> Any:
+        return x + 0.02 * x**3
+
+    y = response(x) + errors * rng.normal(size=8)
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 10.0), pm.HalfNormal("sigma", 1.0)
+        metric = prb.LogLikelihood(error=errors)
+        population = pm.Normal.dist(mu, sigma, name="x")
+        prb.Simulator("y", response, population, metric=metric, observed=y)
+        result = prb.sample(random_seed=1)
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]["x"]
+
+    nodes = np.linspace(-4.0, 12.0, 3201)
+    of_reading = stats.norm.pdf(y[:, None], response(nodes), errors[:, None]) * 0.005
+    axes = {"mu": np.linspace(2.8, 7.0, 64), "sigma": np.linspace(0.03, 2.8, 60)}
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        density = stats.norm.pdf(nodes[:, None], mu, sigma)
+        logs = np.log(of_reading @ density + 1e-300).sum(axis=0)
+        return logs + stats.norm(0, 10).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(result.posterior, values, weights)
+    kept = weights > 1e-6 * weights.max()
+    density = stats.norm.pdf(nodes, values["mu"][kept, None], values["sigma"][kept, None])
+    share = weights[kept] / weights[kept].sum()
+    for i in range(8):
+        mean, sd = specimens_by_quadrature(of_reading[i : i + 1], density, nodes, share)
+        yield difference(f"mean of specimen {i}", drawn[..., i].mean(), mean, 0.1 * sd)
+        yield difference(f"sd of specimen {i}", drawn[..., i].std(), sd, 0.1 * sd)
+
+
+@problem
+def individuals_of_a_folded_response() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(75)
+    x = rng.normal(0.4, 0.8, 12)
+
+    def response(x: Any) -> Any:
+        return 1e-9 * (x**2 + 0.2 * x)
+
+    y = response(x)
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 1.0, 1.0), pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu, sigma, name="x")
+        prb.Simulator("y", response, population, observed=y)
+        result = prb.sample(random_seed=1)
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]["x"]
+
+    other = -0.2 - x
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        population = stats.norm(mu[:, None], sigma[:, None])
+        logs = np.logaddexp(population.logpdf(x), population.logpdf(other)).sum(axis=1)
+        return logs + stats.norm(1, 1).logpdf(mu) + stats.halfnorm.logpdf(sigma)
+
+    axes = {"mu": np.linspace(-2.5, 2.5, 301), "sigma": np.linspace(0.03, 2.5, 200)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(result.posterior, values, weights)
+    population = stats.norm(values["mu"][:, None], values["sigma"][:, None])
+    share = weights @ special.expit(population.logpdf(x) - population.logpdf(other))
+    is_first = np.abs(drawn.values - x) < np.abs(drawn.values - other)
+    yield difference("shares of roots", is_first.mean(axis=(0, 1)), share, 0.05)
+
+
+@problem
+def individuals_of_two_inputs_and_one_reading() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(76)
+    a, b = rng.normal(2.0, 0.4, 10), rng.lognormal(0.0, 0.2, 10)
+
+    def response(a: Any, b: Any) -> Any:
+        return a * b
+
+    y = response(a, b)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 5.0)
+        inputs = pm.Normal.dist(mu, 0.4, name="a"), pm.LogNormal.dist(0.0, 0.2, name="b")
+        prb.Simulator("y", response, *inputs, observed=y)
+        result = prb.sample(random_seed=1)
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]
+
+    logs_b = np.linspace(-1.6, 1.6, 1601)
+    of_a = y[:, None] / np.exp(logs_b)
+    mus = np.linspace(0.9, 3.1, 221)
+    # p(y) is the integral of p(a = y / b) p(b) / b.
+    joint = stats.norm.pdf(of_a, mus[:, None, None], 0.4)  # (S, N, n)
+    joint = joint * stats.norm.pdf(logs_b, 0.0, 0.2) * np.exp(-logs_b)
+    total = np.log(joint.sum(axis=-1)).sum(axis=1) + stats.norm(0, 5).logpdf(mus)
+    weights = special.softmax(total)
+    yield from moments(result.posterior, {"mu": mus}, weights)
+    of_nodes = np.einsum("s,sin->in", weights, joint / joint.sum(axis=-1, keepdims=True))
+    for name, nodes in (("a", of_a), ("b", np.broadcast_to(np.exp(logs_b), of_a.shape))):
+        mean = (of_nodes * nodes).sum(axis=1)
+        sd = np.sqrt((of_nodes * nodes**2).sum(axis=1) - mean**2)
+        got = drawn[name].values.reshape(-1, 10)
+        yield difference(f"means of {name}", got.mean(axis=0), mean, 0.1 * sd)
+        yield difference(f"sds of {name}", got.std(axis=0), sd, 0.1 * sd)
+
+
+# -- leave-one-out and diagnosis -------------------------------------------------------------------
+
+
+def left_out(of_specimens: Any, log_prior: Any) -> Any:
+    """Return exact log p(y_i | others), (N,), from log-likelihoods on a grid, (N, S)."""
+    total = of_specimens.sum(axis=0) + log_prior
+    without = total - of_specimens
+    return special.logsumexp(total) - special.logsumexp(without, axis=1)
+
+
+@problem
+def leave_one_out_of_eight_exact_readings() -> Iterator[tuple[str, float]]:
+    x = np.random.default_rng(77).weibull(2.0, 8) * 3.0
+
+    def response(x: Any) -> Any:
+        return 1e6 * x**3
+
+    with pm.Model() as model:
+        alpha, beta = pm.LogNormal("alpha", 0.5, 0.7), pm.LogNormal("beta", 1.0, 0.7)
+        prb.Simulator("y", response, pm.Weibull.dist(alpha, beta), observed=response(x))
+        result = prb.sample(random_seed=1)
+        prb.diagnose(result, model=model)
+    loo = az.loo(result, pointwise=True)
+
+    alphas, betas = np.meshgrid(np.linspace(0.3, 8.0, 401), np.linspace(0.8, 8.0, 401))
+    logs = stats.weibull_min(alphas, scale=betas).logpdf(x[:, None, None])
+    logs = logs - np.log(3e6 * x**2)[:, None, None]
+    prior = stats.norm(0.5, 0.7).logpdf(np.log(alphas)) - np.log(alphas)
+    prior += stats.norm(1.0, 0.7).logpdf(np.log(betas)) - np.log(betas)
+    exact = left_out(logs.reshape(8, -1), prior.ravel())
+    yield difference("elpd of specimens", loo.elpd_i, exact, 0.1)
+    yield difference("elpd", loo.elpd, exact.sum(), 0.2)
+
+
+@problem
+def leave_one_out_of_repeated_readings() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(78)
+    x, who = rng.normal(1.0, 0.3, 12), np.repeat(np.arange(12), 3)
+
+    def response(x: Any) -> Any:
+        return np.exp(x)
+
+    y = response(x)[who] + 0.4 * rng.normal(size=36)
+    order = rng.permutation(36)
+    y, who = y[order], who[order]
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 2.0), pm.HalfNormal("sigma", 1.0)
+        metric = prb.LogLikelihood(error=0.4)
+        population = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", response, population, metric=metric, observed=y, specimens=who)
+        result = prb.sample(random_seed=1)
+        prb.diagnose(result, model=model)
+    loo = az.loo(result, pointwise=True)
+
+    nodes = np.linspace(-3.0, 4.0, 1401)
+    by_reading = stats.norm.logpdf(y[:, None], response(nodes), 0.4)
+    of_reading = np.stack([np.exp(by_reading[who == i].sum(axis=0)) for i in range(12)]) * 0.005
+    mus, sigmas = np.meshgrid(np.linspace(0.3, 1.6, 101), np.linspace(0.01, 1.3, 100))
+    density = stats.norm.pdf(nodes[:, None], mus.ravel(), sigmas.ravel())
+    prior = stats.norm(0, 2).logpdf(mus.ravel()) + stats.halfnorm.logpdf(sigmas.ravel())
+    exact = left_out(np.log(of_reading @ density), prior)[pd.unique(who)]
+    reliable = np.asarray(loo.pareto_k) < 0.7  # the others are reported as unreliable
+    yield difference("unreliable specimens", (~reliable).sum(), 0, 2)
+    yield difference("elpd", np.asarray(loo.elpd_i)[reliable], exact[reliable], 0.1)
+
+
+@problem
+def leave_one_out_where_one_specimen_is_an_outlier() -> Iterator[tuple[str, float]]:
+    x = np.r_[np.random.default_rng(79).normal(2.0, 0.2, 14), 3.6]
+
+    def response(x: Any) -> Any:
+        return x + 0.5 * np.tanh(x - 2.0)
+
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 5.0), pm.HalfNormal("sigma", 1.0)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), observed=response(x))
+        result = prb.sample(random_seed=1)
+        diagnosis = prb.diagnose(result, model=model)
+    loo = az.loo(result, pointwise=True)
+
+    mus, sigmas = np.meshgrid(np.linspace(1.2, 3.0, 401), np.linspace(0.08, 1.6, 400))
+    logs = stats.norm.logpdf(x[:, None], mus.ravel(), sigmas.ravel())
+    logs = logs - np.log(1 + 0.5 / np.cosh(x - 2.0) ** 2)[:, None]
+    prior = stats.norm(0, 5).logpdf(mus.ravel()) + stats.halfnorm.logpdf(sigmas.ravel())
+    exact = left_out(logs, prior)
+    yield difference("elpd of others", np.asarray(loo.elpd_i)[:-1], exact[:-1], 0.1)
+    codes = {finding.code for finding in (*diagnosis.findings, *diagnosis.remarks)}
+    is_named = bool({"influential-specimens", "population-misfit", "outlying-data"} & codes)
+    yield difference("outlier is named", is_named, True, 0.5)
