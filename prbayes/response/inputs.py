@@ -546,7 +546,7 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
 
 def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups."""
-    labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
+    labels, values = labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]
     place = {text: i for i, text in enumerate(groups.names)}
     unknown = [text for text in dict.fromkeys(texts) if text not in place]
@@ -560,7 +560,7 @@ def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, An
     return np.array([place[text] for text in texts], dtype=np.intp), values
 
 
-def _labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
+def labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
     """Return the group label of each specimen, and the observed values without these labels."""
     if hasattr(observed, "dims") and hasattr(observed, "coords") and dim in observed.coords:
         coordinate = observed.coords[dim]
