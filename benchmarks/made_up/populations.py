@@ -171,7 +171,7 @@ def three_correlated_inputs_with_missing_readings() -> Iterator[tuple[str, float
 # -- sinh-arcsinh families -------------------------------------------------------------------------
 
 
-def sinh_arcsinh(x: Any, mu: Any, s: Any, skew: Any, tail: Any) -> Any:
+def sinh_arcsinh(x: Any, mu: Any, s: Any, skew: Any, *, tail: Any) -> Any:
     """Return the log-density, by the derivative of the score."""
     u = (x - mu) / (s * tail)
     score = np.sinh(tail * np.arcsinh(u) - skew)
@@ -194,7 +194,7 @@ def four_parameters_of_a_sinh_arcsinh_input() -> Iterator[tuple[str, float]]:
 
     def log_posterior(theta: Any) -> Any:
         mu, s, skew, tail = theta[:, 0], np.exp(theta[:, 1]), theta[:, 2], np.exp(theta[:, 3])
-        logs = sinh_arcsinh(x[:, None], mu, s, skew, tail).sum(axis=0)
+        logs = sinh_arcsinh(x[:, None], mu, s, skew, tail=tail).sum(axis=0)
         logs += stats.norm(0, 10).logpdf(mu) + stats.halfnorm(scale=3).logpdf(s) + theta[:, 1]
         logs += stats.norm(0, 0.35).logpdf(skew) + stats.norm(0, 0.25).logpdf(theta[:, 3])
         return logs
@@ -224,7 +224,7 @@ def tiny_log_sinh_arcsinh_input_of_known_shape() -> Iterator[tuple[str, float]]:
         draws = prb.sample(random_seed=1).posterior
 
     def log_posterior(mu: Any, s: Any) -> Any:
-        logs = sinh_arcsinh(np.log(x)[:, None], mu, s, 0.5, 0.7).sum(axis=0)
+        logs = sinh_arcsinh(np.log(x)[:, None], mu, s, 0.5, tail=0.7).sum(axis=0)
         return logs + stats.norm(-20, 3).logpdf(mu) + stats.halfnorm(scale=2).logpdf(s)
 
     axes = {"mu": np.linspace(-20.8, -19.2, 401), "s": np.linspace(0.1, 1.2, 401)}
@@ -259,7 +259,7 @@ def skewness_from_ten_readings_with_an_error() -> Iterator[tuple[str, float]]:
         logs += stats.norm(0, 0.5).logpdf(skew)
         for block in np.array_split(np.arange(len(mu)), 60):
             parts = (v[block, None] for v in (mu, s, skew))
-            density = np.exp(sinh_arcsinh(nodes, *parts, 0.8))
+            density = np.exp(sinh_arcsinh(nodes, *parts, tail=0.8))
             logs[block] += np.log(density @ of_reading.T + 1e-300).sum(axis=1)
         return logs
 
@@ -1445,7 +1445,7 @@ def individuals_with_errors_of_their_own() -> Iterator[tuple[str, float]]:
         population = pm.Normal.dist(mu, sigma, name="x")
         prb.Simulator("y", response, population, metric=metric, observed=y)
         result = prb.sample(random_seed=1)
-        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]["x"]
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"].dataset["x"]
 
     nodes = np.linspace(-4.0, 12.0, 3201)
     of_reading = stats.norm.pdf(y[:, None], response(nodes), errors[:, None]) * 0.005
@@ -1481,7 +1481,7 @@ def individuals_of_a_folded_response() -> Iterator[tuple[str, float]]:
         population = pm.Normal.dist(mu, sigma, name="x")
         prb.Simulator("y", response, population, observed=y)
         result = prb.sample(random_seed=1)
-        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]["x"]
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"].dataset["x"]
 
     other = -0.2 - x
 
@@ -1513,7 +1513,7 @@ def individuals_of_two_inputs_and_one_reading() -> Iterator[tuple[str, float]]:
         inputs = pm.Normal.dist(mu, 0.4, name="a"), pm.LogNormal.dist(0.0, 0.2, name="b")
         prb.Simulator("y", response, *inputs, observed=y)
         result = prb.sample(random_seed=1)
-        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"]
+        drawn = prb.individuals(result, model=model, n_draws=4000)["posterior"].dataset
 
     logs_b = np.linspace(-1.6, 1.6, 1601)
     of_a = y[:, None] / np.exp(logs_b)
@@ -1622,3 +1622,304 @@ def leave_one_out_where_one_specimen_is_an_outlier() -> Iterator[tuple[str, floa
     codes = {finding.code for finding in (*diagnosis.findings, *diagnosis.remarks)}
     is_named = bool({"influential-specimens", "population-misfit", "outlying-data"} & codes)
     yield difference("outlier is named", is_named, True, 0.5)
+
+
+# -- combinations ----------------------------------------------------------------------------------
+
+
+@problem
+def correlated_inputs_of_five_specimens_from_one_output() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(81)
+    x = rng.multivariate_normal([0.5, -1.0], [[0.04, -0.03], [-0.03, 0.09]], 5)
+
+    def response(x: Any) -> Any:
+        return 1e-6 * (np.exp(x[..., 0]) - 2.0 * x[..., 1])
+
+    y = response(x)
+    with pm.Model():
+        mean = pm.Normal("mean", [0.5, -1.0], [0.5, 1.0])
+        rho = pm.Uniform("rho", -0.99, 0.99)
+        c = 0.06 * rho
+        rows = [pm.math.stack([0.04, c]), pm.math.stack([c, 0.09])]
+        population = pm.MvNormal.dist(mean, pm.math.stack(rows))
+        prb.Simulator("y", response, population, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    z, p = normal_nodes(161)
+
+    def log_posterior(a: Any, b: Any, rho: Any) -> Any:
+        logs = stats.norm(0.5, 0.5).logpdf(a) + stats.norm(-1, 1).logpdf(b)
+        for block in np.array_split(np.arange(len(a)), 200):
+            m, n, r = (v[block, None, None] for v in (a, b, rho))
+            first = m + 0.2 * z
+            second = (np.exp(first) - y[:, None] * 1e6) / 2.0
+            sd = 0.3 * np.sqrt(1 - r**2)
+            density = stats.norm.pdf(second, n + 0.3 * r * z, sd) / 2.0
+            logs[block] += np.log(density @ p).sum(axis=1)
+        return logs
+
+    axes = {
+        "a": np.linspace(-1.2, 2.2, 41),
+        "b": np.linspace(-3.2, 1.6, 41),
+        "rho": np.linspace(-0.98, 0.98, 21),
+    }
+    values, weights = on_grid(log_posterior, **axes)
+    got = {
+        "a": draws["mean"].values[..., 0],
+        "b": draws["mean"].values[..., 1],
+        "rho": draws["rho"],
+    }
+    yield from moments(got, values, weights)
+
+
+@problem
+def uniform_population_of_two_unknown_ends_with_errors() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(82)
+    x = rng.uniform(1.0, 3.0, 12)
+
+    def response(x: Any) -> Any:
+        return x**2
+
+    y = response(x) + 0.2 * rng.normal(size=12)
+    with pm.Model():
+        low, width = pm.Normal("low", 1.0, 2.0), pm.HalfNormal("width", 4.0)
+        population = pm.Uniform.dist(low, low + width)
+        metric = prb.LogLikelihood(error=0.2)
+        prb.Simulator("y", response, population, metric=metric, observed=y)
+        draws = prb.sample(random_seed=1).posterior
+
+    nodes = np.linspace(-14.0, 22.0, 36001)
+    of_reading = stats.norm.pdf(y[:, None], response(nodes), 0.2) * 0.001
+    cumulative = np.cumsum(of_reading, axis=1)
+
+    def log_posterior(low: Any, width: Any) -> Any:
+        at = [cumulative[:, np.searchsorted(nodes, v)] for v in (low, low + width)]
+        mass = np.maximum(at[1] - at[0], 1e-300)
+        logs = np.log(mass).sum(axis=0) - 12 * np.log(width)
+        return logs + stats.norm(1, 2).logpdf(low) + stats.halfnorm(scale=4).logpdf(width)
+
+    axes = {"low": np.linspace(-6.0, 2.0, 801), "width": np.linspace(0.3, 12.0, 1171)}
+    values, weights = on_grid(log_posterior, **axes)
+    yield from moments(draws, values, weights)
+
+
+@problem
+def groups_with_a_covariate_and_a_condition() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(83)
+    who, heat, load = np.repeat([0, 1, 2], 6), rng.uniform(200, 500, 18), rng.uniform(1, 4, 18)
+    x = np.array([0.0, 0.5, 0.2])[who] + 0.002 * (heat - 300) + 0.15 * rng.normal(size=18)
+
+    def response(x: Any, load: Any) -> Any:
+        return load * np.exp(x)
+
+    index = pd.Index(np.array(["u", "v", "w"])[who], name="mill")
+    data = pd.Series(response(x, load), index=index)
+    with pm.Model(coords={"mill": ["u", "v", "w"]}):
+        a = pm.Normal("a", 0.0, 1.0, dims="mill")
+        b, sigma = pm.Normal("b", 0.0, 0.01), pm.HalfNormal("sigma", 0.5)
+        warm = prb.response.condition("heat", heat)
+        mean = a[prb.response.group("mill")] + b * (warm - 300.0)
+        inputs = pm.Normal.dist(mean, sigma), prb.response.condition("load", load)
+        prb.Simulator("y", response, *inputs, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    def log_posterior(theta: Any) -> Any:
+        slope, sigma = 1e-3 * theta[:, 3], np.exp(theta[:, 4])
+        mean = theta[:, who].T + slope * (heat - 300)[:, None]
+        logs = stats.norm.logpdf(x[:, None], mean, sigma).sum(axis=0)
+        logs += stats.norm.logpdf(theta[:, :3]).sum(axis=1) + stats.norm(0, 0.01).logpdf(slope)
+        return logs + stats.halfnorm(scale=0.5).logpdf(sigma) + theta[:, 4]
+
+    points, weights = by_importance(log_posterior, [0.0, 0.5, 0.2, 2.0, -2.0])
+    got = {f"a{i}": draws["a"].values[..., i] for i in range(3)}
+    got |= {"b": 1e3 * draws["b"].values, "log sigma": np.log(draws["sigma"].values)}
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def groups_of_functions_of_each_specimen() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(84)
+    who, times = np.repeat([0, 1], [5, 9]), rng.uniform(0.5, 2.0, 14)
+    x = rng.normal(np.array([1.0, 2.0])[who], 0.3)
+
+    def response(x: Any, time: Any) -> Any:
+        return 1e6 * np.expm1(np.asarray(x) * time)
+
+    y = [float(response(v, time)) for v, time in zip(x, times, strict=True)]
+    data = pd.Series(y, index=pd.Index(np.array(["p", "q"])[who], name="batch"))
+    with pm.Model(coords={"batch": ["p", "q"]}):
+        mu = pm.Normal("mu", 0.0, 2.0, dims="batch")
+        sigma = pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu[prb.response.group("batch")], sigma)
+        own = prb.response.by_specimen(response, list(times))
+        prb.Simulator("y", own, population, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    s = np.linspace(0.05, 1.5, 3000)
+    logs = stats.halfnorm.logpdf(s)
+    parts = []
+    for g in range(2):
+        v = x[who == g]
+        n, center = len(v), v.mean()
+        logs -= ((v - center) ** 2).sum() / (2 * s**2) + (n - 1) * np.log(s)
+        logs += stats.norm.logpdf(center, 0.0, np.hypot(2.0, s / np.sqrt(n)))
+        variance = 1 / (0.25 + n / s**2)
+        parts.append((variance * n * center / s**2, variance))
+    weights = special.softmax(logs)
+    yield from moments(draws, {"sigma": s}, weights)
+    for g, (middle, variance) in enumerate(parts):
+        mean = weights @ middle
+        sd = np.sqrt(weights @ (variance + (middle - mean) ** 2))
+        drawn = draws["mu"].values[..., g]
+        yield difference(f"mean of mu {g}", drawn.mean(), mean, 0.1 * sd)
+        yield difference(f"sd of mu {g}", drawn.std(), sd, 0.1 * sd)
+
+
+@problem
+def three_kinds_of_specimens_with_unknown_shares() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(85)
+    kinds = rng.choice(3, 30, p=[0.5, 0.3, 0.2])
+    x = np.exp(rng.normal(np.array([-1.0, 0.5, 2.0])[kinds], 0.3))
+
+    def response(x: Any) -> Any:
+        return 1e-9 * np.log(x) ** 2 + 4e-9 * np.log(x)
+
+    with pm.Model():
+        w = pm.Dirichlet("w", np.array([1.0, 1.0, 1.0]))
+        parts = [pm.LogNormal.dist(m, 0.3) for m in (-1.0, 0.5, 2.0)]
+        prb.Simulator("y", response, pm.Mixture.dist(w, parts), observed=response(x))
+        draws = prb.sample(random_seed=1).posterior["w"].values
+
+    v = np.log(x)
+    roots = np.stack([v, -4.0 - v])
+    density = stats.norm.pdf(roots[:, :, None], [-1.0, 0.5, 2.0], 0.3).sum(axis=0)
+    points = np.random.default_rng(0).dirichlet(np.ones(3), 400_000)
+    logs = np.log(points @ density.T).sum(axis=1)
+    weights = special.softmax(logs)
+    got = {f"w{i}": draws[..., i] for i in range(3)}
+    yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def table_of_runs_for_groups() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(86)
+    who = np.repeat([0, 1], [7, 12])
+    x = rng.normal(np.array([2.0e6, 2.6e6])[who], 2e5)
+    runs = np.sort(rng.uniform(0.8e6, 4e6, 35))
+
+    def response(x: Any) -> Any:
+        return 1e-6 * x + 0.2 * (1e-6 * x) ** 3
+
+    data = pd.Series(response(x), index=pd.Index(np.array(["l", "r"])[who], name="side"))
+    with pm.Model(coords={"side": ["l", "r"]}):
+        mu = pm.Normal("mu", 2.3e6, 4e5, dims="side")
+        sigma = pm.HalfNormal("sigma", 2e5)
+        population = pm.Normal.dist(mu[prb.response.group("side")], sigma)
+        table = prb.Runs(pd.DataFrame({"E": runs}), pd.Series(response(runs), name="y"))
+        prb.Simulator("y", table, population, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    mus, sigmas = np.linspace(1.5e6, 3.2e6, 851), np.linspace(8e4, 6e5, 261)
+    tables = []
+    for g in range(2):
+        v = x[who == g][:, None, None]
+        logs = stats.norm(mus, sigmas[:, None]).logpdf(v).sum(axis=0)
+        tables.append(logs + stats.norm(2.3e6, 4e5).logpdf(mus))
+    total = sum(special.logsumexp(t, axis=1) for t in tables)
+    weights = special.softmax(total + stats.halfnorm(scale=2e5).logpdf(sigmas))
+    yield from moments(draws, {"sigma": sigmas}, weights)
+    for g, table_of in enumerate(tables):
+        conditional = weights @ special.softmax(table_of, axis=1)
+        yield from moments({"mu": draws["mu"].values[..., g]}, {"mu": mus}, conditional)
+
+
+@problem
+def fleet_of_sinh_arcsinh_populations() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(87)
+    x = {"right": rng.gamma(2.0, 0.5, 30), "left": 3.0 - rng.gamma(2.0, 0.3, 20)}
+
+    def response(x: Any) -> Any:
+        return x + 0.1 * x**3
+
+    data = {name: response(v) for name, v in x.items()}
+    with pm.Model() as model:
+        mu, s = pm.Normal("mu", 0.0, 5.0), pm.HalfNormal("s", 2.0)
+        population = prb.families.SinhArcsinh.dist(mu, s, name="x")
+        prb.Simulator("y", response, population, observed=data["right"])
+    fleet = prb.calibrate_each(data, model=model, draws=4000, progressbar=False)
+    for name, v in x.items():
+
+        def log_posterior(theta: Any, v: Any = v) -> Any:
+            s, tail = np.exp(theta[:, 1]), np.exp(theta[:, 3])
+            logs = sinh_arcsinh(v[:, None], theta[:, 0], s, theta[:, 2], tail=tail).sum(axis=0)
+            logs += stats.norm(0, 5).logpdf(theta[:, 0]) + stats.halfnorm(scale=2).logpdf(s)
+            logs += stats.norm(0, 0.35).logpdf(theta[:, 2]) + stats.norm(0, 0.25).logpdf(
+                theta[:, 3]
+            )
+            return logs + theta[:, 1]
+
+        points, weights = by_importance(log_posterior, [v.mean(), np.log(v.std()), 0.0, 0.0])
+        draws = fleet["posterior"].dataset.sel(product=name)
+        got = {
+            f"{name} mu": draws["mu"].values,
+            f"{name} log s": np.log(draws["s"].values),
+            f"{name} skew": draws["x_skew"].values,
+            f"{name} log tail": np.log(draws["x_tail"].values),
+        }
+        yield from moments(got, dict(zip(got, points.T, strict=True)), weights)
+
+
+@problem
+def update_of_correlated_inputs() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(88)
+    covariance = np.array([[1.0, 0.8e-6], [0.8e-6, 1e-12]])
+    x = rng.multivariate_normal([5.0, 3e-6], covariance, 13)
+
+    def response(x: Any) -> Any:
+        return np.stack([x[..., 0] * (1 + 1e5 * x[..., 1]), 1e6 * x[..., 1]], axis=-1)
+
+    y = response(x)
+    with pm.Model() as model:
+        mean = pm.Normal("mean", [0.0, 0.0], [10.0, 1e-5])
+        population = pm.MvNormal.dist(mean, covariance)
+        prb.Simulator("y", response, population, observed=y[:4])
+        result = prb.sample(random_seed=1)
+        for part in (y[4:5], y[5:]):
+            result = prb.update(result, observed=part, model=model)
+    draws = result.posterior["mean"].values.reshape(-1, 2) * [1.0, 1e6]
+
+    scaled, v = np.array([[1.0, 0.8], [0.8, 1.0]]), x * [1.0, 1e6]
+    precision = 13 * np.linalg.inv(scaled) + np.diag([1e-2, 1e-2])
+    exact = np.linalg.inv(precision)
+    middle = exact @ np.linalg.inv(scaled) @ v.sum(axis=0)
+    sd = np.sqrt(np.diag(exact))
+    yield difference("means", draws.mean(axis=0), middle, 0.1 * sd)
+    yield difference("sds", draws.std(axis=0), sd, 0.1 * sd)
+
+
+@problem
+def random_response_of_two_groups() -> Iterator[tuple[str, float]]:
+    rng = np.random.default_rng(89)
+    who = np.repeat([0, 1], [12, 12])
+
+    def response(x: Any, rng: Any) -> Any:
+        return x + 0.4 * rng.normal(size=np.shape(x))
+
+    y = response(rng.normal(np.array([0.0, 1.5])[who], 0.5), rng)
+    data = pd.Series(y, index=pd.Index(np.array(["s", "t"])[who], name="site"))
+    with pm.Model(coords={"site": ["s", "t"]}):
+        mu = pm.Normal("mu", 0.0, 2.0, dims="site")
+        sigma = pm.HalfNormal("sigma", 1.0)
+        population = pm.Normal.dist(mu[prb.response.group("site")], sigma)
+        random = prb.response.Stochastic(response, random_seed=1)
+        prb.Simulator("y", random, population, observed=data)
+        draws = prb.sample(random_seed=1).posterior
+
+    s = np.linspace(0.002, 2.0, 2000)
+    spread = np.hypot(s, 0.4)
+    logs = stats.halfnorm.logpdf(s)
+    for g in range(2):
+        v = y[who == g]
+        logs -= ((v - v.mean()) ** 2).sum() / (2 * spread**2) + 11 * np.log(spread)
+        logs += stats.norm.logpdf(v.mean(), 0.0, np.hypot(2.0, spread / np.sqrt(12)))
+    yield from random_moments(draws, {"sigma": s}, special.softmax(logs))
