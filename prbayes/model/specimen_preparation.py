@@ -198,7 +198,7 @@ def refuse_changed_runs(likelihood: SpecimenLikelihood) -> None:
     for m in likelihood.measurements:
         if is_prepared(likelihood) and m.responses.may_differ:
             emulation = prepared(likelihood).emulation
-            points = likelihood.coordinates.inputs(emulation.z)
+            points = likelihood.coordinates.inputs_of_runs(emulation.z)
             y = emulation.y[:, output_columns(likelihood, m)].reshape(-1, *m.event)
             m.responses.refuse_change(points, y, m.responses)
 
@@ -324,9 +324,7 @@ class CheckedRuns:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         measurements = likelihood.measurements
-        coordinates = likelihood.coordinates
-        reached = coordinates.within(z)
-        inputs = coordinates.inputs(reached)
+        inputs = likelihood.coordinates.inputs_of_runs(z)
         parts = []
         for m in measurements:
             with m.responses.kept_runs():

@@ -135,6 +135,10 @@ class Coordinates:
             first = last
         return arrays
 
+    def inputs_of_runs(self, z: Floats) -> list[Floats]:
+        """Return the inputs at which the response is run for coordinates (..., d)."""
+        return self.inputs(self.within(z))
+
     def within(self, z: Floats) -> Floats:
         """Return coordinates (..., d) that are moved to where the response may be run."""
         return z if self.reach is None else np.clip(z, *self.reach)
