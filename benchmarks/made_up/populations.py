@@ -1272,7 +1272,7 @@ def fleet_of_a_folded_response_with_errors() -> Iterator[tuple[str, float]]:
 
 
 @problem
-def fleet_of_two_outputs_with_a_single_specimen() -> Iterator[tuple[str, float]]:
+def fleet_of_two_outputs_with_two_specimens() -> Iterator[tuple[str, float]]:
     rng = np.random.default_rng(66)
     sizes = {"two": 2, "three": 3, "ten": 10}
     x = {k: rng.multivariate_normal([1.0, 2.0], np.diag([0.04, 0.09]), n) for k, n in sizes.items()}
