@@ -254,7 +254,7 @@ def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedR
     likelihood = simulator.likelihood
     preparation = prepared(likelihood)
     run_z = preparation.emulation.z
-    runs = likelihood.coordinates.inputs(run_z)
+    runs = likelihood.coordinates.inputs_of_runs(run_z)
     points = values_of_inputs(runs, likelihood.inputs, responses.inputs)
     if responses.same_as(simulator.responses):
         emulated = simulator.emulated

@@ -230,7 +230,7 @@ def _first_runs(
         for measurement in likelihood.measurements:
             if measurement.name == simulator.name and is_prepared(likelihood):
                 emulation = prepared(likelihood).emulation
-                points = likelihood.coordinates.inputs(emulation.z)
+                points = likelihood.coordinates.inputs_of_runs(emulation.z)
                 values = emulation.y[:, output_columns(likelihood, measurement)]
     n_rows = len(values)
     if not n_rows:

@@ -23,7 +23,7 @@ from prbayes.model.random_variable import known_value
 from prbayes.response.by_specimen import of_specimens, with_columns
 from prbayes.response.compile import PLAIN
 from prbayes.response.condition import ReadingsCondition, is_condition, known_covariates
-from prbayes.response.inputs import Groups, group_indices
+from prbayes.response.inputs import Groups, group_indices, labels_and_values
 from prbayes.response.outputs import (
     Outputs,
     in_order_of,
@@ -188,8 +188,30 @@ def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> tup
     return tuple(names)
 
 
+def _labelled_rows(name: str, observed: Any, groups: Groups | None) -> Any:
+    """Return a table of pandas as an array with the label and the group of each row."""
+    if not hasattr(observed, "iloc"):
+        return observed
+    first, coords = f"{name}_specimen", {}
+    index = observed.index
+    if groups is not None:
+        labels, observed = labels_and_values(f"{name}: observed", observed, groups.dim)
+        coords[groups.dim] = (first, labels)
+        if groups.dim in index.names:
+            index = index.droplevel(groups.dim) if index.nlevels > 1 else None
+    if index is not None:
+        texts = label_texts(index) if index.nlevels > 1 else None
+        coords[first] = (first, index.to_numpy() if texts is None else texts)
+    dims = (first, f"{name}_column")[: observed.ndim]
+    return xr.DataArray(observed.to_numpy(), dims=dims, coords=coords)
+
+
 def observed_at_conditions(
-    name: str, observed: Any, metric: Metric | None, inputs: Sequence[Any]
+    name: str,
+    observed: Any,
+    metric: Metric | None,
+    inputs: Sequence[Any],
+    groups: Groups | None = None,
 ) -> tuple[Any, Metric | None]:
     """Return observed values and metric with a column for each value of a vector condition.
 
@@ -207,6 +229,8 @@ def observed_at_conditions(
     _refuse_other_order(name, observed, metric, inputs)
     if not vectors:
         return observed, metric
+    if groups is not None:  # the array at the conditions has no index of pandas
+        observed = _labelled_rows(name, observed, groups)
     condition = vectors[0]
     shape = condition.columns.shape
     if any(x is not condition for x in vectors):
@@ -244,7 +268,12 @@ def observed_at_conditions(
 
 
 def observed_by_specimen(
-    name: str, observed: Any, metric: Metric | None, response: Any, inputs: Sequence[Any]
+    name: str,
+    observed: Any,
+    metric: Metric | None,
+    response: Any,
+    inputs: Sequence[Any],
+    groups: Groups | None = None,
 ) -> tuple[Any, Metric | None, Any]:
     """Return observed values, metric and response with an output for each reading of a function.
 
@@ -254,6 +283,7 @@ def observed_by_specimen(
     if functions is None:
         return observed, metric, response
     places = np.array(functions.places)
+    observed = _labelled_rows(name, observed, groups)
     shape = np.shape(observed)
     _refuse_distributions(
         name,

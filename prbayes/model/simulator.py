@@ -233,8 +233,11 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         unused = [metric, epsilon, weights, specimens, dims, variables.groups]
         _refuse_beside_sheets(name, unused, settings)
         metric, observed = read_sheets(name, observed)
-    observed, metric = observed_at_conditions(name, observed, metric, inputs)
-    observed, metric, response = observed_by_specimen(name, observed, metric, response, inputs)
+    groups = variables.groups
+    observed, metric = observed_at_conditions(name, observed, metric, inputs, groups)
+    observed, metric, response = observed_by_specimen(
+        name, observed, metric, response, inputs, groups
+    )
     data = read_data(name, observed, variables.groups, weights, specimens, dims, model)
     if repeats_of(response) > 1:
         inputs = (*inputs, noise_of(data.outputs.event))

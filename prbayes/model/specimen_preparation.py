@@ -66,6 +66,7 @@ from prbayes.specimens.points import (
     Plausible,
     SpecimenData,
     SpecimenPoints,
+    at_scale,
     draw_points,
     fit_proposals,
     likely_scale,
@@ -145,9 +146,17 @@ def with_specimens(
     if proposals.is_open():
         count = max(count, preparation.points.log_a.shape[1] // 2)
     rows = np.linspace(0, len(thetas) - 1, 256).round().astype(int)
-    draws = PopulationDraws(SpecimenPopulations(added), thetas[rows])
+    populations = SpecimenPopulations(added)
+    draws = PopulationDraws(populations, thetas[rows])
     first = draw_points(data, proposals, 2 * count, data.seed)
     scale = likely_scale(data, first, preparation.emulation.error)
+    if not proposals.is_open():
+        # Points need not agree at populations of the first specimens that the new ones exclude.
+        error, finer = preparation.emulation.error, max(2 * count, 512)
+        points = at_scale(data, draw_points(data, proposals, finer, data.seed), error, scale)
+        logs = populations.log_likelihoods(thetas[rows], points.z, points.log_a).sum(axis=1)
+        is_likely = (logs >= np.median(logs)) | (logs > logs.max() - 20.0)
+        draws = PopulationDraws(populations, thetas[rows[is_likely]])
     points, proposals = Plausible(draws, proposals, first, scale, count).agreeing(data)
     gross_errors = measurement.gross_errors is not False
     misfits = misfit_findings(
@@ -192,7 +201,7 @@ def refuse_changed_runs(likelihood: SpecimenLikelihood) -> None:
     for m in likelihood.measurements:
         if is_prepared(likelihood) and m.responses.may_differ:
             emulation = prepared(likelihood).emulation
-            points = likelihood.coordinates.inputs(emulation.z)
+            points = likelihood.coordinates.inputs_of_runs(emulation.z)
             y = emulation.y[:, output_columns(likelihood, m)].reshape(-1, *m.event)
             m.responses.refuse_change(points, y, m.responses)
 
@@ -349,9 +358,7 @@ class CheckedRuns:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         measurements = likelihood.measurements
-        coordinates = likelihood.coordinates
-        reached = coordinates.within(z)
-        inputs = coordinates.inputs(reached)
+        inputs = likelihood.coordinates.inputs_of_runs(z)
         parts = []
         for m in measurements:
             with m.responses.kept_runs():

@@ -160,7 +160,14 @@ def fixed_ends(dist: TensorVariable) -> tuple[Floats, Floats, bool]:
         low[...] = ends[0].data
     if isinstance(ends[1], pt.TensorConstant):
         high[...] = ends[1].data
-    return low, high, kind == "interval"
+    is_finite = kind == "interval"
+    if isinstance(dist.owner.op, pm.Truncated.rv_type):  # it may keep an end of its base
+        base = dist.owner.op.base_rv_op.make_node(*dist.owner.inputs[:-2]).default_output()
+        lower, upper, is_finite_at_both = fixed_ends(base)
+        is_moved = (np.isinf(lower) | (low > lower)) & (np.isinf(upper) | (high < upper))
+        is_finite = is_finite_at_both or bool(is_moved.all())
+        low, high = np.maximum(low, lower), np.minimum(high, upper)
+    return low, high, is_finite
 
 
 def _scalar_if_infinite(end: TensorVariable) -> Any:

@@ -546,7 +546,7 @@ def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
 
 def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups."""
-    labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
+    labels, values = labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]
     place = {text: i for i, text in enumerate(groups.names)}
     unknown = [text for text in dict.fromkeys(texts) if text not in place]
@@ -560,22 +560,24 @@ def group_indices(name: str, observed: Any, groups: Groups) -> tuple[Indices, An
     return np.array([place[text] for text in texts], dtype=np.intp), values
 
 
-def _labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
+def labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
     """Return the group label of each specimen, and the observed values without these labels."""
     if hasattr(observed, "dims") and hasattr(observed, "coords") and dim in observed.coords:
         coordinate = observed.coords[dim]
         if coordinate.dims == observed.dims[:1]:
             return coordinate.values.tolist(), observed
-    if hasattr(observed, "columns") and dim in observed.columns:
-        values = observed.drop(columns=dim)
-        is_single = values.shape[1] == 1
-        return list(observed[dim]), values.iloc[:, 0] if is_single else values
+    values, labels = observed, None
     index: Any = getattr(observed, "index", None)
-    if dim in getattr(index, "names", ()) and not hasattr(observed, "columns"):
-        return list(index.get_level_values(dim)), observed
+    if hasattr(observed, "columns") and dim in observed.columns:
+        labels, values = observed[dim], observed.drop(columns=dim)
+    elif dim in getattr(index, "names", ()):
+        labels = index.get_level_values(dim)
+    if labels is not None:
+        is_single = hasattr(values, "columns") and values.shape[1] == 1
+        return list(labels), values.iloc[:, 0] if is_single else values
     raise TypeError(
         f"{name}: got {type(observed).__name__} without the group of each specimen, expected a "
-        f"DataArray with a coordinate {dim!r} along the specimens, a DataFrame with a column of "
-        "that name, or a Series with it in its index, since an input depends on "
-        f"prb.response.group({dim!r})"
+        f"DataArray with a coordinate {dim!r} along the specimens, a DataFrame with a column "
+        "or an index level of that name, or a Series with it in its index, since an input depends "
+        f"on prb.response.group({dim!r})"
     )

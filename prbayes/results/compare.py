@@ -22,7 +22,6 @@ from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.multivariate import Joint
-from prbayes.metrics.whitening import FewSpecimensError
 from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.locking import locked
@@ -342,10 +341,12 @@ def _scores(
             for metric in selection:
                 try:
                     target = metric.against(simulator.observed, simulator.weights)
-                except FewSpecimensError:
+                except ValueError:
                     if metrics is not None:
                         raise
-                    continue  # Few specimens have the same outputs, such as readings at one time.
+                    # A default metric takes no single specimen, and no outputs that few specimens
+                    # have, such as readings at one time, or that follow from others.
+                    continue
                 totals = simulator.discrepancies(evaluator.parents(thetas, k), target)
                 inner = getattr(metric, "metric", None)
                 name = type(metric).__name__

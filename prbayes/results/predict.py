@@ -641,7 +641,10 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
         is_finite = np.isfinite(flat).all(axis=1)
         spread = np.full(error.shape, np.nan)
         if is_finite.any():
+            # Quartiles as well, because few specimens beside a pole have most of the variance.
+            low, high = np.quantile(flat[is_finite], [0.25, 0.75], axis=0)
             spread = flat[is_finite].std(axis=0)
+            spread = np.where(high > low, np.minimum(spread, (high - low) / 1.349), spread)
         share = float(np.max(error / positive_scale(spread, np.inf)))
         if share > 0.05:
             text = (

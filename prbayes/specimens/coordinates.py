@@ -107,6 +107,8 @@ class Coordinates:
             high.append(upper.ravel())
             closed.append(np.full(lower.size, is_closed))
         flat = np.stack([np.concatenate(low), np.concatenate(high)])
+        # A logarithm has no lower end, also where the family as such has negative numbers.
+        flat[0, self.is_log] = np.maximum(flat[0, self.is_log], 0.0)
         support = (_logs(flat, self.is_log) - self.center) / self.half_width
         support[:, self.is_condition] = [[-np.inf], [np.inf]]
         is_end = np.concatenate(closed) | np.isinf(support)
@@ -136,6 +138,10 @@ class Coordinates:
             arrays.append(part.reshape(*z.shape[:-1], *shape))
             first = last
         return arrays
+
+    def inputs_of_runs(self, z: Floats) -> list[Floats]:
+        """Return the inputs at which the response is run for coordinates (..., d)."""
+        return self.inputs(self.within(z))
 
     def within(self, z: Floats) -> Floats:
         """Return coordinates (..., d) that are moved to where the response may be run."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 from numpy.typing import NDArray
@@ -124,6 +125,43 @@ def test_each_specimen_has_the_likelihood_of_its_function(propagation: Any) -> N
     expected -= np.log(SLOPES) + SLOPES * X  # dx / dy
     np.testing.assert_allclose(got, expected, atol=0.04)
     np.testing.assert_allclose(got - got[0], expected - expected[0], atol=0.01)
+
+
+@pytest.mark.parametrize("form", ["index", "levels", "column"])
+@pytest.mark.parametrize("given", ["functions", "condition"])
+def test_groups_and_labels_are_read_from_pandas(form: str, given: str) -> None:
+    names = ["a" if row % 3 else "b" for row in range(N)]
+    labels = [f"no. {row}" for row in range(N)]
+    index = pd.Index(names, name="rig")
+    if form == "levels":
+        index = pd.MultiIndex.from_arrays([labels, names], names=["bar", "rig"])
+    table = pd.DataFrame(np.exp(np.outer(X, [1.0, 2.0])), index)
+    if form == "column":
+        table = table.reset_index(drop=True).assign(rig=names)
+
+    def curve(x: Any, t: Any) -> Any:
+        return np.exp(np.asarray(x)[..., None] * t)
+
+    with pm.Model(coords={"rig": ["a", "b"]}) as model:
+        mu = pm.Normal("mu", 1.0, 0.5, dims="rig")
+        inputs = [pm.Normal.dist(mu[prb.response.group("rig")], 0.3)]
+        if given == "condition":
+            inputs.append(prb.response.condition("t", np.tile([1.0, 2.0], (N, 1))))
+            response: Any = curve
+        else:
+            response = prb.response.by_specimen(curve, [np.array([1.0, 2.0])] * N)
+        prb.Simulator("y", response, *inputs, observed=table)
+    (likelihood,) = specimen_likelihoods(model).values()
+    for group, (_, rows) in zip("ab", likelihood.by_group, strict=True):
+        assert [names[row] for row in rows] == [group] * len(rows)
+
+
+def test_a_named_index_labels_the_specimens() -> None:
+    labels = [f"no. {row}" for row in range(N)]
+    index = pd.Index(labels, name="bar")
+    model = model_of_functions(observed=pd.Series(np.exp(SLOPES * X), index))
+    (measurement,) = likelihood_of(model).measurements
+    assert measurement.outputs.names == tuple(labels)
 
 
 def test_records_with_readings_in_different_numbers_have_their_exact_likelihood() -> None:

@@ -229,6 +229,7 @@ def observed() -> list[Any]:
         pd.DataFrame({"y": VALUES, "supplier": WHO}),
         pd.Series(VALUES, pd.Index(WHO, name="supplier")),
         pd.Series(VALUES, index),
+        pd.DataFrame({"y": VALUES}, index),
     ]
 
 
@@ -239,6 +240,9 @@ def test_groups_are_read_from_coordinate_column_or_index(given: Any) -> None:
     np.testing.assert_array_equal(np.asarray(values), VALUES)
     frame = pd.DataFrame({"a": VALUES, "supplier": WHO, "b": VALUES})
     places, rest = group_indices("y", frame, GROUPS)
+    np.testing.assert_array_equal(places, [1, 0, 1])
+    assert list(rest.columns) == ["a", "b"]
+    places, rest = group_indices("y", frame.set_index("supplier"), GROUPS)
     np.testing.assert_array_equal(places, [1, 0, 1])
     assert list(rest.columns) == ["a", "b"]
 

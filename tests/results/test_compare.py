@@ -4,6 +4,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
@@ -272,3 +273,24 @@ def test_readings_at_times_of_their_own_are_scored_by_the_likelihood_alone() -> 
     assert not any("Joint" in str(name) for name in scores)
     with pytest.raises(ValueError, match="expected at least 3"):
         prb.compare(results, model=model, metrics=[prb.Joint(prb.AreaMetric())])
+
+
+def test_data_that_a_default_metric_does_not_take_have_no_value_of_it() -> None:
+    """A group of one specimen has no bandwidth, and three outputs of one input are dependent."""
+    rng = np.random.default_rng(0)
+    x, who = rng.normal(2.0, 0.3, 11), ["A"] + ["B"] * 10
+    with pm.Model(coords={"maker": ["A", "B"]}) as of_groups:
+        mu = pm.Normal("mu", 0.0, 5.0, dims="maker")
+        population = pm.Normal.dist(mu[prb.response.group("maker")], 0.3)
+        data = pd.Series(np.exp(x), pd.Index(who, name="maker"))
+        prb.Simulator("y", np.exp, population, observed=data)
+
+    def curve(x: Any) -> Any:
+        return np.asarray(x)[..., None] * np.array([1.0, 2.0, 3.0])
+
+    with pm.Model() as of_curves:
+        population = pm.Normal.dist(pm.Normal("mu", 0.0, 5.0), 0.3)
+        prb.Simulator("y", curve, population, observed=curve(x))
+    for model in (of_groups, of_curves):
+        table = prb.compare({"optimum": prb.minimize(model, progressbar=False)}, model=model)
+        assert np.isfinite(table["estimate"]).all()

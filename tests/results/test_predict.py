@@ -379,3 +379,22 @@ def test_wide_populations_have_the_response_of_runs_far_from_the_data() -> None:
         np.testing.assert_allclose(
             predicted.values[inside], computed.values[inside], rtol=0.25, atol=3.0
         )
+
+
+def test_a_response_with_a_pole_at_the_end_of_its_inputs(caplog: pytest.LogCaptureFixture) -> None:
+    x = np.random.default_rng(37).beta(2.0, 5.0, 20)
+
+    def odds(x: Any) -> Any:
+        return x / (1.0 - x)
+
+    with pm.Model() as model:
+        mean, nu = pm.Beta("mean", 1.0, 1.0), pm.LogNormal("nu", 2.0, 1.0)
+        population = pm.Beta.dist(mean * nu, (1 - mean) * nu)
+        prb.Simulator("y", odds, population, observed=odds(x))
+    optimum = prb.minimize(model, progressbar=False)
+    # The runs nearest to the end are at an input that is not one itself.
+    same = prb.predict(optimum, odds, population, model=model)
+    assert float(same.median()) == pytest.approx(np.median(odds(x)), rel=0.3)
+    # The interpolant of another response is rough beside the pole, which few specimens show.
+    prb.predict(optimum, lambda x: 1.0 / (1.0 - x), population, model=model)
+    assert "rough-prediction" in caplog.text

@@ -12,6 +12,7 @@ from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 from prbayes.results.update import rare_specimens
 
@@ -104,6 +105,22 @@ def test_a_specimen_that_contradicts_the_others_is_named(
     assert "1 new specimen (row 18)" in finding.text
     assert "unlike-specimens" in prb.help("unlike-specimens")
     assert "row 18" in caplog.text
+
+
+def test_populations_that_new_specimens_exclude_take_no_points() -> None:
+    """Of the first six specimens one draw of 256 is a population that is far too narrow."""
+    rng = np.random.default_rng(61)
+    x = 2.0 * rng.weibull(3.0, 32)
+    observed = x**2 + 0.3 * rng.normal(size=32)
+    with pm.Model() as model:
+        alpha, beta = pm.LogNormal("alpha", 1.0, 0.7), pm.LogNormal("beta", 0.5, 0.7)
+        metric = prb.LogLikelihood(error=0.3)
+        population = pm.Weibull.dist(alpha, beta)
+        prb.Simulator("y", np.square, population, metric=metric, observed=observed[:6])
+    prb.update(drawn(model), observed=observed[6:11], model=model)
+    (likelihood,) = specimen_likelihoods(model).values()
+    (updated,) = likelihood.cache["updated"].likelihoods
+    assert prepared(updated).points.log_a.shape[1] <= 512  # 8192 with that draw
 
 
 def test_a_specimen_is_rare_if_few_draws_have_the_weight() -> None:

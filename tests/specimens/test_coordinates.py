@@ -146,6 +146,22 @@ def test_runs_stay_within_ends_that_are_the_same_for_all_populations() -> None:
     np.testing.assert_array_equal(ended.within(inner), inner)
 
 
+@pytest.mark.parametrize(
+    "dist",
+    [
+        lambda factor: pm.Truncated.dist(pm.Gamma.dist(factor, 1.0), upper=4.0),
+        lambda _: pm.TruncatedNormal.dist(mu := pm.LogNormal("mu", 0, 2), 0.05 * mu, upper=90),
+    ],
+)
+def test_a_logarithm_of_an_input_with_an_upper_end_has_no_lower_end(dist: Any) -> None:
+    ended = coordinates(lambda factor: [dist(factor)])
+    assert ended.is_log.all()
+    far = np.array([[-2.0], [0.0], [50.0]])
+    (x,) = ended.inputs(ended.within(far))
+    assert np.isfinite(x).all()
+    assert (x > 0).all()
+
+
 def test_narrow_inputs_around_zero_have_no_ends() -> None:
     """They are below one as shares are, and have values below zero, as an unknown offset has."""
     x = coordinates(lambda factor: [pm.Normal.dist(0.0, 0.25 * factor)])
