@@ -24,8 +24,6 @@ from prbayes.metrics.base import (
 )
 from prbayes.metrics.grid import compiled
 
-ROUNDING = 1e-13  # largest error of sums of weights, by rounding
-
 
 @dataclass(frozen=True)
 class AreaMetric(Metric):
@@ -234,9 +232,8 @@ class _Integral:
         first = self.edges[:-1]
         last = self.edges[1:]
         crossing = np.searchsorted(self.observed, simulated).clip(first, last)
-        below, above = (
-            self._area(simulated, start, end) for start, end in ((first, crossing), (crossing, last))
-        )
+        below = self._area(simulated, first, crossing)
+        above = self._area(simulated, crossing, last)
         areas = np.asarray((below - above).sum(axis=-1))
         if correction.any():
             widths = self.positions[last] - self.positions[first]
@@ -322,18 +319,22 @@ def interpolated(tables: Floats, p: Any, xp: Any = np) -> Any:
 
 def _heights(simulated: Any, observed: Any, tables: Floats, xp: Any) -> Any:
     """Return |F - S_N|, or with tables of a correction |F - S_N| + g(S_N) - g(F)."""
-    gap = xp.abs(simulated - observed)
-    heights = gap
+    heights = xp.abs(simulated - observed)
     if tables.any():
         heights = heights + interpolated(tables, observed, xp) - interpolated(tables, simulated, xp)
-    # Differences of sums of weights that are equal but for rounding are zero. Otherwise the
-    # intervals between responses far beyond the data, as of an exponential function, have an area.
-    return xp.where(gap < ROUNDING, 0.0, heights)
+    # Otherwise the intervals between responses far beyond the data, as of an exponential function,
+    # have an area by rounding.
+    return xp.where(_is_equal(simulated, observed, xp), 0.0, heights)
+
+
+def _is_equal(simulated: Any, observed: Any, xp: Any = np) -> Any:
+    """Return whether sums of weights are equal but for rounding."""
+    return xp.abs(simulated - observed) < 1e-13
 
 
 def _without_rounding(levels: Floats) -> Floats:
     """Return sums of weights with exact ones in place of sums that are one but for rounding."""
-    return np.where(np.abs(levels - 1) < ROUNDING, 1.0, levels)
+    return np.where(_is_equal(levels, 1.0), 1.0, levels)
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

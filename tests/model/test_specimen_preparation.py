@@ -144,7 +144,9 @@ def test_a_response_whose_squares_overflow_under_a_vague_prior_is_refused() -> N
     with pm.Model():
         mu, sigma = pm.Normal("mu", 0.0, 100.0), pm.HalfNormal("sigma", 10.0)
         prb.Simulator("y", np.exp, pm.Normal.dist(mu, sigma), observed=y)
-        with pytest.raises(prb.propagation.DesignError, match=r"not smooth enough.*narrow the priors"):
+        with pytest.raises(
+            prb.propagation.DesignError, match=r"not smooth enough.*narrow the priors"
+        ):
             prb.minimize(progressbar=False)
 
 
