@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 import pymc as pm
-from scipy import stats
+from scipy import optimize, stats
 
 import prbayes as prb
-from benchmarks.made_up import difference, on_grid, problem
+from benchmarks.made_up import difference, moments, on_grid, problem
 
 Differences = Iterator[tuple[str, float]]
 DRAWS = 4000  # of a posterior, in four chains
@@ -22,7 +23,9 @@ def of_weights(values: Any, weights: Any, levels: Any) -> Any:
     return np.interp(levels, weights[order].cumsum() - weights[order] / 2, values[order])
 
 
-def with_interval(name: str, table: Any, values: Any, weights: Any, prob: float = 0.89) -> Differences:
+def with_interval(
+    name: str, table: Any, values: Any, weights: Any, prob: float = 0.89
+) -> Differences:
     """Yield differences of a mean and its interval from those of a weighted grid."""
     mean = weights @ values
     sd = np.sqrt(weights @ (values - mean) ** 2)
@@ -159,7 +162,9 @@ def normal_population(
 def prediction_of_a_hump_elsewhere() -> Differences:
     x = np.random.default_rng(24).normal(0.5, 0.4, 20)
     model, a, idata = normal_population(x, np.exp)
-    hump = prb.predict(idata, lambda a: 1e6 * np.exp(-((a - 0.5) ** 2) / 0.1), a, model=model, n_draws=2000)
+    hump = prb.predict(
+        idata, lambda a: 1e6 * np.exp(-((a - 0.5) ** 2) / 0.1), a, model=model, n_draws=2000
+    )
     mu, sigma, weights = of_normals(x)
     nodes = stats.norm.ppf((np.arange(401) + 0.5) / 401)
     values = 1e6 * np.exp(-((mu[:, None] + sigma[:, None] * nodes - 0.5) ** 2) / 0.1)
@@ -193,7 +198,12 @@ def prediction_with_missing_readings() -> Differences:
         prb.Simulator("y", response, dist_a, dist_b, observed=observed)
         idata = prb.sample(DRAWS // 4, random_seed=1)
     got = prb.predict(
-        idata, lambda a, b: np.stack([a * b, a - b], axis=-1), dist_a, dist_b, model=model, n_draws=2000
+        idata,
+        lambda a, b: np.stack([a * b, a - b], axis=-1),
+        dist_a,
+        dist_b,
+        model=model,
+        n_draws=2000,
     )
     both = ~np.isnan(observed["first"])
     # the normal posterior of the two means: complete specimens and those with the sum alone
@@ -220,7 +230,9 @@ def prediction_at_another_hardness() -> Differences:
         a = pm.Normal.dist(base + slope * covariate, 0.15, name="a")
         prb.Simulator("y", np.exp, a, observed=np.exp(x))
         idata = prb.sample(DRAWS // 4, random_seed=1)
-    got = prb.predict(idata, np.square, a, model=model, at={"hardness": 420.0}, n_draws=2000, stored=False)
+    got = prb.predict(
+        idata, np.square, a, model=model, at={"hardness": 420.0}, n_draws=2000, stored=False
+    )
     table = prb.population(idata, a, model=model, at={"hardness": 420.0}).sel(name="a")
     design = np.stack([np.ones(30), hardness], axis=1)
     precision = design.T @ design / 0.15**2 + np.diag([1 / 25, 1 / 0.01])
@@ -254,9 +266,7 @@ def exceedance_on_both_sides_of_a_dip() -> Differences:
     model, a, idata = normal_population(x, np.sinh, 2.0)
     mu, sigma, weights = of_normals(x, 2.0)
     for limit, n_points in ((1.0, None), (25.0, 1000), (36.0, 1000)):
-        got = prb.exceedance(
-            idata, lambda a: a**2 + a, limit, a, model=model, n_points=n_points
-        )
+        got = prb.exceedance(idata, lambda a: a**2 + a, limit, a, model=model, n_points=n_points)
         roots = -0.5 + np.sqrt(0.25 + limit) * np.array([-1.0, 1.0])
         values = stats.norm.cdf(roots[0], mu, sigma) + stats.norm.sf(roots[1], mu, sigma)
         yield from with_probability(f"above {limit}", got, values, weights)
@@ -291,7 +301,9 @@ def exceedance_below_of_the_second_output() -> Differences:
 
     rng = np.random.default_rng(1)
     first, p = on_grid(log_weibull, k=np.linspace(1, 7, 301), scale=np.linspace(1.2, 3.2, 301))
-    second, q = on_grid(log_normal, mu=np.linspace(-0.4, 0.4, 301), sigma=np.linspace(0.08, 0.6, 301))
+    second, q = on_grid(
+        log_normal, mu=np.linspace(-0.4, 0.4, 301), sigma=np.linspace(0.08, 0.6, 301)
+    )
     i, j = rng.choice(p.size, 20_000, p=p), rng.choice(q.size, 20_000, p=q)
     nodes = stats.norm.ppf((np.arange(101) + 0.5) / 101)
     limits = limit * np.exp(second["mu"][j, None] + second["sigma"][j, None] * nodes)
@@ -332,9 +344,7 @@ def evaluated_median_of_a_bounded_response() -> Differences:
     got = prb.decision.evaluate(idata, quantity, model=model)
     exact = np.tanh(mu + stats.norm.ppf(0.1) * sigma)
     yield from with_interval("10%", got, exact, weights)
-    got = prb.decision.evaluate(
-        idata, prb.decision.StandardDeviation(np.exp, a), model=model
-    )
+    got = prb.decision.evaluate(idata, prb.decision.StandardDeviation(np.exp, a), model=model)
     exact = np.sqrt(np.expm1(sigma**2)) * np.exp(mu + sigma**2 / 2)
     yield from with_interval("sd", got, exact, weights)
 
@@ -439,9 +449,7 @@ def plan_of_readings_with_error() -> Differences:
     error = 3e5
     rough = prb.decision.Condition(np.positive, a, metric=prb.LogLikelihood(error=error))
     quantity = prb.decision.Quantile(np.positive, a, probability=0.99)
-    table = prb.plan(
-        idata, {"rough": rough}, k=[25, 100], model=model, quantity=quantity
-    )
+    table = prb.plan(idata, {"rough": rough}, k=[25, 100], model=model, quantity=quantity)
     centre, covariance = in_logarithms(*of_normals(x, 1e6))
     variance = centre[1] ** 2 + error**2
     information = np.diag([1 / variance, 2 * (centre[1] ** 2 / variance) ** 2])
@@ -739,7 +747,9 @@ def rank_of_two_families() -> Differences:
         rest = np.delete(y, i)
         logs = np.log(rest)
         of_normal = stats.norm(rest.mean(), rest.std()).logpdf(y[i])
-        scores.append([of_normal, stats.lognorm(logs.std(), scale=np.exp(logs.mean())).logpdf(y[i])])
+        scores.append(
+            [of_normal, stats.lognorm(logs.std(), scale=np.exp(logs.mean())).logpdf(y[i])]
+        )
     exact = np.subtract(*np.sum(scores, axis=0)[::-1])
     row = table.sel(candidate="normal")
     yield difference("difference", row.difference, exact, 1.0 * float(row.stderr))
@@ -766,9 +776,7 @@ def rank_is_that_of_any_unit() -> Differences:
 def rank_of_the_same_model_twice() -> Differences:
     x = np.random.default_rng(54).normal(1.0, 0.2, 12)
     by_exp, by_line = estimated(np.exp, np.exp(x)), estimated(np.exp, np.exp(x), epsilon=None)
-    equal = estimated(
-        np.positive, np.exp(x), pm.LogNormal.dist
-    )
+    equal = estimated(np.positive, np.exp(x), pm.LogNormal.dist)
     table = prb.rank({"a": by_exp, "b": by_line, "c": equal}, folds=6)
     yield difference("differences", table.difference, 0, 0.05)
     yield difference("beyond chance", table.significant.sum(), 0, 0.5)
@@ -798,7 +806,9 @@ def comparison_of_optimum_and_posterior() -> Differences:
     for result in ("optimum", "posterior"):
         mu, sigma = table.estimate.sel(result=result).values
         area = stats.wasserstein_distance(1e-9 * (mu + sigma * nodes) ** 3, 1e-9 * x**3)
-        yield difference(f"area of {result}", table["AreaMetric"].sel(result=result), area, 0.02 * area)
+        yield difference(
+            f"area of {result}", table["AreaMetric"].sel(result=result), area, 0.02 * area
+        )
 
 
 @problem
@@ -834,7 +844,12 @@ def comparison_of_a_chain_of_pymc() -> Differences:
         prb.Simulator("y", lambda a: a**2, pm.Gamma.dist(shape, rate), observed=x**2)
         optimum = prb.minimize()
         idata = pm.sample(
-            1000, initvals=optimum.initvals, init="adapt_diag", random_seed=1, chains=2, cores=1,
+            1000,
+            initvals=optimum.initvals,
+            init="adapt_diag",
+            random_seed=1,
+            chains=2,
+            cores=1,
             progressbar=False,
         )
     table = prb.compare({"optimum": optimum, "chain": idata}, model=model)
@@ -903,8 +918,7 @@ def bootstrap_of_a_parametric_weibull() -> Differences:
             slope = (powers @ logs**2) / powers.sum() - ratio**2 + 1 / k**2
             k = max(k - (ratio - 1 / k - logs.mean()) / slope, 0.1)
         refits.append([k, fitted[2] * (data**k).mean() ** (1 / k)])
-    refits = np.array(refits)
-    for name, values in zip(("k", "scale"), refits.T, strict=True):
+    for name, values in zip(("k", "scale"), np.transpose(refits), strict=True):
         got = draws[name].values.ravel()
         yield difference(f"mean of {name}", got.mean(), values.mean(), 0.2 * values.std())
         yield difference(f"sd of {name}", got.std(), values.std(), 0.2 * values.std())
@@ -974,11 +988,14 @@ def cross_validation_of_a_divergence() -> Differences:
     optimum = estimated(lambda a: a, x, metric=prb.KullbackLeibler())
     table = prb.cross_validate(optimum, folds=5)
 
+    h = bandwidth(x)  # of all data; the minimiser does not depend on it
+    grid = np.linspace(x.min() - 8 * h, x.max() + 8 * h, 2001)
+
     def loss(out: Any) -> Any:
         rest = np.delete(x, out)
-        nodes = stats.norm(rest.mean(), rest.std()).ppf((np.arange(4000) + 0.5) / 4000)
-        metric = prb.KullbackLeibler()
-        return [metric(nodes, x[out]), metric(nodes, rest)]
+        p = stats.norm(rest.mean(), np.hypot(rest.std(), h)).pdf(grid)
+        densities = [stats.norm(z, h).pdf(grid[:, None]).mean(axis=1) for z in (x[out], rest)]
+        return [np.trapezoid(q * np.log(q / p), grid) for q in densities]
 
     yield from held_out_pairs(table, loss, 10)
 
@@ -1015,13 +1032,14 @@ def residuals_of_a_line_with_error() -> Differences:
     rng = np.random.default_rng(64)
     y = 1e6 * (rng.normal(2.0, 0.5, 15) * 3 + rng.normal(0, 0.4, 15))
     optimum = estimated(lambda a: 3e6 * a, y, metric=prb.LogLikelihood(error=0.4e6))
-    table = prb.residuals(optimum)["y"]
+    table = prb.residuals(optimum, n_draws=20_000)["y"]
     mu, sigma = optimum.point["mu"], optimum.point["sigma"]
     yield difference("mean", mu, y.mean() / 3e6, 1e-3)
     yield difference("sd", sigma, np.sqrt(y.var() - 0.16e12) / 3e6, 2e-3)
     variance = (3e6 * sigma) ** 2 + 0.4e6**2
     yield difference("CWRES", table.CWRES.values.ravel(), (y - 3e6 * mu) / np.sqrt(variance), 0.05)
-    yield difference("PRED", table.PRED.values.ravel(), 3e6 * mu, 1e4)
+    # five Monte Carlo errors of 20 000 draws
+    yield difference("PRED", table.PRED.values.ravel(), 3e6 * mu, 5 * 3e6 * sigma / 141)
     shrunk = 3e6 * mu + (3e6 * sigma) ** 2 / variance * (y - 3e6 * mu)
     yield difference("IPRED", table.IPRED.values.ravel(), shrunk, 0.05 * 0.4e6)
     yield difference("IWRES", table.IWRES.values.ravel(), (y - shrunk) / 0.4e6, 0.06)
@@ -1043,7 +1061,7 @@ def residuals_of_two_outputs_of_one_input() -> Differences:
             metric=prb.LogLikelihood(error=[0.1, 0.3]),
         )
         optimum = prb.minimize()
-    table = prb.residuals(optimum)["y"]
+    table = prb.residuals(optimum, n_draws=20_000)["y"]
     slope, mu = np.array([1.0, 2.0]), optimum.point["mu"]
     covariance = 0.09 * np.outer(slope, slope) + np.diag([0.01, 0.09])
     squares, is_seen = [], ~np.isnan(y)
@@ -1065,7 +1083,7 @@ def residuals_of_lognormal_inputs_given_a_posterior() -> Differences:
         c = pm.LogNormal.dist(mu, sigma)
         prb.Simulator("y", lambda c: 1e-9 * c**2, c, observed=y)
         idata = prb.sample(random_seed=1)
-    table = prb.residuals(idata, model=model)["y"]
+    table = prb.residuals(idata, model=model, n_draws=4000)["y"]
     grid_mu, grid_sigma, weights = of_normals(logs, 1.0)
     mean = weights @ grid_mu
     # all populations together: the mean variance and the variance of the mean
@@ -1073,3 +1091,394 @@ def residuals_of_lognormal_inputs_given_a_posterior() -> Differences:
     exact = (logs - mean) / np.sqrt(variance)
     yield difference("CWRES", table.CWRES.values.ravel(), exact, 0.06)
     yield difference("IPRED", table.IPRED.values.ravel(), y, 1e-3 * y)
+
+
+def bandwidth(z: Any, factor: float = 1.8, power: float = 0.2) -> float:
+    """Return the kernel's bandwidth of measured values."""
+    quartiles = np.quantile(z, [0.25, 0.75], method="hazen")
+    return float(factor * min(z.std(), np.ptp(quartiles) / 1.34) * z.size**-power)
+
+
+def minimiser(loss: Any, start: Any) -> Any:
+    """Return the minimiser of a loss of a mean and the logarithm of a spread."""
+    found = optimize.minimize(
+        loss, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-12}
+    )
+    return np.array([found.x[0], np.exp(found.x[1])])
+
+
+def by_metric(response: Any, observed: Any, metric: Any, scale: float = 1.0) -> Any:
+    """Return the optimum of a normal population under a metric."""
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 10 * scale), pm.HalfNormal("sigma", 5 * scale)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), metric=metric, observed=observed)
+        return prb.minimize()
+
+
+@problem
+def minima_of_metrics_of_a_line_in_nanounits() -> Differences:
+    x = np.random.default_rng(71).normal(3.0, 1.0, 14)
+    y, h = 1e-9 * x, bandwidth(x)
+    nodes = stats.norm.ppf((np.arange(4000) + 0.5) / 4000)
+
+    def residual(at: Any) -> float:
+        spread = np.sqrt(np.exp(2 * at[1]) + h**2)
+        own = stats.norm(0, np.sqrt(2) * spread).pdf(0)
+        return float(own - 2 * stats.norm(at[0], np.hypot(spread, h)).pdf(x).mean())
+
+    def area(at: Any) -> float:
+        return float(stats.wasserstein_distance(at[0] + np.exp(at[1]) * nodes, x))
+
+    start = [x.mean(), np.log(x.std())]
+    exact = {
+        prb.KullbackLeibler(): np.array([x.mean(), x.std()]),
+        prb.ProbabilityResidual(): minimiser(residual, start),
+        prb.AreaMetric(): minimiser(area, start),
+    }
+    for metric, values in exact.items():
+        optimum = by_metric(lambda a: 1e-9 * a, y, metric)
+        sds = x.std() / np.sqrt([14, 28])
+        got = [optimum.point["mu"], optimum.point["sigma"]]
+        yield difference(type(metric).__name__, got, values, 0.1 * sds)
+
+
+@problem
+def minima_of_metrics_of_a_curve() -> Differences:
+    x = np.random.default_rng(72).normal(0.0, 0.7, 25)
+    y, nodes = np.exp(x), stats.norm.ppf((np.arange(4000) + 0.5) / 4000)
+    h = bandwidth(y)
+    grid = np.linspace(y.min() - 8 * h, y.max() + 12 * h, 601)
+    q = stats.norm(y, h).pdf(grid[:, None]).mean(axis=1)
+
+    def density(at: Any) -> Any:
+        values = np.exp(at[0] + np.exp(at[1]) * nodes[::4])
+        return stats.norm.pdf(grid[:, None], values, h).mean(axis=1)
+
+    def residual(at: Any) -> float:
+        return float(np.trapezoid((density(at) - q) ** 2, grid))
+
+    def divergence(at: Any) -> float:
+        return float(np.trapezoid(q * np.log(q / (density(at) + 1e-12)), grid))
+
+    def area(at: Any) -> float:
+        return float(stats.wasserstein_distance(np.exp(at[0] + np.exp(at[1]) * nodes), y))
+
+    losses = {
+        prb.ProbabilityResidual(): residual,
+        prb.KullbackLeibler(): divergence,
+        prb.AreaMetric(): area,
+    }
+    for metric, loss in losses.items():
+        optimum = by_metric(np.exp, y, metric)
+        values = minimiser(loss, [x.mean(), np.log(x.std())])
+        got = [optimum.point["mu"], optimum.point["sigma"]]
+        allowed = 0.1 * x.std() / np.sqrt([25, 50])
+        yield difference(type(metric).__name__, got, values, allowed)
+
+
+@problem
+def posterior_of_a_divergence_of_few_specimens() -> Differences:
+    # the minimiser is the mean and the standard deviation, which are sufficient
+    x = np.random.default_rng(73).normal(2.0, 0.5, 8)
+    _, _, idata = normal_population(x, lambda a: 1e6 * a, metric=prb.KullbackLeibler())
+    mu, sigma, weights = of_normals(x)
+    yield from moments(idata.posterior, {"mu": mu, "sigma": sigma}, weights)
+
+
+def draws_of_abc(metric: Any, response: Any, y: Any, epsilon: float, n: int = 512) -> Any:
+    """Return draws of the pseudo-posterior of a normal mean with spread .5 and prior N(0, 2)."""
+    with pm.Model():
+        mu = pm.Normal("mu", 0.0, 2.0)
+        prb.Simulator(
+            "y",
+            response,
+            pm.Normal.dist(mu, 0.5),
+            metric=metric,
+            observed=y,
+            epsilon=epsilon,
+            propagation=prb.Reweighted(n),
+        )
+        return prb.sample_smc(1000, adjustment=None, random_seed=1).posterior
+
+
+def of_kernel(loss: Any, epsilon: float, low: float = -3.0, high: float = 5.0) -> Any:
+    """Return a grid and weights of the prior N(0, 2) times exp(-loss / epsilon)."""
+    return on_grid(
+        lambda mu: stats.norm(0, 2).logpdf(mu) - np.array([loss(m) for m in mu]) / epsilon,
+        mu=np.linspace(low, high, 801),
+    )
+
+
+@problem
+def abc_by_an_area_in_millions() -> Differences:
+    x = np.random.default_rng(74).normal(1.0, 0.6, 11)
+    nodes = 0.5 * stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
+    for epsilon in (0.05, 0.5):
+        draws = draws_of_abc(prb.AreaMetric(), lambda a: 1e6 * a, 1e6 * x, 1e6 * epsilon)
+
+        def loss(mu: Any) -> float:
+            return float(stats.wasserstein_distance(mu + nodes, x))
+
+        yield from moments(draws, *of_kernel(loss, epsilon))
+
+
+@problem
+def abc_of_a_fold_by_residuals() -> Differences:
+    x = np.random.default_rng(75).normal(1.2, 0.5, 15)
+    y, nodes = x**2, 0.5 * stats.norm.ppf((np.arange(800) + 0.5) / 800)
+    metric = prb.ProbabilityResidual()
+
+    def loss(mu: Any) -> float:
+        return float(metric((mu + nodes) ** 2, y))
+
+    draws = draws_of_abc(metric, np.square, y, 0.02)
+    grid, weights = of_kernel(loss, 0.02, -4.0, 4.0)
+    yield from moments({"mu": np.abs(draws["mu"])}, {"mu": np.abs(grid["mu"])}, weights)
+    share = float((draws["mu"] > 0).mean())
+    yield difference("share of the positive mode", share, weights[grid["mu"] > 0].sum(), 0.1)
+
+
+@problem
+def abc_by_a_function_of_means() -> Differences:
+    x = np.random.default_rng(76).normal(1.5, 0.5, 6)
+
+    def squared(simulated: Any, observed: Any, weights: Any) -> Any:
+        return ((simulated * weights).sum(axis=-1) - observed.mean()) ** 2
+
+    metric = prb.FunctionMetric(squared, weighted=True)
+    draws = draws_of_abc(metric, np.positive, x, 0.08, 1024)["mu"]
+    precision = 1 / 4 + 2 / 0.08
+    mean, sd = 2 / 0.08 * x.mean() / precision, precision**-0.5
+    yield difference("mean", float(draws.mean()), mean, 0.1 * sd)
+    yield difference("sd", float(draws.std()), sd, 0.1 * sd)
+
+
+@problem
+def function_of_moments_with_refits() -> Differences:
+    x = np.random.default_rng(77).normal(2.0, 0.4, 40)
+
+    def of_moments(simulated: Any, observed: Any, weights: Any) -> Any:
+        mean = (simulated * weights).sum(axis=-1)
+        square = (simulated**2 * weights).sum(axis=-1)
+        deviation = np.sqrt(np.maximum(square - mean**2, 0)) - observed.std()
+        return (mean - observed.mean()) ** 2 + deviation**2
+
+    metric = prb.FunctionMetric(of_moments, weighted=True)
+    optimum = by_metric(np.positive, x, metric)
+    sds = x.std() / np.sqrt([40, 80])
+    got = [optimum.point["mu"], optimum.point["sigma"]]
+    yield difference("minimum", got, [x.mean(), x.std()], 0.1 * sds)
+    got = [optimum.stderr["mu"], optimum.stderr["sigma"]]
+    yield difference("standard errors", got, sds, 0.15 * sds)
+
+
+@problem
+def joint_divergence_of_correlated_outputs() -> Differences:
+    rng = np.random.default_rng(78)
+    covariance = np.array([[0.25, 0.3], [0.3, 1.0]])
+    x = rng.multivariate_normal([1.0, -2.0], covariance, 40)
+    units = np.array([1e6, 1e-9])
+    with pm.Model():
+        mu = pm.Normal("mu", 0.0, 5.0, shape=2)
+        sd = pm.HalfNormal("sd", 2.0, shape=2)
+        rho = pm.Uniform("rho", -1, 1)
+        matrix = pm.math.stack(
+            [sd[0] ** 2, rho * sd[0] * sd[1], rho * sd[0] * sd[1], sd[1] ** 2]
+        ).reshape((2, 2))
+        dist = pm.MvNormal.dist(mu, matrix, shape=2)
+        prb.Simulator(
+            "y",
+            lambda a: a * units,
+            dist,
+            metric=prb.Joint(prb.KullbackLeibler()),
+            observed=x * units,
+        )
+        optimum = prb.minimize()
+    exact = np.cov(x.T, bias=True)
+    sds = np.sqrt(np.diag(exact))
+    rho_exact = exact[0, 1] / sds.prod()
+    yield difference("means", optimum.point["mu"], x.mean(axis=0), 0.1 * sds / np.sqrt(40))
+    yield difference("sds", optimum.point["sd"], sds, 0.1 * sds / np.sqrt(80))
+    error = (1 - rho_exact**2) / np.sqrt(40)
+    yield difference("correlation", optimum.point["rho"], rho_exact, 0.1 * error)
+
+
+@dataclass(frozen=True)
+class SquaredDensities(prb.Metric):
+    """The integral of the squared difference of two densities, without a scale."""
+
+    density: prb.GaussianKDE = field(default_factory=prb.GaussianKDE)
+    minimum: ClassVar[prb.metrics.Minimum] = prb.metrics.Minimum.QUADRATIC
+    additive: ClassVar[bool] = False
+
+    def _prepare(self, observed: Any, weights: Any) -> Any:
+        cells = self.density.cells(observed, weights)
+        return SquaredDifference.on_cells(self, observed, weights, cells)
+
+
+class SquaredDifference(prb.metrics.DensityDiscrepancy):
+    """The integral against fixed observed values."""
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        return (xp.square(features[0] - self.density) * self.cells.widths).sum(axis=-1)
+
+
+@problem
+def metric_of_ones_own_with_a_quadratic_minimum() -> Differences:
+    x = np.random.default_rng(79).normal(0.5, 0.5, 30)
+    own = by_metric(np.exp, np.exp(x), SquaredDensities())
+    built_in = by_metric(np.exp, np.exp(x), prb.ProbabilityResidual())
+    for name in ("mu", "sigma"):
+        sd = built_in.stderr[name]
+        yield difference(f"estimate of {name}", own.point[name], built_in.point[name], 0.02 * sd)
+        yield difference(f"standard error of {name}", own.stderr[name], sd, 0.15 * sd)
+
+
+def calibrated_ranks(metric: Any, response: Any, n: int) -> Any:
+    """Return ranks of a normal mean with the prior N(1, 2) of 8 specimens with the spread 1."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.0, 2.0), 1.0)
+        arguments = {} if metric is None else {"metric": metric}
+        observed = response(np.linspace(0.0, 2.0, 8))
+        prb.Simulator("y", response, x, observed=observed, **arguments)
+    return prb.simulation_based_calibration(n, model=model, draws=400, random_seed=1)
+
+
+def rank_differences(ranks: Any, name: str, sd: float, n: int) -> Differences:
+    """Yield differences of ranks from uniform ones, and of standard deviations."""
+    values = ranks.prior_sbc[name].values.ravel()
+    yield difference("mean rank", values.mean(), 0.5, 3.5 * np.sqrt(1 / 12 / n))
+    yield difference("variance of ranks", values.var(), 1 / 12, 3.5 * np.sqrt(1 / 180 / n))
+    yield difference("posterior sds", ranks.posterior_sd[name].values, sd, 0.25 * sd)
+
+
+@problem
+def ranks_of_a_likelihood() -> Differences:
+    ranks = calibrated_ranks(None, np.sinh, 40)
+    yield from rank_differences(ranks, "mu", (8 + 1 / 4) ** -0.5, 40)
+    truth = ranks.truth["mu"].values
+    yield difference("truths", truth.mean(), 1.0, 3.5 * 2 / np.sqrt(40))
+
+
+@problem
+def ranks_of_a_divergence() -> Differences:
+    ranks = calibrated_ranks(prb.KullbackLeibler(), lambda x: 1e-9 * x, 25)
+    yield from rank_differences(ranks, "mu", (8 + 1 / 4) ** -0.5, 25)
+
+
+@problem
+def ranks_of_a_gamma_population_with_labels() -> Differences:
+    rng = np.random.default_rng(80)
+    with pm.Model() as model:
+        rate = pm.Gamma("rate", 5.0, 5.0)
+        load = pm.Gamma.dist(3.0, rate)
+        labels, loads = [f"specimen {i}" for i in range(10)], rng.gamma(3.0, 1.0, 10)
+        for name, response in (("y", np.sqrt), ("z", np.log)):
+            # an error makes two readings of a specimen possible
+            prb.Simulator(
+                name,
+                response,
+                load,
+                observed=response(loads),
+                specimens=labels,
+                metric=prb.LogLikelihood(error=1e-3),
+            )
+    ranks = prb.simulation_based_calibration(20, model=model, draws=400, random_seed=1)
+    # the posterior is a gamma distribution with shape 5 + 30, whose mean is near the truth
+    truth = ranks.truth["rate"].values.ravel()
+    values = ranks.prior_sbc["rate"].values.ravel()
+    yield difference("mean rank", values.mean(), 0.5, 3.5 * np.sqrt(1 / 12 / 20))
+    shares = ranks.posterior_sd["rate"].values.ravel() / truth
+    # of 35 / (5 + sum) with the sum gamma (30): a mean of about sqrt(35) (1 +- .2) / 35
+    yield difference("relative sd", shares.mean(), 35**-0.5, 0.2 * 35**-0.5)
+
+
+@problem
+def proposed_runs_beyond_a_table() -> Differences:
+    x = np.random.default_rng(81).normal(2.4, 0.1, 20)
+    table = np.linspace(1.0, 2.0, 12)
+    for turn in range(4):
+        with pm.Model() as model:
+            mu, sigma = pm.Normal("mu", 2.0, 1.0), pm.HalfNormal("sigma", 0.5)
+            dist = pm.Normal.dist(mu, sigma, name="x")
+            prb.Simulator("y", prb.Runs({"x": table}, 1e6 * table**2), dist, observed=1e6 * x**2)
+        if table.max() > x.max() + 0.1 and turn > 1:
+            break
+        added = prb.propose_runs(model)["x"].to_numpy()
+        yield difference(
+            "distance of proposals", max(added.max() - 3.5, 1.0 - added.min(), 0), 0, 1
+        )
+        table = np.unique(np.concatenate([table, added]))
+    idata = prb.sample(model=model, random_seed=1)
+
+    def log_posterior(mu: Any, sigma: Any) -> Any:
+        logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(x).sum(axis=1)
+        return logs + stats.norm(2, 1).logpdf(mu) + stats.halfnorm(scale=0.5).logpdf(sigma)
+
+    grid, weights = on_grid(
+        log_posterior, mu=np.linspace(2.2, 2.6, 301), sigma=np.linspace(0.04, 0.3, 301)
+    )
+    yield from moments(idata.posterior, grid, weights)
+
+
+@problem
+def proposed_runs_of_two_inputs_in_odd_units() -> Differences:
+    rng = np.random.default_rng(82)
+    a, b = 1e6 * rng.normal(3.0, 0.3, 15), 1e-9 * rng.normal(2.0, 0.2, 15)
+
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([a * b * 1e3, np.log(a) - 1e9 * b / 3], axis=-1)
+
+    runs = np.stack([1e6 * rng.uniform(1, 3, 40), 1e-9 * rng.uniform(1, 2, 40)], axis=1)
+    for turn in range(3):
+        with pm.Model() as model:
+            inputs = (
+                pm.Normal.dist(pm.Normal("mu_a", 2e6, 1e6), 0.3e6, name="a"),
+                pm.Normal.dist(pm.Normal("mu_b", 1.5e-9, 1e-9), 0.2e-9, name="b"),
+            )
+            columns = {"a": runs[:, 0], "b": runs[:, 1]}
+            table = prb.Runs(columns, response(*runs.T))
+            prb.Simulator("y", table, *inputs, observed=response(a, b))
+        if turn < 2:
+            runs = np.concatenate([runs, prb.propose_runs(model, n=25)[["a", "b"]].to_numpy()])
+    idata = prb.sample(model=model, random_seed=1)
+    for name, x, prior, known in (
+        ("mu_a", a, (2e6, 1e6), 0.3e6),
+        ("mu_b", b, (1.5e-9, 1e-9), 2e-10),
+    ):
+        precision = 15 / known**2 + prior[1] ** -2
+        mean = (x.sum() / known**2 + prior[0] / prior[1] ** 2) / precision
+        draws = idata.posterior[name].values
+        sd = precision**-0.5
+        yield difference(f"mean of {name}", draws.mean(), mean, 0.1 * sd)
+        yield difference(f"sd of {name}", draws.std(), sd, 0.1 * sd)
+
+
+@problem
+def refined_design_under_a_vague_prior() -> Differences:
+    x = np.random.default_rng(83).normal(30.0, 0.5, 20)
+    response = Counted()
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 20.0), pm.HalfNormal("sigma", 5.0)
+        prb.Simulator(
+            "y",
+            response,
+            pm.Normal.dist(mu, sigma),
+            0.0,
+            metric=prb.AreaMetric(),
+            observed=1e6 * np.exp(x),
+            propagation=prb.Reweighted(256),
+        )
+        sizes = prb.refine(model)
+        optimum = prb.minimize()
+    yield difference("runs", response.count, sizes["y"], 64)
+    nodes = stats.norm.ppf((np.arange(4000) + 0.5) / 4000)
+
+    def area(at: Any) -> float:
+        return float(
+            stats.wasserstein_distance(np.exp(at[0] + np.exp(at[1]) * nodes - 30), np.exp(x - 30))
+        )
+
+    exact = minimiser(area, [x.mean(), np.log(x.std())])
+    got = [optimum.point["mu"], optimum.point["sigma"]]
+    yield difference("optimum", got, exact, 0.1 * x.std() / np.sqrt([20, 40]))
