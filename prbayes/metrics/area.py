@@ -219,7 +219,7 @@ class _Integral:
         """Integrate S_N, known at the knots."""
         starts = np.searchsorted(below, np.arange(order.size) + 1)
         edges = np.concatenate([[0], starts, [lengths.size]])
-        observed = _without_rounding(observed)
+        observed = without_rounding(observed)
         positions, integral, complement = (
             np.concatenate([[0.0], np.cumsum(heights * lengths)])
             for heights in (1.0, observed, 1.0 - observed)
@@ -228,7 +228,7 @@ class _Integral:
 
     def areas(self, weights: Floats, correction: Floats) -> Floats:
         """Return the areas for weights of the simulated values, (..., n) -> (...)."""
-        simulated = _without_rounding(cumulated(weights, self.order))
+        simulated = without_rounding(cumulated(weights, self.order))
         first = self.edges[:-1]
         last = self.edges[1:]
         crossing = np.searchsorted(self.observed, simulated).clip(first, last)
@@ -332,7 +332,7 @@ def _is_equal(simulated: Any, observed: Any, xp: Any = np) -> Any:
     return xp.abs(simulated - observed) < 1e-13
 
 
-def _without_rounding(levels: Floats) -> Floats:
+def without_rounding(levels: Floats) -> Floats:
     """Return sums of weights with exact ones in place of sums that are one but for rounding."""
     return np.where(_is_equal(levels, 1.0), 1.0, levels)
 
