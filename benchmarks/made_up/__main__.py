@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.made_up import PROBLEMS
 from benchmarks.study import Study
 
-MODULES = ("likelihood", "readings", "populations")
+MODULES = ("likelihood", "readings", "populations", "decisions")
 for module in MODULES:
     import_module(f"benchmarks.made_up.{module}")
 

@@ -35,6 +35,7 @@ from prbayes.decision.populations import (
     NestedPopulations,
     Populations,
     ResponseSample,
+    emulator_findings,
     left_out_findings,
     output_column,
     probability_bounds,
@@ -368,6 +369,7 @@ class _Estimate:
     runs: int = 0  # number of stored responses behind the probabilities
     points: int = 0  # number of points near the limit
     lost: float = 0.0  # share of the populations without response
+    findings: Findings = ()  # of the emulator
 
     @property
     def mean(self) -> float:
@@ -436,7 +438,10 @@ class _Question:
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
         n_runs = sample.design.n_runs
-        return _Estimate(by_draw, float(error), count, source, n_runs, lost=sample.lost)
+        findings = emulator_findings(sample)
+        return _Estimate(
+            by_draw, float(error), count, source, n_runs, lost=sample.lost, findings=findings
+        )
 
     def over_intervals(
         self, settings: _Settings
@@ -557,6 +562,7 @@ def _error_findings(
             f"{worst.error:.2g}; pass {more} responses where the limit is exceeded."
         )
         findings.append(Finding("rough-probability", text))
+    findings += next((list(x.findings) for x in estimates if x.findings), [])
     lost = max(estimate.lost for estimate in estimates)
     answer = (
         "the probability is that of the others, and the upper end of the interval counts all of "

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Table, View, percentage
-from prbayes._finding import as_json, sentences_of
+from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
 from prbayes._validate import Floats, Function, StrPath, positive_integer, share
 from prbayes.decision.populations import (
@@ -19,6 +19,7 @@ from prbayes.decision.populations import (
     Populations,
     ResponseSample,
     answers_by_family,
+    emulator_findings,
     left_out_findings,
     probability_bounds,
     share_error,
@@ -151,6 +152,7 @@ def p_box(
     lost = max(sample.lost for sample in samples)
     answer = "the mean is that of the others, and the bands contain them at either end"
     findings = findings_of(response) + left_out_findings(name, lost, answer)
+    findings += report(*emulator_findings(samples[0]))
 
     def tails(sample: ResponseSample) -> str:
         populations = sample.populations

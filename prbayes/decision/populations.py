@@ -40,6 +40,7 @@ from prbayes.model.emulated import (
     EmulatedSample,
     EmulatedSimulator,
     PopulationSimulator,
+    emulator_error,
     replaced_inputs,
 )
 from prbayes.model.evaluator import Evaluator, read_inputs_of_copy
@@ -65,6 +66,7 @@ from prbayes.results.predict import (
     named_response,
     provenance,
     refuse_unsupported,
+    rough_emulator,
     serving,
     thetas_of,
 )
@@ -386,6 +388,22 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
     return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
 
+def emulator_findings(sample: ResponseSample) -> Findings:
+    """Return a finding if the emulator of a response has a large error beside its spread."""
+    if not isinstance(sample.design, EmulatedSample):
+        return ()
+    weights = sample.mean_weights() * np.isfinite(sample.values)
+    values = np.where(weights > 0, sample.values, 0.0)
+    mean = weights @ values / weights.sum()
+    spread = np.sqrt(weights @ (values - mean) ** 2 / weights.sum())
+    error = np.atleast_1d(sample.select(emulator_error(sample.design, sample.responses)))
+    remedy = (
+        "compute the answer from prb.predict with stored=False, or a probability from "
+        "prb.exceedance with n_points=1000, which call the response at new specimens"
+    )
+    return rough_emulator(sample.responses.name, error, np.atleast_1d(spread), remedy)
+
+
 def left_out_findings(name: str, lost: float, answer: str) -> Findings:
     """Report a share of specimens without response, and what the ``answer`` says of them."""
     if lost < SMALLEST_SHARE:
@@ -408,6 +426,7 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     findings = findings_of(quantity.response)
     others = "the quantity is that of the others"
     findings += left_out_findings(repr(quantity), sample.lost, others)
+    findings += report(*emulator_findings(sample))
     if quantity.needs_finite and np.isposinf(sample.values[-1]):
         raise ValueError(
             f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "
@@ -426,7 +445,10 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
         at, side = np.nextafter(value, np.inf), "on its other side"
         share = float(sample.mean_weights() @ (1 - quantity.of_specimen(sample.values, at)))
     error = float(share_error(sample, lambda values: quantity.of_specimen(values, at)))
-    advice = "pass more responses to the propagation, or ask for a less rare quantity"
+    more = "pass more responses to the propagation"
+    if not sample.design.has_runs:
+        more = "compute it from prb.predict with stored=False"
+    advice = f"{more}, or ask for a less rare quantity"
     if share == 0:
         raise ValueError(
             f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "

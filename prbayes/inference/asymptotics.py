@@ -25,7 +25,7 @@ from prbayes.inference.resampling import (
     simulated_sets,
     thinned,
 )
-from prbayes.metrics.area import bias_and_density
+from prbayes.metrics.area import bias_and_density, without_rounding
 from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
@@ -284,6 +284,7 @@ class Information:
                 values = values[0]
             simulated = distribution_function(values, weights, knots, kind="quicksort")
             measured = distribution_function(part_observed, w, knots, kind="quicksort")
+            simulated, measured = without_rounding(simulated), without_rounding(measured)
             gaps = simulated[0] - measured
             derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
             # Distribution functions are constant between knots, with the value at the left knot.

@@ -96,10 +96,8 @@ class AreaDiscrepancy(Discrepancy):
         del order  # frees memory, for populations of ten million
         # The last interval begins at the largest value and has no end.
         gap = xp.cumsum(steps, axis=-1)[..., :-1]
-        heights = xp.abs(gap)
-        if self.specimens:
-            below = xp.cumsum(xp.maximum(steps, 0.0), axis=-1)[..., :-1]
-            heights = _heights(below, below - gap, correction_table(self.specimens), xp)
+        below = xp.cumsum(xp.maximum(steps, 0.0), axis=-1)[..., :-1] if self.specimens else gap
+        heights = _heights(below, below - gap, correction_table(self.specimens), xp)
         # Intervals that end at infinity are left out: their length is set to zero.
         is_finite = xp.abs(pooled[..., 1:]) < np.inf
         upper = xp.where(is_finite, pooled[..., 1:], 0.0)
@@ -208,6 +206,7 @@ class _Integral:
     observed: Floats  # S_N at the knots, (m,)
     positions: Floats  # distances of the knots from the first one, (m + 1,)
     integral: Floats  # integral of S_N up to each knot, (m + 1,)
+    complement: Floats  # integral of 1 - S_N up to each knot, (m + 1,)
 
     @classmethod
     def of(
@@ -220,28 +219,35 @@ class _Integral:
         """Integrate S_N, known at the knots."""
         starts = np.searchsorted(below, np.arange(order.size) + 1)
         edges = np.concatenate([[0], starts, [lengths.size]])
-        positions, integral = (
-            np.concatenate([[0.0], np.cumsum(steps)]) for steps in (lengths, observed * lengths)
+        observed = without_rounding(observed)
+        positions, integral, complement = (
+            np.concatenate([[0.0], np.cumsum(heights * lengths)])
+            for heights in (1.0, observed, 1.0 - observed)
         )
-        return cls(order, edges, observed, positions, integral)
+        return cls(order, edges, observed, positions, integral, complement)
 
     def areas(self, weights: Floats, correction: Floats) -> Floats:
         """Return the areas for weights of the simulated values, (..., n) -> (...)."""
-        simulated = cumulated(weights, self.order)
+        simulated = without_rounding(cumulated(weights, self.order))
         first = self.edges[:-1]
         last = self.edges[1:]
         crossing = np.searchsorted(self.observed, simulated).clip(first, last)
-        below, above = (
-            simulated * (self.positions[end] - self.positions[start])
-            - (self.integral[end] - self.integral[start])
-            for start, end in ((first, crossing), (crossing, last))
-        )
+        below = self._area(simulated, first, crossing)
+        above = self._area(simulated, crossing, last)
         areas = np.asarray((below - above).sum(axis=-1))
         if correction.any():
             widths = self.positions[last] - self.positions[first]
             areas += interpolated(correction, self.observed) @ np.diff(self.positions)
             areas -= (interpolated(correction, simulated) * widths).sum(axis=-1)
         return areas
+
+    def _area(self, simulated: Floats, start: Indices, end: Indices) -> Floats:
+        """Return the integrals of F - S_N between knots, where F is constant."""
+        width = self.positions[end] - self.positions[start]
+        direct = simulated * width - (self.integral[end] - self.integral[start])
+        # In the upper half the integral of 1 - S_N has the smaller rounding error.
+        by_complement = self.complement[end] - self.complement[start] - (1 - simulated) * width
+        return np.where(simulated > 0.5, by_complement, direct)
 
 
 def with_unbiased_areas(target: Discrepancy) -> Discrepancy:
@@ -316,7 +322,19 @@ def _heights(simulated: Any, observed: Any, tables: Floats, xp: Any) -> Any:
     heights = xp.abs(simulated - observed)
     if tables.any():
         heights = heights + interpolated(tables, observed, xp) - interpolated(tables, simulated, xp)
-    return heights
+    # Otherwise the intervals between responses far beyond the data, as of an exponential function,
+    # have an area by rounding.
+    return xp.where(_is_equal(simulated, observed, xp), 0.0, heights)
+
+
+def _is_equal(simulated: Any, observed: Any, xp: Any = np) -> Any:
+    """Return whether sums of weights are equal but for rounding."""
+    return xp.abs(simulated - observed) < 1e-13
+
+
+def without_rounding(levels: Floats) -> Floats:
+    """Return sums of weights with exact ones in place of sums that are one but for rounding."""
+    return np.where(_is_equal(levels, 1.0), 1.0, levels)
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

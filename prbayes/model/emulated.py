@@ -441,6 +441,12 @@ class EmulatedSample:
             )
 
 
+def emulator_error(sample: EmulatedSample, responses: Responses) -> Floats:
+    """Return the cross-validation error of the emulator of a response, () or (m,)."""
+    emulator = sample._emulator(responses)
+    return emulator.error.reshape(emulator.event)
+
+
 def _population_log_densities(
     inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
 ) -> Floats:

@@ -233,7 +233,8 @@ def predict(
     rng = np.random.default_rng(seed)
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
-    missing = _check_responses(label, drawn, max_lost, _remedy(response, responses))
+    missing, findings = _checked_responses(label, drawn, max_lost, _remedy(response, responses))
+    findings += _prediction_findings(responses, drawn, result, model)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -244,7 +245,7 @@ def predict(
         **_left_out(sources, response, drawn.values),
         "specimens_id": array_digest(*drawn.specimens),
         "random_seed": str(seed),
-        "findings": as_json(_prediction_findings(responses, drawn, result, model)),
+        "findings": as_json(findings),
         **_calibration_attributes(result, model),
         **provenance(result, model),
     }
@@ -616,8 +617,10 @@ def _remedy(response: Any, responses: Responses) -> str:
     return f"the runs have {', '.join(parts)}: add runs at the inputs of the prediction"
 
 
-def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
-    """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
+def _checked_responses(
+    label: str, drawn: _Predicted, max_lost: float, remedy: str
+) -> tuple[int, Findings]:
+    """Return the number of NaN, and findings on them and on the emulator; raise if it is large."""
     values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
     missing = int(is_nan.sum())
@@ -633,9 +636,10 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
             f"only the specimens that have a response; {remedy}, return +inf for specimens that "
             "fail, or pass a larger max_lost"
         )
+    findings: Findings = ()
     if missing:
         text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN; {remedy}."
-        report(Finding("missing-predictions", text))
+        findings = report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)
         is_finite = np.isfinite(flat).all(axis=1)
@@ -645,15 +649,21 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str
             low, high = np.quantile(flat[is_finite], [0.25, 0.75], axis=0)
             spread = flat[is_finite].std(axis=0)
             spread = np.where(high > low, np.minimum(spread, (high - low) / 1.349), spread)
-        share = float(np.max(error / positive_scale(spread, np.inf)))
-        if share > 0.05:
-            text = (
-                f"{label}: the interpolant between runs has an error of {share:.0%} of the "
-                "standard deviation of the predicted responses; pass stored=False, which computes "
-                "the response at new specimens."
-            )
-            report(Finding("rough-prediction", text, "likelihood_findings.md#predictions"))
-    return missing
+        advice = "pass stored=False, which computes the response at new specimens"
+        findings += report(*rough_emulator(label, error, spread, advice))
+    return missing, findings
+
+
+def rough_emulator(name: str, error: Floats, spread: Floats, remedy: str) -> Findings:
+    """Return a finding if an emulator has a large error beside the spread of responses, (m,)."""
+    share = float(np.max(error / positive_scale(spread, np.inf)))
+    if not share > 0.05:
+        return ()
+    text = (
+        f"{name}: the interpolant between runs has an error of {share:.0%} of the standard "
+        f"deviation of the predicted responses; {remedy}."
+    )
+    return (Finding("rough-prediction", text, "likelihood_findings.md#predictions"),)
 
 
 def known_outputs(
@@ -738,7 +748,7 @@ def _resampled_responses(
 def refuse_unsupported(name: str, design: ReweightedBound, parents: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
     support = design.support(parents)
-    # The lost mass is not checked here, because `_check_responses` reports the share of NaN.
+    # The lost mass is not checked here, because `_checked_responses` reports the share of NaN.
     if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         return
     ess = np.median(support["weight_ess"])

@@ -365,7 +365,8 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
     left_out = left_out[np.isfinite(left_out).all(axis=1)]
     if not len(left_out):
         return error
-    improved = 2 * np.sqrt((left_out**2).mean(axis=0))
+    with np.errstate(over="ignore"):  # An infinite error improves nothing.
+        improved = 2 * np.sqrt((left_out**2).mean(axis=0))
     floor = data.options.floor * data.readings.spread()
     return np.asarray(np.maximum(np.minimum(error, improved), floor))
 
@@ -390,6 +391,9 @@ def _compared(
     misfit = np.zeros((len(z), emulation.y.shape[1]))
     outputs = run(z[is_new]) if is_new.any() else misfit[:0]
     misfit[is_new] = outputs - emulation.surface.values(z[is_new])
+    # Squares of larger numbers overflow, for example where a response is an exponential function.
+    finite = np.isfinite(misfit)
+    misfit[finite] = np.clip(misfit[finite], -1e100, 1e100)
     return emulation.with_runs(z[is_new], outputs), misfit, is_new
 
 

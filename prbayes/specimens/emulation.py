@@ -278,7 +278,8 @@ def near_readings(y: Floats, readings: Readings) -> Bools:
     margin = np.maximum((high - low) / 2, spread)
     is_near = ((y >= low - margin) & (y <= high + margin)).all(axis=1)
     if is_near.sum() < len(y) // 4:
-        distance = (((y - center) / spread) ** 2).sum(axis=1)
+        with np.errstate(over="ignore"):  # An infinite distance is the largest.
+            distance = (((y - center) / spread) ** 2).sum(axis=1)
         is_near = np.zeros(len(y), dtype=bool)
         is_near[np.argsort(distance, kind="stable")[: max(8, len(y) // 4)]] = True
     return is_near

@@ -206,6 +206,29 @@ def test_a_limit_beyond_the_range_of_the_runs_is_not_decided() -> None:
     assert (np.quantile(by_draw, 0.945) > 0.003, table.attrs["verdict"]) == (True, "not decided")
 
 
+def test_a_response_that_the_emulator_does_not_follow_is_reported() -> None:
+    model, x, result = narrow_prior()
+
+    def waves(x: Any) -> Any:
+        return np.sin(20 * x)
+
+    quantity = prb.decision.Quantile(waves, x, probability=0.1)
+    tables = [
+        prb.predict(result, waves, x, model=model, n_draws=50, n_samples=200),
+        prb.exceedance(result, waves, 0.5, x, model=model),
+        prb.decision.p_box(result, waves, x, model=model),
+        prb.decision.evaluate(result, quantity, model=model),
+    ]
+    for table in tables:
+        findings = from_json(table.attrs["findings"])
+        assert "rough-prediction" in [finding.code for finding in findings]
+        # More responses to the propagation would not improve an emulator.
+        assert not any("to the propagation" in finding.text for finding in findings)
+    computed = prb.exceedance(result, waves, 0.5, x, model=model, n_points=1000)
+    codes = [finding.code for finding in from_json(computed.attrs["findings"])]
+    assert "rough-prediction" not in codes
+
+
 @pytest.mark.long
 def test_quantiles_beyond_the_range_of_the_runs_are_reported() -> None:
     model, x, result = narrow_prior()

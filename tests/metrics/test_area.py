@@ -50,6 +50,21 @@ def test_many_observed_values_give_the_same_area(digits: int) -> None:
         np.testing.assert_allclose(stored, corrected.of(values, weights), rtol=1e-11)
 
 
+def test_responses_far_beyond_the_data_without_weight_have_no_area() -> None:
+    # The last intervals are 1e20 long, so that heights of 1e-16 by rounding would dominate.
+    rng = np.random.default_rng(7)
+    x = np.append(rng.normal(size=40), [1e15, 1e20])
+    weights = np.append(rng.dirichlet(np.ones(40), 5), np.zeros((5, 2)), axis=1)
+    for size in (25, 2000):
+        target = AreaMetric().against(rng.normal(size=size))
+        for d in (target, with_unbiased_areas(target)):
+            expected = d.of(np.broadcast_to(x[:40], (5, 40)), weights[:, :40])
+            got = d.of(np.broadcast_to(x, (5, 42)), weights)
+            np.testing.assert_allclose(got, expected, rtol=1e-11)
+            stored = d.outer(*d.basis(x).features(weights), xp=np)
+            np.testing.assert_allclose(stored, expected, rtol=1e-7)
+
+
 def test_failed_specimens_count_below_and_their_infinite_interval_is_left_out() -> None:
     # F: 1/4 from 0, 1/2 from 2; S: 1/2 from 1, 1 from 3.
     # |F - S|: 1/4 on (0, 1), 1/4 on (1, 2), 0, then none.

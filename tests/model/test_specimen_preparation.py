@@ -166,6 +166,17 @@ def test_specimens_that_no_population_reaches() -> None:
         populations.posterior(*points_at(populations, X + 10))
 
 
+def test_a_response_whose_squares_overflow_under_a_vague_prior_is_refused() -> None:
+    y = np.random.default_rng(52).lognormal(1.0, 0.7, 40)
+    with pm.Model():
+        mu, sigma = pm.Normal("mu", 0.0, 100.0), pm.HalfNormal("sigma", 10.0)
+        prb.Simulator("y", np.exp, pm.Normal.dist(mu, sigma), observed=y)
+        with pytest.raises(
+            prb.propagation.DesignError, match=r"not smooth enough.*narrow the priors"
+        ):
+            prb.minimize(progressbar=False)
+
+
 def test_a_model_that_is_gone() -> None:
     model: Any = normal_model()
     populations = populations_of(model)

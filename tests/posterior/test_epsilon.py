@@ -220,3 +220,17 @@ def test_set_epsilon_scales_the_log_density() -> None:
         log_likelihood = evaluation.log_likelihood(epsilons(evaluator))
         np.testing.assert_allclose(log_likelihood, expected, rtol=1e-12)
     assert evaluation.discrepancies[0, 0] > evaluation.discrepancies[1, 0] > 0
+
+
+def test_responses_far_beyond_the_data_do_not_change_an_epsilon_of_areas() -> None:
+    # Under the wide prior responses reach 1e17, so that rounding errors of weights would count.
+    x = np.random.default_rng(72).normal(0.0, 0.7, 25)
+    epsilons = []
+    for width in (1.0, 10.0):
+        with pm.Model():
+            mu, sigma = pm.Normal("mu", 0.0, width), pm.HalfNormal("sigma", width / 2)
+            inputs = pm.Normal.dist(mu, sigma)
+            prb.Simulator("y", np.exp, inputs, metric=prb.AreaMetric(), observed=np.exp(x))
+            optimum = prb.minimize(starts=0, progressbar=False)
+        epsilons.append(prb.calibrate_epsilon(optimum)["y"])
+    assert epsilons[1] == pytest.approx(epsilons[0], rel=0.1)
