@@ -243,7 +243,8 @@ def sequential_design(
             is_good = emulation.bias <= 1.5 * data.options.bias
             if is_good and emulation.surface is not before:
                 # The audit's runs changed the surface, so that another population may be likely.
-                earlier = plausible
+                likely, earlier = Likely.of(data, emulation, population, batches), plausible
+                emulation = without_spurious_modes(run, data, emulation, likely)
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
             if is_good and is_rough(data, emulation):
@@ -625,7 +626,11 @@ def without_spurious_modes(
         modes = proposals.modes
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
         deviation = np.sqrt(emulation.surface.variance(z))
-        doubtful = z[(deviation > largest).any(axis=1)]
+        # Farther from the runs than the population is wide, the deviation may be far too small.
+        near = np.min([(((z - at) / scale) ** 2).sum(axis=1) for at in emulation.z], axis=0)
+        cost = modes.misfit + (modes.a**2).sum(axis=1) / 2
+        is_other = ~np.isin(np.arange(len(z)), best_rows(modes.specimen, cost))
+        doubtful = z[(deviation > largest).any(axis=1) | (is_other & (near > z.shape[1]))]
         if not len(doubtful):
             return emulation
         runs = farthest(emulation.z, doubtful, min(4, len(doubtful)), scale)
