@@ -618,6 +618,8 @@ def without_spurious_modes(
     # With an unknown error the prior's largest would leave all inputs open.
     if proposals.is_open(likely_scale(data, likely.points, emulation.error)):
         return emulation
+    # The points have modes in such a population.
+    proposals = fit_proposals(data, emulation, wider(likely.population))
     spread = data.readings.spread()
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)

@@ -261,7 +261,8 @@ def fit_surface(
         surface = CompressedSurface(emulator, center, unit)
         errors = yg - surface.expanded(compressed - surface.surface.left_out)
         fits.append((surface, errors))
-    surface, errors = min(fits, key=lambda fit: float(((fit[1] / spread)[inside] ** 2).sum()))
+    with np.errstate(over="ignore"):
+        surface, errors = min(fits, key=lambda fit: float(((fit[1] / spread)[inside] ** 2).sum()))
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = errors[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near
