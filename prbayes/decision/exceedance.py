@@ -35,10 +35,10 @@ from prbayes.decision.populations import (
     NestedPopulations,
     Populations,
     ResponseSample,
-    emulator_findings,
     left_out_findings,
     output_column,
     probability_bounds,
+    rough_sample,
     share_error,
 )
 from prbayes.decision.quantities import (
@@ -438,7 +438,7 @@ class _Question:
         kind = "stored" if sample.design.has_runs else "emulated"
         source = f"{kind} responses of {self.populations.evaluator.simulators[sample.k].name}"
         n_runs = sample.design.n_runs
-        findings = emulator_findings(sample)
+        findings = rough_sample(sample)
         return _Estimate(
             by_draw, float(error), count, source, n_runs, lost=sample.lost, findings=findings
         )

@@ -19,9 +19,9 @@ from prbayes.decision.populations import (
     Populations,
     ResponseSample,
     answers_by_family,
-    emulator_findings,
     left_out_findings,
     probability_bounds,
+    rough_sample,
     share_error,
 )
 from prbayes.decision.quantities import extreme_places, interval_grid
@@ -152,7 +152,7 @@ def p_box(
     lost = max(sample.lost for sample in samples)
     answer = "the mean is that of the others, and the bands contain them at either end"
     findings = findings_of(response) + left_out_findings(name, lost, answer)
-    findings += report(*emulator_findings(samples[0]))
+    findings += report(*rough_sample(samples[0]))
 
     def tails(sample: ResponseSample) -> str:
         populations = sample.populations

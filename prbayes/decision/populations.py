@@ -388,7 +388,7 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
     return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
 
 
-def emulator_findings(sample: ResponseSample) -> Findings:
+def rough_sample(sample: ResponseSample) -> Findings:
     """Return a finding if the emulator of a response has a large error beside its spread."""
     if not isinstance(sample.design, EmulatedSample):
         return ()
@@ -426,7 +426,7 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     findings = findings_of(quantity.response)
     others = "the quantity is that of the others"
     findings += left_out_findings(repr(quantity), sample.lost, others)
-    findings += report(*emulator_findings(sample))
+    findings += report(*rough_sample(sample))
     if quantity.needs_finite and np.isposinf(sample.values[-1]):
         raise ValueError(
             f"{caller}: {quantity!r}: got specimens that failed (+inf), expected finite "

@@ -478,7 +478,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *coverage_findings(likelihood, data, points, draws.specimens()),
         *_end_findings(runs, data, emulation, points, proposals, draws),
         *_root_findings(data, proposals),
-        *_flat_findings(data, proposals, normal_of(draws.specimens()[:, data.free])),
+        *flat_findings(data, proposals, normal_of(draws.specimens()[:, data.free])),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
 
@@ -509,7 +509,7 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
 
 
-def _flat_findings(
+def flat_findings(
     data: SpecimenData, proposals: Proposals, population: Normal, largest: float = 0.1
 ) -> list[Finding]:
     """Report an exact reading that hardly tells the input, because the emulator has an error."""
@@ -572,13 +572,16 @@ def _end_findings(
     like gross errors do not count.
     """
     likelihood, coordinates = runs.likelihood, runs.likelihood.coordinates
-    weights = likely_weights(data, points, normal_of(draws.specimens()[:, data.free]))
-    z = points.z[np.arange(len(weights)), weights.argmax(axis=1)]
+    population = normal_of(draws.specimens()[:, data.free])
+    weights = likely_weights(data, points, population)
+    likeliest = weights.argmax(axis=1)
+    z = points.z[np.arange(len(weights)), likeliest]
     # Inputs at an end are moved inside, because slopes and densities are not defined there.
     z = np.clip(z, coordinates.ends[0] + 1e-12, coordinates.ends[1] - 1e-12)
     is_log = coordinates.is_log & ~coordinates.is_condition
     scale = np.where(is_log, 1 / coordinates.half_width, np.inf)
-    distance = np.minimum(np.min(np.abs(coordinates.ends[:, None] - z), axis=0), scale)
+    to_ends = np.abs(coordinates.ends[:, None] - z)
+    distance = np.minimum(to_ends.min(axis=0), scale)
     ended = [k for k in data.free if np.isfinite(distance[:, k]).all()]
     if not ended:
         return []
@@ -586,21 +589,26 @@ def _end_findings(
     # error.
     _, jacobian = emulation(z)
     jacobian[:, :, ended] = secants(emulation.values, z, distance, ended)
-    at_end = shares_of_distance(data, emulation.error, z, jacobian, scale).max(axis=1) >= 0.9
+    shares = shares_of_distance(data, emulation.error, z, jacobian, scale)
+    at_end = shares.max(axis=1) >= 0.9
     error = np.tile(emulation.error, (len(z), 1))
     rows = low_outliers(z, is_log)
     if rows.size and not (likelihood.has_table or likelihood.calls_response):
-        by_readings = 3 * data.readings.comparison_sd(0 * emulation.error)[rows]
-        misfit = np.abs(runs(z[rows]) - data.readings.values[rows])
+        without_error = np.zeros_like(emulation.error)
+        by_readings = 3 * data.readings.comparison_sd(without_error)[rows]
+        outputs = runs(z[rows])
+        misfit = np.abs(outputs - data.readings.values[rows])
         error[rows] = np.fmax(error[rows], misfit - by_readings)
         slopes = secants(runs, z[rows], distance[rows], ended)
         jacobian[rows[:, None], :, ended] = np.moveaxis(slopes, -1, 1)
     shares = shares_of_distance(data, error, z, jacobian, scale).max(axis=1)
     if shares.max() <= 0.03:
         return []
-    tilts = shares * log_density_changes(likelihood, draws.thetas, two_sides(z, distance, ended))
+    sides = two_sides(z, distance, ended)
+    tilts = shares * log_density_changes(likelihood, draws.thetas, sides)
     if data.gross_errors:
-        tilts = np.where(typical_specimens(proposals.modes, len(z)), tilts, 0.0)
+        is_typical = typical_specimens(proposals.modes, len(z))
+        tilts = np.where(is_typical, tilts, 0.0)
     worst = int(tilts.argmax())
     if not np.sqrt((tilts**2).sum()) > 0.1:
         return []

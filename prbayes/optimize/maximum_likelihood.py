@@ -104,7 +104,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         if latest is evaluator:
             break
         evaluator = latest
-    modes, weights = _with_weights(evaluator, modes, prior=settings.prior)
+    modes, weights = modes_with_weights(evaluator, modes, prior=settings.prior)
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
     preparations = map(prepared, evaluator.likelihoods)
@@ -149,7 +149,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     )
 
 
-def _with_weights(
+def modes_with_weights(
     evaluator: Evaluator, modes: list[Mode], *, prior: bool
 ) -> tuple[list[Mode], Floats]:
     """Return optima, best first, and their shares in the posterior's mass.

@@ -351,16 +351,20 @@ def extended_log_density(
         empirical = cumulants([log_weights[rows]], scores, tilts)
         center, within = mean[rows], covariance[rows]
         linear = np.einsum("skl,sl->sk", within, tilts)
-        values = (center * tilts).sum(axis=1) + (linear * tilts).sum(axis=1) / 2
+        values = (center * tilts).sum(axis=1)
+        values += (linear * tilts).sum(axis=1) / 2
+        normal = values, center + linear, within
         mixed = []
-        for of_sets, of_normal in zip(empirical, (values, center + linear, within), strict=True):
-            weight = share[rows].reshape(-1, *[1] * (of_sets.ndim - 1))
+        for of_sets, of_normal in zip(empirical, normal, strict=True):
+            ones = [1] * (of_sets.ndim - 1)
+            weight = share[rows].reshape(-1, *ones)
             mixed.append(weight * of_sets + (1 - weight) * of_normal)
         return Cumulants(*mixed)
 
     logs = saddlepoint_density(function, (len(shifts), r), 1, options.saddlepoint)
-    normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
-    return np.where(np.isfinite(logs), logs, normal)
+    log_det = np.linalg.slogdet(covariance)[1]
+    of_normal = -(distance + log_det) / 2
+    return np.where(np.isfinite(logs), logs, of_normal)
 
 
 def refit_likelihood(

@@ -115,7 +115,9 @@ def _elements(value: Any, *, is_plain: bool) -> Opened:
         if array.nbytes > 2**28:  # a checksum takes 70 ms for 256 MiB; of more a part counts
             array = array.ravel(order="K")[:: array.size // 2**16]
         # As bytes, because an array of dates is no buffer.
-        return f"{text} {zlib.crc32(np.ascontiguousarray(array).ravel().view(np.uint8))}", ()
+        numbers = np.ascontiguousarray(array).ravel()
+        checksum = zlib.crc32(numbers.view(np.uint8))
+        return f"{text} {checksum}", ()
     if isinstance(value, dict):
         keys, values = list(dict.keys(value)), list(dict.values(value))
         if len(keys) <= 64 and all(type(key) is str for key in keys):

@@ -56,15 +56,7 @@ class Coordinates:
             return flat[np.isfinite(flat).all(axis=1)]
 
         flat = draw(1, populations)
-        low, high = np.quantile(flat, [0.005, 0.995], axis=0)
-        # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
-        from_middle = np.abs(flat - 0.5)
-        is_share = (from_middle <= 0.5).all(axis=0) & (high > 0.5)
-        # Draws of a gamma density that is infinite at zero may underflow.
-        is_positive = (flat >= 0).all(axis=0) & ((flat > 0).mean(axis=0) > 0.99)
-        is_log = is_positive & (high > 10 * low) & ~is_share
-        # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
-        is_infinite = is_share & ((from_middle > 0.499).mean(axis=0) > 0.01)
+        is_log, is_infinite = kinds_of_scale(flat)
         logs = _logs(flat, is_log)
         logs = logs[np.isfinite(logs).all(axis=1)]
         low, high = np.quantile(logs, [0.005, 0.995], axis=0)
@@ -158,6 +150,23 @@ class Coordinates:
         is_log = self.is_log & ~self.is_condition
         logs = np.where(is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
         return np.asarray(logs + np.log(self.half_width[~self.is_condition]).sum())
+
+
+def kinds_of_scale(flat: Floats) -> tuple[Bools, Bools]:
+    """Return which inputs, (n, d), have logarithmic coordinates, and which an infinite density.
+
+    The latter is that of shares at zero or one.
+    """
+    low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+    # A density may be infinite at both ends of a range; a logarithm resolves one of them only.
+    from_middle = np.abs(flat - 0.5)
+    is_share = (from_middle <= 0.5).all(axis=0) & (high > 0.5)
+    # Draws of a gamma density that is infinite at zero may underflow.
+    is_positive = (flat >= 0).all(axis=0) & ((flat > 0).mean(axis=0) > 0.99)
+    is_log = is_positive & (high > 10 * low) & ~is_share
+    # A uniform density has .2 % of the draws so near to an end; one that is infinite has more.
+    is_infinite = is_share & ((from_middle > 0.499).mean(axis=0) > 0.01)
+    return is_log, is_infinite
 
 
 @np.errstate(divide="ignore", invalid="ignore")

@@ -526,8 +526,17 @@ def _near_population(data: SpecimenData, z: Floats, population: Normal) -> Bools
 
 def farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Floats:
     """Return candidates, (count, d), each the farthest from the runs and from earlier ones."""
-    squares = np.min([(((candidates - z) / scale) ** 2).sum(axis=1) for z in runs], axis=0)
+    squares = squared_distances(runs, candidates, scale)
     return candidates[farthest_rows(candidates / scale, count, squares)]
+
+
+def squared_distances(runs: Floats, z: Floats, scale: Floats) -> Floats:
+    """Return the squared distance of points from their nearest runs, (k, d) -> (k,)."""
+    squares = np.full(len(z), np.inf)
+    for at in runs:
+        away = (z - at) / scale
+        squares = np.minimum(squares, (away**2).sum(axis=1))
+    return squares
 
 
 def _explored(
@@ -629,10 +638,11 @@ def without_spurious_modes(
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
         deviation = np.sqrt(emulation.surface.variance(z))
         # Farther from the runs than the population is wide, the deviation may be far too small.
-        near = np.min([(((z - at) / scale) ** 2).sum(axis=1) for at in emulation.z], axis=0)
+        is_far = squared_distances(emulation.z, z, scale) > z.shape[1]
         cost = modes.misfit + (modes.a**2).sum(axis=1) / 2
-        is_other = ~np.isin(np.arange(len(z)), best_rows(modes.specimen, cost))
-        doubtful = z[(deviation > largest).any(axis=1) | (is_other & (near > z.shape[1]))]
+        is_far[best_rows(modes.specimen, cost)] = False
+        is_uncertain = (deviation > largest).any(axis=1)
+        doubtful = z[is_uncertain | is_far]
         if not len(doubtful):
             return emulation
         runs = farthest(emulation.z, doubtful, min(4, len(doubtful)), scale)

@@ -268,11 +268,13 @@ def _minimised(
         hessian = np.einsum("kmd,kme->kde", g, g) + precision * np.eye(d)
         gradient = precision * a[active] - np.einsum("kmd,km->kd", g, e[active])
         diagonal = np.einsum("kdd->kd", hessian)
-        damped = hessian + (damping[active, None] * diagonal)[:, :, None] * np.eye(d)
+        added = damping[active, None] * diagonal
+        damped = hessian + added[:, :, None] * np.eye(d)
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         length = np.sqrt((step**2).sum(axis=1))
         # Steps are longer far from the population, because an outlier may be there.
-        longest = np.maximum(1.0, np.sqrt((a[active] ** 2).sum(axis=1)) / 2)
+        from_center = np.sqrt((a[active] ** 2).sum(axis=1))
+        longest = np.maximum(1.0, from_center / 2)
         step /= np.maximum(length / longest, 1.0)[:, None]
         trial = a[active] + step
         new_e, new_slopes = residuals.errors(specimen[active], trial, scale)
@@ -282,7 +284,8 @@ def _minimised(
         rows = active[better]
         a[rows], e[rows], slopes[rows] = trial[better], new_e[better], new_slopes[better]
         value[rows] = new_value[better]
-        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
+        changed = damping[active] * np.where(better, 0.1, 8.0)
+        damping[active] = np.clip(changed, 1e-12, 1e12)
         # The search ends at a gain below 1e-6 nats, or at a rejected step as short as rounding.
         unfinished = (gain > 1e-6) & (length > 1e-11) & (damping[active] < 1e11)
         active = active[unfinished]
@@ -748,10 +751,13 @@ def with_covered_fibres(proposals: Proposals, starts: Floats, scale: float) -> P
     e, slopes = residuals.errors(specimen, a, scale)
     misfit = (e**2).sum(axis=1) / 2
     least = _lowest(modes.specimen, modes.misfit, n)
-    is_near = misfit <= least[specimen] + np.where(np.arange(len(a)) < len(met), 10.0, 3.0)
+    is_met = np.arange(len(a)) < len(met)
+    margin = np.where(is_met, 10.0, 3.0)
+    is_near = misfit <= least[specimen] + margin
     rows = np.flatnonzero(is_near)
-    rows = rows[np.argsort(specimen[rows], kind="stable")]
-    points = Modes(specimen, a, misfit, e, slopes, np.full(len(a), scale)).rows(rows)
+    order = np.argsort(specimen[rows], kind="stable")
+    scales = np.full(len(a), scale)
+    points = Modes(specimen, a, misfit, e, slopes, scales).rows(rows[order])
 
     def importance(modes: Modes) -> Floats:
         log_q = proposals.log_mixture(modes.specimen, modes.a, proposals.share)
@@ -759,9 +765,11 @@ def with_covered_fibres(proposals: Proposals, starts: Floats, scale: float) -> P
 
     for _ in range(4):
         of_modes = importance(modes)
-        usual = -_lowest(modes.specimen, np.where(np.isfinite(of_modes), -of_modes, np.inf), n)
-        excess = importance(points) - usual[points.specimen]
-        excess = np.where(np.isfinite(usual[points.specimen]), excess, -np.inf)
+        negative = np.where(np.isfinite(of_modes), -of_modes, np.inf)
+        usual = -_lowest(modes.specimen, negative, n)
+        of_specimens = usual[points.specimen]
+        excess = importance(points) - of_specimens
+        excess = np.where(np.isfinite(of_specimens), excess, -np.inf)
         first = best_rows(points.specimen, -excess)
         added = first[excess[first] > np.log(3.0)]
         if not added.size:

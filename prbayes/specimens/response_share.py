@@ -145,7 +145,7 @@ def _agreeing_share(
                 f"change the log-likelihood by {difference:.2g} nats, expected at most {largest}; "
                 f"{any_of('narrow the priors', other_metric)}"
             )
-    return _joined(halves)
+    return _of_both_halves(halves)
 
 
 def renewed_share(
@@ -158,10 +158,10 @@ def renewed_share(
     """Return as many new points around specimens, (n, d), with the outputs of a later emulation."""
     samples, count = (data.prior, specimens), len(share.z) // 4
     halves = [_points(emulation, samples, count, 2 * data.seed + k, selection) for k in (0, 1)]
-    return _joined(halves)
+    return _of_both_halves(halves)
 
 
-def _joined(halves: Sequence[ResponseShare]) -> ResponseShare:
+def _of_both_halves(halves: Sequence[ResponseShare]) -> ResponseShare:
     """Return the points of several shares as one."""
     z = np.concatenate([half.z for half in halves])
     log_b = np.concatenate([half.log_b for half in halves])
