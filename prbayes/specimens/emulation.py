@@ -255,7 +255,7 @@ def fit_surface(
     start = previous.surface if isinstance(previous, CompressedSurface) else None
     of_point = int(readings.is_measured.sum(axis=1).max())
     fits = []
-    for unit in [plain, np.where(is_far, 10 * spread, plain)][: 1 + is_far.any()]:
+    for unit in [np.where(is_far, 10 * spread, plain), plain][: 1 + is_far.any()]:
         compressed = np.arcsinh((yg - center) / unit)
         emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
         surface = CompressedSurface(emulator, center, unit)
