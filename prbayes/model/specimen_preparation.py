@@ -478,6 +478,7 @@ def _emulate(runs: CheckedRuns, data: SpecimenData, emulation: Emulation | None)
         *coverage_findings(likelihood, data, points, draws.specimens()),
         *_end_findings(runs, data, emulation, points, proposals, draws),
         *_root_findings(data, proposals),
+        *error_findings(likelihood),
         *flat_findings(data, proposals, normal_of(draws.specimens()[:, data.free])),
     )
     return Preparation(emulation, points, proposals, draws.thetas, findings)
@@ -507,6 +508,25 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
         "missing; narrow the prior, or compare models with a prior around each."
     )
     return [Finding("second-mode", text, "likelihood_findings.md#several-modes")]
+
+
+def error_findings(likelihood: SpecimenLikelihood) -> list[Finding]:
+    """Report several unknown errors: the points are those of errors with a common factor."""
+    sizes = {
+        m.unknown["error"]: m.readings.values.shape[1] if m.unknown["error"].type.ndim else 1
+        for m in likelihood.measurements
+        if "error" in m.unknown
+    }
+    count = sum(sizes.values())
+    if count < 2:
+        return []
+    text = (
+        f"{likelihood.name}: got {count} unknown errors of readings, expected one: where one of "
+        "them is far smaller than the others the log-likelihood is too low, and means of errors "
+        "and spreads may be .3 posterior standard deviations off; scale outputs and readings so "
+        "that one error= serves all, or pass known errors."
+    )
+    return [Finding("several-errors", text, "measurement_error.md#what-it-changes")]
 
 
 def flat_findings(
