@@ -1,6 +1,7 @@
 """Audit of emulators at likely inputs of posterior draws: poles, periods, and smooth responses."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,9 +131,15 @@ def test_a_smooth_response_needs_no_further_run() -> None:
 
 def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
     evaluator = Evaluator.of(build(*PROBLEMS["period"]))
-    # Populations around x = -.7 make inputs likely at which the emulator is wrong.
-    thetas = np.stack([np.full(32, -0.7), np.full(32, np.log(0.2))], axis=1)
+    thetas = np.stack([np.full(32, 3.5), np.full(32, np.log(0.5))], axis=1)
     evaluator.log_other(thetas)
+    (likelihood,) = evaluator.likelihoods
+    preparation = prepared(likelihood)
+    # Its outputs are wrong by a fifth.
+    surface = preparation.emulation.surface
+    wrong = replace(surface, center=surface.center + 0.2)
+    emulation = replace(preparation.emulation, surface=wrong)
+    likelihood.cache["preparation"] = replace(preparation, emulation=emulation)
     with pytest.raises(DesignError, match=r"not smooth enough.*an emulator of \d+ runs that would"):
         audited_evaluator(evaluator, thetas, "here", is_last=True)
 
