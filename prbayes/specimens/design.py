@@ -633,7 +633,7 @@ def without_spurious_modes(
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
     likeliest, before, grown = likely.best(), emulation, emulation
-    for _ in range(4):
+    for _ in range(8):
         modes = proposals.modes
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
         deviation = np.sqrt(emulation.surface.variance(z))
@@ -645,7 +645,7 @@ def without_spurious_modes(
         doubtful = z[is_uncertain | is_far]
         if not len(doubtful):
             return emulation
-        runs = farthest(emulation.z, doubtful, min(4, len(doubtful)), scale)
+        runs = farthest(emulation.z, doubtful, min(2, len(doubtful)), scale)
         grown, misfit, _ = _compared(run, emulation, runs, scale)
         audited = range(len(emulation.z), len(grown.z))
         grown = replace(grown, audited=(*emulation.audited, *audited))
@@ -654,11 +654,11 @@ def without_spurious_modes(
             return emulation
         change = emulation.surface.values(likeliest) - before.surface.values(likeliest)
         if (np.abs(change) > largest).any():
-            break
+            # A response that oscillates far off is not known from a few runs, which would also make
+            # the surface worse at the specimens.
+            return replace(before, z=grown.z, y=grown.y)
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
-    # A response that oscillates far off is not known from a few runs, which would also make the
-    # surface worse at the specimens.
-    return replace(before, z=grown.z, y=grown.y)
+    return emulation
 
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:
