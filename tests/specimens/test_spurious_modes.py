@@ -63,7 +63,9 @@ def test_an_unknown_error_leaves_no_inputs_that_only_the_emulator_has() -> None:
     is_point = np.isfinite(found.points.log_a)
     (inputs,) = simulator.likelihood.coordinates.inputs(found.points.z[is_point])
     away = abs(found.points.outputs[is_point][:, 0] - np.exp(inputs))
-    np.testing.assert_array_less(away[inputs > -5], 0.2)
+    # Points of the largest errors reach outputs of 25, five times the readings.
+    allowed = np.maximum(0.2, 0.05 * np.exp(inputs))
+    np.testing.assert_array_less((away / allowed)[inputs > -5], 1.0)
 
 
 def test_two_inputs_have_one_mode_for_each_specimen() -> None:
