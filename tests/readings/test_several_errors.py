@@ -10,9 +10,7 @@ import prbayes as prb
 
 
 @pytest.mark.parametrize(("shape", "is_reported"), [((), False), (2, True)])
-def test_several_unknown_errors_are_reported(
-    shape: Any, is_reported: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_several_unknown_errors_are_reported(shape: Any, is_reported: bool) -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(1.0, 0.5, 12)
     y = np.stack([x, 2.0 * x], axis=1) + 0.1 * rng.standard_normal((12, 2))
@@ -23,4 +21,3 @@ def test_several_unknown_errors_are_reported(
         prb.Simulator("y", response, population, observed=y, metric=metric)
         codes = [finding.code for finding in prb.minimize().findings]
     assert ("several-errors" in codes) == is_reported
-    assert ("got 2 unknown errors" in caplog.text) == is_reported
