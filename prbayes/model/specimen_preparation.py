@@ -607,8 +607,8 @@ def _end_findings(
         return []
     # Secants, because the slopes of a surface say nothing of changes that are smaller than its
     # error.
-    _, jacobian = emulation(z)
-    jacobian[:, :, ended] = secants(emulation.values, z, distance, ended)
+    center, jacobian = emulation(z)
+    jacobian[:, :, ended] = secants(emulation.values, center, z, distance, ended)
     shares = shares_of_distance(data, emulation.error, z, jacobian, scale)
     at_end = shares.max(axis=1) >= 0.9
     error = np.tile(emulation.error, (len(z), 1))
@@ -619,7 +619,7 @@ def _end_findings(
         outputs = runs(z[rows])
         misfit = np.abs(outputs - data.readings.values[rows])
         error[rows] = np.fmax(error[rows], misfit - by_readings)
-        slopes = secants(runs, z[rows], distance[rows], ended)
+        slopes = secants(runs, outputs, z[rows], distance[rows], ended)
         jacobian[rows[:, None], :, ended] = np.moveaxis(slopes, -1, 1)
     shares = shares_of_distance(data, error, z, jacobian, scale).max(axis=1)
     if shares.max() <= 0.03:
@@ -652,10 +652,20 @@ def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Flo
     return [(z - step, z + step) for step in steps]
 
 
-def secants(values: ArrayFunction, z: Floats, distance: Floats, columns: list[int]) -> Floats:
-    """Return slopes of values (n, m) over half a distance to both sides, (n, m, columns)."""
-    changes = [values(high) - values(low) for low, high in two_sides(z, distance, columns)]
-    return np.asarray(np.stack(changes, axis=-1) / distance[:, None, columns])
+def secants(
+    values: ArrayFunction, center: Floats, z: Floats, distance: Floats, columns: list[int]
+) -> Floats:
+    """Return the steeper slope of values (n, m) over half a distance to a side, (n, m, columns).
+
+    ``center`` are the values at z, (n, d). Beside a turning point one of the slopes may be zero.
+    """
+    steeper = []
+    for low, high in two_sides(z, distance, columns):
+        below, above = center - values(low), values(high) - center
+        sizes = [np.nan_to_num(np.abs(change)).max(axis=1) for change in (below, above)]
+        is_above = sizes[1] > sizes[0]
+        steeper.append(np.where(is_above[:, None], above, below))
+    return np.asarray(2 * np.stack(steeper, axis=-1) / distance[:, None, columns])
 
 
 def low_outliers(z: Floats, is_log: Bools) -> Indices:

@@ -632,7 +632,7 @@ def without_spurious_modes(
     spread = data.readings.spread()
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
-    likeliest, before, grown = likely.best(), emulation, emulation
+    likeliest, before = likely.best(), emulation
     for _ in range(8):
         modes = proposals.modes
         z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
@@ -650,15 +650,14 @@ def without_spurious_modes(
         audited = range(len(emulation.z), len(grown.z))
         grown = replace(grown, audited=(*emulation.audited, *audited))
         emulation, _ = _refitted(data, grown, likely.population)
-        if (np.abs(misfit) < 0.1 * spread).all():  # the modes exist
-            return emulation
         change = emulation.surface.values(likeliest) - before.surface.values(likeliest)
-        if (np.abs(change) > largest).any():
-            # A response that oscillates far off is not known from a few runs, which would also make
-            # the surface worse at the specimens.
-            return replace(before, z=grown.z, y=grown.y)
+        exist = (np.abs(misfit) < 0.1 * spread).all()
+        if exist or (np.abs(change) > largest).any():
+            break
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
-    return emulation
+    # A response that oscillates far off is not known from a few runs, which also make the surface
+    # worse at the specimens.
+    return before if (np.abs(change) > 3 * before.error).any() else emulation
 
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:

@@ -129,14 +129,15 @@ def test_a_smooth_response_needs_no_further_run() -> None:
     assert evaluator.n_responses == n_runs
 
 
-def test_a_wrong_emulator_is_refused_in_the_last_round() -> None:
+def test_a_wrong_emulator_is_refused_in_the_last_round(monkeypatch: pytest.MonkeyPatch) -> None:
     evaluator = Evaluator.of(build(*PROBLEMS["period"]))
     thetas = np.stack([np.full(32, 3.5), np.full(32, np.log(0.5))], axis=1)
     evaluator.log_other(thetas)
     (likelihood,) = evaluator.likelihoods
     preparation = prepared(likelihood)
-    # Its outputs are wrong by a fifth.
+    # Its outputs are wrong by a fifth, and it does not claim to know them.
     surface = preparation.emulation.surface
+    monkeypatch.setattr(type(surface), "variance", lambda _, z: np.ones((len(z), 1)))
     wrong = replace(surface, center=surface.center + 0.2)
     emulation = replace(preparation.emulation, surface=wrong)
     likelihood.cache["preparation"] = replace(preparation, emulation=emulation)
