@@ -14,7 +14,7 @@ from scipy.stats import halfnorm, norm, truncnorm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.specimen_preparation import SpecimenPopulations, prepared
+from prbayes.model.specimen_preparation import SpecimenPopulations, prepared, secants
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)
@@ -175,6 +175,16 @@ def test_a_response_whose_squares_overflow_under_a_vague_prior_is_refused() -> N
             prb.propagation.DesignError, match=r"not smooth enough.*narrow the priors"
         ):
             prb.minimize(progressbar=False)
+
+
+def test_slopes_to_an_end_beside_a_turning_point() -> None:
+    """A difference over both sides of the turning point would be zero."""
+    z = np.array([[0.0], [1.0], [-0.1]])
+    distance = np.full((3, 1), 0.4)
+    slopes = secants(np.square, np.square(z), z, distance, [0])
+    np.testing.assert_allclose(slopes[:, 0, 0], [-0.2, 2.2, -0.4])
+    missing = secants(lambda z: np.where(z < 0, np.nan, z), z, z, distance, [0])
+    np.testing.assert_allclose(missing[:2, 0, 0], [1.0, 1.0])
 
 
 def test_a_model_that_is_gone() -> None:
