@@ -634,16 +634,26 @@ def _end_findings(
         return []
     if at_end[worst]:
         refuse_at_end(data, worst)
+    return [end_finding(likelihood, data, worst, float(shares[worst]), float(tilts[worst]))]
+
+
+def end_finding(
+    likelihood: SpecimenLikelihood, data: SpecimenData, worst: int, share: float, tilt: float
+) -> Finding:
+    """Return the finding of a specimen whose input is known worse than its distance from an end.
+
+    ``share`` is the error in units of the distance, ``tilt`` the change of the log-likelihood.
+    """
     label = worst if data.labels is None else data.labels[worst]
     remedy = "pass metric=prb.LogLikelihood(error=...) with the error of the readings"
     if all(m.metric.error is not None for m in likelihood.measurements):
         remedy = any_of("narrow the priors", data.remedies()[0])
     text = (
         f"{likelihood.name}: the input of specimen {label} is so near an end of its range that the "
-        f"emulator's error is {shares[worst]:.0%} of the distance: posterior means may be off by "
-        f"{tilts[worst]:.1g} standard deviations or more; {remedy}."
+        f"emulator's error is {share:.0%} of the distance: posterior means may be off by "
+        f"{tilt:.1g} standard deviations or more; {remedy}."
     )
-    return [Finding("emulator-error", text, "likelihood_findings.md#emulator-error")]
+    return Finding("emulator-error", text, "likelihood_findings.md#emulator-error")
 
 
 def two_sides(z: Floats, distance: Floats, columns: list[int]) -> list[tuple[Floats, Floats]]:
