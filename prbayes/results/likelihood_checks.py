@@ -181,9 +181,23 @@ def check_population(optimum: Optimum) -> Checked:
     if len(null[0]) < _OPTIONS.replicates / 2:
         reason = f"{len(null[0])} of {_OPTIONS.replicates} refits converged"
         return _not_tested(_FAMILY, reason)
+    checked = reported_tests(optimum, samples, null)
+    cache["population"] = preparations, optimum.theta, checked
+    return checked
+
+
+def reported_tests(
+    optimum: Optimum, samples: Sequence[tuple[Floats, Floats]], null: Sequence[Sequence[Floats]]
+) -> Checked:
+    """Return what tests of the population say of each likelihood.
+
+    ``samples`` are scores and weights of the specimens, ``null`` statistics of synthetic data.
+    """
     checked = Checked()
     is_rounded = "rounded-data" in [finding.code for finding in optimum.findings]
-    for likelihood, (z, weights), statistics in zip(likelihoods, samples, null, strict=True):
+    for likelihood, (z, weights), statistics in zip(
+        optimum.evaluator.likelihoods, samples, null, strict=True
+    ):
         inputs = likelihood.inputs
         labels = []
         names = aleatory_names(inputs, likelihood.measurements[0].responses.function)
@@ -203,7 +217,6 @@ def check_population(optimum: Optimum) -> Checked:
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
         checked += Checked(remarks=misfit or (Finding("population-tested", text),))
-    cache["population"] = preparations, optimum.theta, checked
     return checked
 
 

@@ -237,13 +237,10 @@ def predict(
     findings += _prediction_findings(responses, drawn, result, model)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
-        "source": drawn.source,
         "responses": n_computed,
-        **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
         **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
-        **_left_out(sources, response, drawn.values),
-        "specimens_id": array_digest(*drawn.specimens),
+        **_drawn_attributes(drawn, sources, response),
         "random_seed": str(seed),
         "findings": as_json(findings),
         **_calibration_attributes(result, model),
@@ -687,13 +684,17 @@ def _vectors(inputs: Inputs) -> list[list[float]]:
     return [x.ravel().tolist() for x in inputs.arguments if isinstance(x, np.ndarray)]
 
 
-def _left_out(
-    simulators: Sequence[PopulationSimulator], response: Function, values: Floats
-) -> dict[str, str]:
-    """Return an attribute of predictions of a response whose readings have an error."""
+def _drawn_attributes(
+    drawn: _Predicted, simulators: Sequence[PopulationSimulator], response: Function
+) -> dict[str, Any]:
+    """Return attributes of drawn responses; one of them if their readings have an error."""
+    attrs = {"source": drawn.source, "specimens_id": array_digest(*drawn.specimens)}
+    if drawn.error is not None:
+        attrs |= {"emulator_error": drawn.error.tolist()}
     of_response = (s.metric for s in simulators if s.responses.function is response)
-    has_error = any(getattr(metric, "error", None) is not None for metric in of_response)
-    return {"without_error": array_digest(values)} if has_error else {}
+    if any(getattr(metric, "error", None) is not None for metric in of_response):
+        attrs |= {"without_error": array_digest(drawn.values)}
+    return attrs
 
 
 def known_scatter(simulators: Sequence[PopulationSimulator], response: Function) -> float | None:
