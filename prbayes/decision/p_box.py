@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -145,9 +146,7 @@ def p_box(
         n_searched = respond.count
     bands = [_bands(sample, y, prob) for sample in samples]
     lower, upper, means, errors = zip(*bands, strict=True)
-    # Distribution functions increase, so that a bound at y also holds beyond it.
-    lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
-    highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
+    lowest, highest = outermost(lower, upper)
     name = response_name(response, output)
     lost = max(sample.lost for sample in samples)
     answer = "the mean is that of the others, and the bands contain them at either end"
@@ -209,6 +208,13 @@ class ProbabilityBox(Table):
 def _place(function: Floats, y: Floats, probability: float) -> float:
     """Return the quantile of a distribution function given at y, (m,); infinite beyond y."""
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
+
+
+def outermost(lower: Sequence[Floats], upper: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Return the outermost of bands, (band, y): a bound of a distribution function holds beyond."""
+    lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
+    flipped = np.minimum.accumulate(np.flip(upper, -1), axis=-1)
+    return lowest, np.max(flipped, axis=0)[:, ::-1]
 
 
 def _evaluation_points(samples: list[ResponseSample]) -> Floats:

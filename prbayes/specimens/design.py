@@ -254,17 +254,24 @@ def sequential_design(
             if is_good:
                 return emulation, plausible.of_emulation(data, emulation)
         if len(emulation.z) >= most:
-            if may_correct(data, likely):
-                emulation = corrected(run, data, emulation, population)
-            if emulation.bias > data.options.bias:
-                require_accurate(data, emulation, likely)
-            return emulation, Plausible.of(data, emulation, wider(population))
+            return at_most_runs(run, data, emulation, likely, population)
         count = data.options.sampled + 2
         if previous is None:
             count = max(count, batch_size(data, emulation))
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def at_most_runs(
+    run: Run, data: SpecimenData, emulation: Emulation, likely: Likely, population: Normal
+) -> tuple[Emulation, Plausible]:
+    """Return an emulation with the largest number of runs, corrected where it may be, or raise."""
+    if may_correct(data, likely):
+        emulation = corrected(run, data, emulation, population)
+    if emulation.bias > data.options.bias:
+        require_accurate(data, emulation, likely)
+    return emulation, Plausible.of(data, emulation, wider(population))
 
 
 def batch_size(data: SpecimenData, emulation: Emulation) -> int:
