@@ -83,11 +83,14 @@ def test_inputs_that_do_not_exist_have_no_mass() -> None:
 
 @pytest.mark.long
 def test_a_budget_that_ends_in_the_audit_keeps_the_draws() -> None:
+    first = Evaluator.of(build(*PROBLEMS["pole"]))
+    first.log_other(np.zeros((1, 2)))
+    most = first.n_responses + 1
     model = build(*PROBLEMS["pole"])
-    result = prb.sample(model=model, max_runs=110, random_seed=1)
+    result = prb.sample(model=model, max_runs=most, random_seed=1)
     assert result.posterior.sizes["draw"] == 1000
     (text,) = [f.text for f in findings_of(result) if f.code == "budget-spent"]
-    assert text.startswith("max_runs = 110 was reached before the runs were checked at the dra")
+    assert text.startswith(f"max_runs = {most} was reached before the runs were checked at the dra")
     # A larger budget gives the same as a new model.
     again = prb.sample(model=model, max_runs=300, random_seed=1)
     expected, sd = exact(*PROBLEMS["pole"][1:])
@@ -97,10 +100,15 @@ def test_a_budget_that_ends_in_the_audit_keeps_the_draws() -> None:
 
 @pytest.mark.long
 def test_a_budget_that_ends_in_the_audit_keeps_the_optimum() -> None:
+    first = Evaluator.of(build(*PROBLEMS["pole"]))
+    first.log_other(np.zeros((1, 2)))
+    most = first.n_responses + 1
     model = build(*PROBLEMS["pole"])
-    optimum = prb.minimize(model, max_runs=90)
+    optimum = prb.minimize(model, max_runs=most)
     (text,) = [f.text for f in optimum.findings if f.code == "budget-spent"]
-    assert text.startswith("max_runs = 90 was reached before the runs were checked at the optima")
+    assert text.startswith(
+        f"max_runs = {most} was reached before the runs were checked at the optima"
+    )
     again = prb.minimize(model)
     assert "budget-spent" not in {f.code for f in again.findings}
     assert again.point["mu"] == pytest.approx(PROBLEMS["pole"][3].mean(), rel=1e-3)

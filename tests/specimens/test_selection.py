@@ -8,12 +8,14 @@ import numpy as np
 import pymc as pm
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 import prbayes as prb
 from benchmarks import selection as study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import selection_of
 from prbayes.model.specimen_likelihood import draw_readings, measurements_of
+from prbayes.model.specimen_preparation import prepared
 from prbayes.response.compile import PLAIN
 from prbayes.specimens.selection import Selection
 
@@ -53,12 +55,17 @@ def test_the_probability_of_being_seen_is_that_of_the_last_emulator() -> None:
     reading = stats.norm(np.cos(x)[:, None], 0.1)
     masses = stats.norm(mu[:, None], sigma[:, None]).pdf(x) * (x[1] - x[0])
     seen = masses @ (reading.sf(0.5) - reading.sf(0.95))
-    exact = np.log(masses @ reading.pdf(y) / seen).sum(axis=1)
-    found = evaluator(np.column_stack([np.log(mu), np.log(sigma)])).log_other
-    # The points of the specimens have a constant error of some tenths of a nat; before, the share
-    # of wide populations was up to 16 nats off.
-    difference = found - exact
-    assert np.abs(difference - difference.mean()).max() < 0.75
+    # The share is that of points around specimens whose response is within the limits.
+    evaluator(np.column_stack([np.log(mu), np.log(sigma)]))
+    (likelihood,) = evaluator.likelihoods
+    share, coordinates = prepared(likelihood).share, likelihood.coordinates
+    assert share is not None
+    (inputs,) = coordinates.inputs(share.z)
+    logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(inputs.ravel())
+    logs += coordinates.log_jacobian(share.z) + share.log_b
+    found = logsumexp(logs[:, : share.with_response], axis=1) - logsumexp(logs, axis=1)
+    # Wide populations were up to 16 nats off.
+    assert len(y) * np.abs(found - np.log(seen).ravel()).max() < 0.75
 
 
 @pytest.mark.long
