@@ -64,8 +64,9 @@ def test_the_probability_of_being_seen_is_that_of_the_last_emulator() -> None:
     logs = stats.norm(mu[:, None], sigma[:, None]).logpdf(inputs.ravel())
     logs += coordinates.log_jacobian(share.z) + share.log_b
     found = logsumexp(logs[:, : share.with_response], axis=1) - logsumexp(logs, axis=1)
-    # Wide populations were up to 16 nats off.
-    assert len(y) * np.abs(found - np.log(seen).ravel()).max() < 0.75
+    # Wide populations were up to 16 nats off. That of N(2, .5), of which few are seen, has a Monte
+    # Carlo error of .7 to .9 nats.
+    assert len(y) * np.abs(found - np.log(seen).ravel()).max() < 1.5
 
 
 @pytest.mark.long
