@@ -63,9 +63,8 @@ def audited_likelihood(
     """
     preparation, readings = prepared(likelihood), likelihood.readings
     emulation = preparation.emulation
-    # Spurious inputs form a narrow population only if readings determine the inputs.
-    is_open = preparation.proposals is None or preparation.proposals.is_open()
-    if likelihood.calls_response or emulation.offsets is not None or is_open:
+    has_points = preparation.proposals is not None
+    if likelihood.calls_response or emulation.offsets is not None or not has_points:
         return likelihood
     runs = likelihood.options.sampled
     points = preparation.points.z

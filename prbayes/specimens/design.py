@@ -17,7 +17,7 @@ from prbayes._validate import ArrayFunction, Bools, Floats, Indices
 from prbayes.metrics.readings import has_error, located_values, relative_error
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
-from prbayes.specimens.emulation import Emulation, fit_surface, predicted_bias
+from prbayes.specimens.emulation import Emulation, Surface, fit_surface, predicted_bias
 from prbayes.specimens.points import (
     Draws,
     Plausible,
@@ -77,9 +77,21 @@ def first_emulation(run: Run, data: SpecimenData) -> Emulation:
     surface, left_out, is_near = fit_surface(z, y, data.readings, data.name)
     square = left_out[is_near] ** 2
     rms = np.sqrt(square.mean(axis=0))
-    least = data.options.floor * data.readings.spread()
-    error = np.maximum(2 * rms, least)
+    error = np.maximum(2 * rms, _least_error(data, z, surface))
     return Emulation(z, y, surface, error, np.inf)
+
+
+def _least_error(data: SpecimenData, z: Floats, surface: Surface) -> Floats:
+    """Return the least error of an emulator, (m,): a share of the data's spread, or rounding.
+
+    Newton's method needs outputs whose rounding errors are far smaller than the error.
+    """
+    z = z[-32:]
+    step = 1e-9 * np.ptp(z, axis=0)
+    # Second differences at so small a distance have rounding errors alone.
+    change = surface.values(z - step) - 2 * surface.values(z) + surface.values(z + step)
+    rounding = np.sqrt(np.median(change**2, axis=0) / 6)
+    return np.asarray(np.maximum(data.options.floor * data.readings.spread(), 1e3 * rounding))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +169,12 @@ class Likely:
         best = self.weights.argmax(axis=1)
         return self.points.z[np.arange(len(best)), best]
 
+    def has_runs(self, data: SpecimenData, runs: Floats) -> bool:
+        """Return whether half of the specimens are within three standard deviations of runs."""
+        best = self.best()
+        squares = squared_distances(runs, best, self.scale(data))
+        return bool(np.median(squares) <= 9 * best.shape[1])
+
     def possible(self, data: SpecimenData, count: int, rng: np.random.Generator) -> Floats:
         """Return inputs, (count, d), that are likely under a wider population.
 
@@ -225,22 +243,32 @@ def sequential_design(
         emulation = replace(emulation, bias=np.inf, offsets=None)
     while True:
         likely = Likely.of(data, emulation, population, batches)
-        population = likely.population
         is_complete = batches >= enough or len(emulation.z) >= most
+        is_unbiased = emulation.bias <= data.options.bias and is_complete
+        if is_unbiased and len(emulation.z) < most and not likely.has_runs(data, emulation.z):
+            # The bias is that at another population. Far from runs an emulator is often wrong.
+            runs = farthest(emulation.z, likely.best(), 4, likely.scale(data))
+            emulation, _ = with_audited_runs(run, data, emulation, runs, likely, population)
+            batches += 1
+            continue
+        population = likely.population
         can_correct = may_correct(data, likely) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it matters less, because the inputs are not known well.
         is_last = further >= (1 if has_fewer_readings else 2) or len(emulation.z) >= most
         may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
-        if emulation.bias <= data.options.bias and is_complete and is_smooth:
+        if is_unbiased and is_smooth:
             emulation = without_spurious_modes(run, data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population), plausible)
-            before = emulation.surface
+            before, measured = emulation.surface, emulation.z
             # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
             is_good = emulation.bias <= 1.5 * data.options.bias
+            if not is_good and not likely.has_runs(data, measured):
+                batches += 1
+                continue
             if is_good and emulation.surface is not before:
                 # The audit's runs changed the surface, so that another population may be likely.
                 likely, earlier = Likely.of(data, emulation, population, batches), plausible
@@ -360,11 +388,12 @@ def joined(
     grown, left_out = _refitted(data, grown, likely.population)
     if np.isfinite(bias):
         at_sampled = left_out[len(emulation.z) :][: is_new[: len(sampled)].sum()]
-        error = _improved(data, error, at_sampled)
+        least = _least_error(data, grown.z, grown.surface)
+        error = _improved(error, at_sampled, least)
     return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
 
 
-def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
+def _improved(error: Floats, left_out: Floats, least: Floats) -> Floats:
     """Return errors, (m,), from misfits at runs and left-out errors, (k, m), at the same runs.
 
     Misfits are those of the emulator without these runs. Left-out errors show what the runs have
@@ -375,8 +404,7 @@ def _improved(data: SpecimenData, error: Floats, left_out: Floats) -> Floats:
         return error
     with np.errstate(over="ignore"):  # An infinite error improves nothing.
         improved = 2 * np.sqrt((left_out**2).mean(axis=0))
-    floor = data.options.floor * data.readings.spread()
-    return np.asarray(np.maximum(np.minimum(error, improved), floor))
+    return np.asarray(np.maximum(np.minimum(error, improved), least))
 
 
 def _is_new(runs: Floats, z: Floats, scale: Floats) -> Bools:
@@ -413,7 +441,8 @@ def _refitted(
     # Without these runs the emulator would have the same spurious inputs again.
     rows[list(emulation.audited)] = True
     surface, left_out, _ = fit_surface(z, y, data.readings, data.name, emulation.surface, rows)
-    return replace(emulation, surface=surface, offsets=None), left_out
+    error = np.maximum(emulation.error, _least_error(data, z, surface))
+    return replace(emulation, surface=surface, error=error, offsets=None), left_out
 
 
 def _bias_of_possible(data: SpecimenData, misfit: Floats) -> float:
@@ -443,9 +472,8 @@ def error_and_bias(
     if good.sum() < 4:
         return emulation.error, np.inf
     z, specimens, misfit = z[good], specimens[good], misfit[good]
-    error = np.maximum(
-        2 * np.sqrt((misfit**2).mean(axis=0)), data.options.floor * data.readings.spread()
-    )
+    least = _least_error(data, emulation.z, emulation.surface)
+    error = np.maximum(2 * np.sqrt((misfit**2).mean(axis=0)), least)
     measured = replace(emulation, error=error)
     residuals = residuals_of(data, measured, likely.population)
     a = residuals.whitened(z)
@@ -616,10 +644,26 @@ def audited(
         n_audited = is_new[: len(specimens)].sum()
         of_new_runs = left_out[len(emulation.z) :]
         at_audited = of_new_runs[:n_audited]
-        error = _improved(data, error, at_audited)
+        least = _least_error(data, grown.z, grown.surface)
+        error = _improved(error, at_audited, least)
     else:  # The error stays, because specimens may be at inputs that the runs do not have.
         error = np.maximum(error, emulation.error)
     return _with_bias_at_ends(data, replace(grown, error=error, bias=bias), likely)
+
+
+def with_audited_runs(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    runs: Floats,
+    likely: Likely,
+    population: Normal,
+) -> tuple[Emulation, Floats]:
+    """Return the emulation with runs that its surface never leaves out, and the misfits there."""
+    grown, misfit, _ = _compared(run, emulation, runs, likely.scale(data))
+    audited = range(len(emulation.z), len(grown.z))
+    grown = replace(grown, audited=(*emulation.audited, *audited))
+    return _refitted(data, grown, population)[0], misfit
 
 
 def without_spurious_modes(
@@ -653,10 +697,9 @@ def without_spurious_modes(
         if not len(doubtful):
             return emulation
         runs = farthest(emulation.z, doubtful, min(2, len(doubtful)), scale)
-        grown, misfit, _ = _compared(run, emulation, runs, scale)
-        audited = range(len(emulation.z), len(grown.z))
-        grown = replace(grown, audited=(*emulation.audited, *audited))
-        emulation, _ = _refitted(data, grown, likely.population)
+        emulation, misfit = with_audited_runs(
+            run, data, emulation, runs, likely, likely.population
+        )
         change = emulation.surface.values(likeliest) - before.surface.values(likeliest)
         exist = (np.abs(misfit) < 0.1 * spread).all()
         if exist or (np.abs(change) > largest).any():
@@ -664,7 +707,8 @@ def without_spurious_modes(
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
     # A response that oscillates far off is not known from a few runs, which also make the surface
     # worse at the specimens.
-    return before if (np.abs(change) > 3 * before.error).any() else emulation
+    harmless = np.maximum(0.01 * spread, 3 * before.error)
+    return before if (np.abs(change) > harmless).any() else emulation
 
 
 def is_rough(data: SpecimenData, emulation: Emulation) -> bool:

@@ -56,7 +56,7 @@ class SpecimenOptions:
     # Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
     # More runs are added where the emulator's error could cause as much.
     bias: float = 0.1
-    floor: float = 1e-6  # smallest error of the emulator, as a share of the data's spread
+    floor: float = 1e-5  # smallest error of the emulator, as a share of the data's spread
     sampled: int = 8  # runs of a batch that measure the error, at least
     n_first: int | None = None  # number of first runs; by default that of `first_runs`
     max_runs: int | None = None  # by default that of `most_runs`

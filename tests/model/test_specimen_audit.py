@@ -194,3 +194,16 @@ def test_an_audit_makes_no_other_problem() -> None:
     assert prb.compare({"optimum": optimum, "posterior": posterior}) is not None
     again = prb.sample(200, model=model, optimum=optimum, random_seed=1)
     assert prb.compare({"posterior": again}, model=build(*PROBLEMS["pole"])) is not None
+
+
+def test_inaccurate_readings_have_no_population_where_the_emulator_is_wrong() -> None:
+    """Five readings whose error is as large as their spread leave the inputs open."""
+    y = [0.6077, 0.6272, 0.5734, 0.6471, 0.5784]
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0.12, 2.38), pm.HalfNormal("sigma", 1.18))
+        metric = prb.LogLikelihood(error=0.042)
+        prb.Simulator("y", lambda x: 1 / (1 + np.exp(-2 * x)), x, observed=y, metric=metric)
+        mu = prb.sample(2000, random_seed=11, progressbar=False).posterior["mu"]
+    # The readings are those of inputs between .15 and .3; a false mode was near -1.4.
+    assert float(mu.mean()) == pytest.approx(0.219, abs=0.02)
+    assert float((mu < -0.5).mean()) < 0.002
