@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Bools, Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import FORMAT, Bools, Floats, plain_text, positive_integer, stated_path
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -369,7 +369,6 @@ def _numbers(values: Iterable[bytes]) -> Floats:
 
 # Distinguishes stores from other databases (https://www.sqlite.org/pragma.html).
 _APPLICATION = int.from_bytes(b"prby")
-_LAYOUT = 2  # version of the tables below; files of other versions are refused
 # Seconds to wait for other writers. A chunk takes 10 ms, so that a thousand writers may queue.
 _PATIENCE = 60.0
 
@@ -410,7 +409,7 @@ def create(path: Path) -> None:
                 for table in _TABLES:
                     connection.execute(table)
                 connection.execute(f"PRAGMA application_id = {_APPLICATION}")
-                connection.execute(f"PRAGMA user_version = {_LAYOUT}")
+                connection.execute(f"PRAGMA user_version = {FORMAT}")
         try:
             os.link(part, path)
         except FileExistsError:
@@ -531,11 +530,11 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
             "a store of prbayes",
             "nothing was changed: pass another folder",
         )
-    (layout,) = connection.execute("PRAGMA user_version").fetchone()
-    if layout != _LAYOUT:
+    (number,) = connection.execute("PRAGMA user_version").fetchone()
+    if number != FORMAT:
         raise _FileError(
-            f"which has layout {layout}",
-            f"layout {_LAYOUT}",
+            f"which has format {number}",
+            f"format {FORMAT} (numbers below 10 are those of release candidates)",
             "use the version of prbayes that wrote it, or pass another folder",
         )
     tables = connection.execute("SELECT sql FROM sqlite_master ORDER BY name").fetchall()
