@@ -146,9 +146,22 @@ class Store:
         return len(self._read().values)
 
     def find(self, inputs: Floats) -> tuple[Floats, Bools]:
-        """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
+        """Return stored responses, and whether there is one.
 
-        Several outputs have shape (n, m).
+        Parameters
+        ----------
+        inputs : ndarray, shape (n, columns)
+
+        Returns
+        -------
+        responses : ndarray, shape (n,) or (n, m)
+            NaN where there is none.
+        is_known : ndarray of bool, shape (n,)
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be read, or is damaged.
         """
         session = self._read()
         values = [session.values.get(key) for key in _keys(inputs)]
@@ -157,7 +170,22 @@ class Store:
         return self._as_array(session, (v or missing for v in values)), is_known
 
     def failed(self, inputs: Floats) -> dict[int, str]:
-        """Return the reasons of those inputs, (n, columns), that are stored as failed, by row."""
+        """Return the reasons of inputs that are stored as failed.
+
+        Parameters
+        ----------
+        inputs : ndarray, shape (n, columns)
+
+        Returns
+        -------
+        dict of int to str
+            By row.
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be read, or is damaged.
+        """
         failed = self._read().failed
         if not failed:
             return {}
@@ -181,11 +209,27 @@ class Store:
         values : ndarray, shape (n,) or (n, m)
         reasons : mapping, optional
             Reasons of failed responses, by row.
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be written, is locked for a minute, or is damaged.
         """
         self.add_all([(inputs, values, reasons or {})])
 
     def add_all(self, parts: Iterable[tuple[Floats, Floats, Mapping[int, str]]]) -> None:
-        """Append several batches of responses as `add` does, all or none of them."""
+        """Append several batches of responses, all or none of them.
+
+        Parameters
+        ----------
+        parts : iterable of tuple
+            Arguments of `add`, with ``reasons`` as a mapping.
+
+        Raises
+        ------
+        StoreError
+            As for `add`.
+        """
         session = self._read()
         rows = []
         for inputs, values, reasons in parts:
