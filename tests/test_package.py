@@ -107,6 +107,19 @@ def test_the_conda_recipe_is_of_this_version_and_program() -> None:
     assert RECIPE["build"]["python"]["entry_points"] == [" = ".join(script)]
 
 
+def test_all_files_name_the_version_and_whether_it_is_a_candidate() -> None:
+    project = PROJECT["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == project["version"]
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## \[([^\]]+)\]", changelog, re.MULTILINE)[1] == project["version"]  # type: ignore[index]
+    is_candidate = "rc" in project["version"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert ("release candidate" in readme) is is_candidate
+    assert any("4 - Beta" in name for name in project["classifiers"]) is is_candidate
+    assert ("date-released" in citation) is not is_candidate
+
+
 def test_every_python_of_the_classifiers_is_allowed() -> None:
     listed = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]))
     allowed = SpecifierSet(PROJECT["project"]["requires-python"])
