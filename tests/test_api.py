@@ -141,6 +141,15 @@ def test_only_keywords_with_defaults_may_be_added(signature: str, is_kept: bool)
     assert broken({"fmu": "(x)"}, {}) == []
 
 
+def test_what_is_experimental_is_in_the_documentation() -> None:
+    page = (FILE.parents[1] / "docs/stability.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.*) \|.*\|$", page.partition("## Experimental")[2], re.MULTILINE)
+    names = re.findall(r"`(?:prb\.)?([\w.]+)`", "\n".join(rows))
+    names = [f"response.{name}" if name in prbayes.response.__all__ else name for name in names]
+    assert len(names) == 6
+    assert all(EXPERIMENTAL.match(name) for name in names)
+
+
 def test_public_names_and_signatures_are_those_that_are_promised() -> None:
     promised = json.loads(FILE.read_text(encoding="utf-8"))
     assert json.loads(as_text()) == promised, (
