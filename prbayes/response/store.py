@@ -222,7 +222,7 @@ class Store:
 
         Parameters
         ----------
-        parts : iterable of tuple
+        parts : sequence of tuple
             Arguments of `add`, with ``reasons`` as a mapping.
 
         Raises
