@@ -24,7 +24,7 @@ from benchmarks.scoreboard.problems import PROBLEMS
 
 DOCS = Path(__file__).parents[1] / "docs"
 SCOREBOARD = DOCS / "appendix/scoreboard.csv"
-PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md")])
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md"), DOCS.parent / "paper/paper.md"])
 Row = Iterable[str]
 
 

@@ -36,6 +36,10 @@ IN_CACHE = 1 << 18
 # Largest measured value, so that sums of squares stay finite.
 _LARGEST = 1e152
 
+# Number of the format of all files that this version writes and reads; release candidates have
+# lower numbers, or none.
+FORMAT = 10
+
 Shape = tuple[int, ...]  # sizes of the axes of an array
 Labels = Mapping[str, str]  # labels, units or other texts by name
 StrPath = str | os.PathLike[str]  # path of a file or folder
@@ -54,6 +58,15 @@ def called(value: object) -> str:
 def wrong_type(value: object, name: str, expected: str) -> TypeError:
     """Return the error for an argument of another type."""
     return TypeError(f"{name}: got {type(value).__name__}, expected {expected}")
+
+
+def require_format(got: object) -> None:
+    """Raise a ValueError unless a file has the format of this version; ``got`` is its number."""
+    if str(got) != str(FORMAT):
+        raise ValueError(
+            f"got a file of format {got!s:.20}, expected {FORMAT}; numbers below 10, or none, are "
+            "those of release candidates: use the version that wrote it, or compute it again"
+        )
 
 
 # -- arrays ----------------------------------------------------------------------------------

@@ -1,22 +1,36 @@
 """Public names and signatures are those of `tests/api.json`, which docs/stability.md promises.
 
-After a change that is wanted, write the file again:
+After names or keywords were added, write the file again:
 
     uv run python tests/test_api.py
+
+It refuses what version 1 does not allow: names and parameters that are gone, moved or have other
+defaults, and new parameters that are positional or have no default. Only version 2 may remove a
+name, one that has raised a FutureWarning before.
 """
 
 from __future__ import annotations
 
+import ast
 import inspect
 import json
 import re
+import sys
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import prbayes
 
 FILE = Path(__file__).with_name("api.json")
+TEMPLATE = FILE.parents[1] / "docs/_templates/autosummary/class.rst"
+# Names that docs/stability.md lists as experimental.
+EXPERIMENTAL = re.compile(
+    r"Metric$|metrics$|propagation$|families$|calibrate_each$|fmu$"
+    r"|response\.(Additive|Multiplicative|Smooth)$"
+)
 
 
 def signature(value: Any) -> str:
@@ -66,6 +80,76 @@ def as_text() -> str:
     return json.dumps(public(prbayes), indent=1, sort_keys=True) + "\n"
 
 
+def extends(promised: str, signature: str) -> bool:
+    """Return whether a signature adds nothing but keywords with defaults."""
+    if "(" not in promised or "(" not in signature:
+        return False
+    (old, old_keywords), (new, keywords) = map(parameters, (promised, signature))
+    added = keywords.keys() - old_keywords.keys()
+    kept = old_keywords.items() <= keywords.items()
+    return old == new and kept and None not in {keywords[name] for name in added}
+
+
+def parameters(signature: str) -> tuple[list[Any], dict[str, str | None]]:
+    """Return positional parameters in order, and keywords, with their defaults."""
+    (function,) = ast.parse(f"def f{signature}: ...").body
+    assert isinstance(function, ast.FunctionDef)
+    found = function.args
+    positional = [ast.dump(x) for x in (*found.posonlyargs, *found.args, *found.defaults)]
+    pairs = zip(found.kwonlyargs, found.kw_defaults, strict=True)
+    return [*positional, found.vararg and found.vararg.arg, found.kwarg and found.kwarg.arg], {
+        name.arg: default and ast.dump(default) for name, default in pairs
+    }
+
+
+def broken(promised: dict[str, Any], names: dict[str, Any], path: str = "") -> list[str]:
+    """Return the promises on names and signatures that a version does not keep."""
+    problems = []
+    template = TEMPLATE.read_text(encoding="utf-8")
+    for name, old in promised.items():
+        where = f"{path}{name}"
+        new = names.get(name)
+        if EXPERIMENTAL.match(where) or old == new:
+            continue
+        if isinstance(old, dict) and "()" in old and f'"{name}"' not in template:
+            old = {"()": old["()"]}  # the reference shows no methods of this class
+        if isinstance(old, dict) and isinstance(new, dict):
+            problems += broken(old, new, f"{where}.")
+        elif not (isinstance(new, str) and extends(old, new)):
+            problems.append(f"{where}: got {new}, promised {old}")
+    return problems
+
+
+@pytest.mark.parametrize(
+    ("signature", "is_kept"),
+    [
+        ("(x, y=1, *, z=2)", True),
+        ("(x, y=1, *, new=None, z=2)", True),
+        ("(x, y=1, *, new, z=2)", False),
+        ("(x, y=1, new=0, *, z=2)", False),
+        ("(x, y=2, *, z=2)", False),
+        ("(x, y=1, *, z=3)", False),
+        ("(y, x=1, *, z=2)", False),
+        ("(x, y=1)", False),
+        ("attribute", False),
+    ],
+)
+def test_only_keywords_with_defaults_may_be_added(signature: str, is_kept: bool) -> None:
+    promised = {"space": {"f": "(x, y=1, *, z=2)"}}
+    assert (broken(promised, {"space": {"f": signature, "g": "()"}}) == []) is is_kept
+    assert broken(promised, {"space": {}}) == ["space.f: got None, promised (x, y=1, *, z=2)"]
+    assert broken({"fmu": "(x)"}, {}) == []
+
+
+def test_what_is_experimental_is_in_the_documentation() -> None:
+    page = (FILE.parents[1] / "docs/stability.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.*) \|.*\|$", page.partition("## Experimental")[2], re.MULTILINE)
+    names = re.findall(r"`(?:prb\.)?([\w.]+)`", "\n".join(rows))
+    names = [f"response.{name}" if name in prbayes.response.__all__ else name for name in names]
+    assert len(names) == 6
+    assert all(EXPERIMENTAL.match(name) for name in names)
+
+
 def test_public_names_and_signatures_are_those_that_are_promised() -> None:
     promised = json.loads(FILE.read_text(encoding="utf-8"))
     assert json.loads(as_text()) == promised, (
@@ -74,4 +158,6 @@ def test_public_names_and_signatures_are_those_that_are_promised() -> None:
 
 
 if __name__ == "__main__":
+    if problems := broken(json.loads(FILE.read_text(encoding="utf-8")), public(prbayes)):
+        sys.exit("\n".join(problems))
     FILE.write_text(as_text(), encoding="utf-8")

@@ -628,8 +628,8 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         own="result observed",
     ),
     "plots.plot_landscape": Row(
-        responses=(*ZERO_OR_MORE, None),
-        own="responses",
+        max_responses=(*ZERO_OR_MORE, None),
+        own="max_responses",
     ),
     "plots.plot_outputs": Row(
         {"result": Later(of_two_outputs), "model": two_outputs},

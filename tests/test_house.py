@@ -10,6 +10,7 @@ import re
 import runpy
 import subprocess
 import sys
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -195,19 +196,67 @@ def test_files_print_nothing_and_evaluate_nothing() -> None:
     assert not violations, "\n".join(violations)
 
 
-def test_public_functions_and_configurations_have_an_example() -> None:
-    missing = [
-        name
-        for name, value in PUBLIC.items()
-        if name.split(".")[-1] not in WITHOUT_EXAMPLE
-        and not ("Examples\n" in value.__doc__ and ">>> " in value.__doc__)
-    ]
-    assert not missing
+def sections(value: Any) -> dict[str, str]:
+    """Return the sections of a numpydoc docstring, and its summary, by title."""
+    text = f"Summary\n---\n{inspect.getdoc(value)}"
+    parts = re.split(r"^([A-Z][a-z]+)\n---+\n", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
-def test_the_summary_of_a_public_name_is_one_sentence() -> None:
-    summaries = {name: value.__doc__.strip().splitlines()[0] for name, value in PUBLIC.items()}
-    assert not [name for name, summary in summaries.items() if not summary.endswith(".")]
+def documented(value: Any) -> set[str]:
+    """Return the parameters that a docstring describes; a base class has attributes."""
+    parts = sections(value)
+    text = parts.get("Parameters", "") + parts.get("Attributes", "")
+    lines = re.findall(r"^([*\w, ]+?)(?: :.*)?$", text, re.MULTILINE)
+    return {name.strip(" *") for line in lines for name in line.split(",")}
+
+
+def members_in_the_reference() -> dict[str, Any]:
+    """Return the methods with arguments that pages of classes show, by name."""
+    template = (ROOT / "docs/_templates/autosummary/class.rst").read_text(encoding="utf-8")
+    shown = set(re.findall(r'"(\w+)"', template.partition("in [")[2].partition("]")[0]))
+    hidden = re.findall(r"\w+", template.partition("exclude-members:")[2].partition("\n")[0])
+    return {
+        f"{name}.{key}": getattr(value, "__func__", value)
+        for name, cls in PUBLIC.items()
+        if name.split(".")[-1] in shown - WITHOUT_EXAMPLE | {"Store", "Optimum", "ValidityTest"}
+        for key, value in vars(cls).items()
+        if key[0] != "_" and key not in hidden
+        if inspect.isfunction(getattr(value, "__func__", value))
+    }
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_public_name_has_all_sections(name: str) -> None:
+    value = PUBLIC[name]
+    parts = sections(value)
+    assert parts["Summary"].splitlines()[0].endswith(".")
+    is_base = name.split(".")[-1] in WITHOUT_EXAMPLE
+    assert is_base or ">>> " in parts["Examples"]
+    if not (is_base and issubclass(value, Exception | Enum)):
+        parameters = inspect.signature(value).parameters
+        assert parameters.keys() <= documented(value)
+        assert is_base or not parameters or "Raises" in parts
+    assert inspect.isclass(value) or "Returns" in parts or returns_nothing(value)
+
+
+def returns_nothing(function: Any) -> bool:
+    """Return whether a function is annotated so."""
+    return inspect.signature(function).return_annotation in ("None", None)
+
+
+METHODS = members_in_the_reference()
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_a_method_of_the_reference_has_all_sections(name: str) -> None:
+    method = METHODS[name]
+    parts = sections(method)
+    arguments = inspect.signature(method).parameters.keys() - {"self", "cls"}
+    assert parts["Summary"].splitlines()[0].endswith(".")
+    assert arguments <= documented(method)
+    assert not arguments or "Raises" in parts
+    assert not arguments or "Returns" in parts or returns_nothing(method)
 
 
 def test_no_module_at_the_top_has_the_name_of_a_public_function() -> None:
@@ -331,18 +380,28 @@ def test_seeds_are_zero_by_default() -> None:
             assert parameters["random_seed"].default == 0, name
 
 
+DESIGN = (ROOT / "DESIGN.md").read_text(encoding="utf-8")
+
+
 def test_design_shows_the_rooms_in_their_own_words() -> None:
-    page = (ROOT / "DESIGN.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \| (.*) \| (.*)\|$", page, flags=re.MULTILINE)
-    shown = {name: (words, files.strip()) for name, words, files in rows}
-    assert set(shown) == {room(module) for module in MODULES - {""}} - {"__init__"}
-    for name, (words, files) in shown.items():
+    rows = dict(re.findall(r"^\| `(\w+)(?:/|\.py)` \| (.*) \|$", DESIGN, flags=re.MULTILINE))
+    assert set(rows) == {room(module) for module in MODULES - {""}} - {"__init__"}
+    for name, words in rows.items():
         folder = PACKAGE / name
         path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
         summary = (ast.get_docstring(parsed(path)) or "").split("\n\n")[0].replace("\n", " ")
         assert words == summary, f"DESIGN.md says of {name}: {words}; the module: {summary}"
-        inside = sorted(p.stem for p in folder.glob("*.py") if p.stem != "__init__")
-        assert files == (", ".join(inside) or ("-" if folder.is_dir() else ""))
+
+
+def test_design_names_what_there_is() -> None:
+    defined = {path.stem for path in FILES} | {path.parent.name for path in FILES}
+    for path in FILES:
+        text = path.read_text(encoding="utf-8")
+        defined |= set(re.findall(r"^ *(?:class|def) (\w+)", text, re.MULTILINE))
+        defined |= set(re.findall(r"^([A-Z]\w*) = ", text, re.MULTILINE))
+    named = set(re.findall(r"`(?:prb\.)?(\w+)`", DESIGN))
+    assert named - defined == set()
+    assert len(DESIGN.split()) < 1300  # two pages
 
 
 @pytest.mark.long

@@ -2,11 +2,14 @@
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
@@ -104,9 +107,64 @@ def test_the_conda_recipe_is_of_this_version_and_program() -> None:
     assert RECIPE["build"]["python"]["entry_points"] == [" = ".join(script)]
 
 
+def test_all_files_name_the_version_and_whether_it_is_a_candidate() -> None:
+    project = PROJECT["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == project["version"]
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## \[([^\]]+)\]", changelog, re.MULTILINE)[1] == project["version"]  # type: ignore[index]
+    is_candidate = "rc" in project["version"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert ("release candidate" in readme) is is_candidate
+    assert any("4 - Beta" in name for name in project["classifiers"]) is is_candidate
+    assert ("date-released" in citation) is not is_candidate
+
+
 def test_every_python_of_the_classifiers_is_allowed() -> None:
     listed = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]))
     allowed = SpecifierSet(PROJECT["project"]["requires-python"])
     assert listed == ["3.12", "3.13"]
     assert listed[0] in allowed
     assert "3.11" not in allowed
+
+
+LICENCES = dict(
+    re.findall(
+        r"^\| (.+) \| ([^|]+) \|$",
+        (ROOT / "docs/install.md").read_text(encoding="utf-8").partition("## Licences")[2],
+        re.MULTILINE,
+    )
+)
+
+
+def test_every_requirement_has_its_licence_in_the_documentation() -> None:
+    packages = [name for name in LICENCES if re.fullmatch(r"[a-z0-9]+", name)]
+    assert sorted(packages) == sorted({*REQUIRED, *EXTRAS, "package", "data"})
+
+
+@pytest.mark.parametrize("name", [*REQUIRED, *EXTRAS])
+def test_the_licence_of_a_requirement_is_that_of_the_installed_package(name: str) -> None:
+    try:
+        package = distribution(name)
+    except PackageNotFoundError:
+        pytest.skip("not installed: an extra")
+    declared = [str(package.metadata.get("License-Expression", ""))]
+    declared += [str(package.metadata.get("License", ""))]
+    declared += package.metadata.get_all("Classifier") or []
+    paths = [path for path in package.files or [] if path.name.upper().startswith("LICEN")]
+    texts = [path.read_text(encoding="utf-8") for path in paths if path.suffix != ".json"]
+    text = "\n".join(declared + texts)
+    # A classifier names the family only.
+    families = {"PSF": "Python Software Foundation", "Apache-2.0": "Apache"}
+    licences = re.findall(r"[A-Z][\w.]+(?:-[\w.]+)*", LICENCES[name])
+    names = [families.get(licence, licence.partition("-")[0]) for licence in licences]
+    assert any(re.search(rf"\b{family}\b", text) for family in names)
+
+
+def test_all_data_in_the_repository_have_a_licence() -> None:
+    listed = re.findall(r"`([^`]+)`", " ".join(LICENCES))
+    command = ["git", "ls-files", "*.csv"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    paths = done.stdout.split()
+    assert not [p for p in paths if not any(p.startswith(name) for name in listed)]
+    assert all((ROOT / name).exists() for name in listed)

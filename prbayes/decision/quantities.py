@@ -94,7 +94,19 @@ class Quantity(ABC):
 class Mean(Quantity):
     """The mean of a response over the population.
 
-    Parameters are those of `Quantity`.
+    Parameters
+    ----------
+    response : callable
+        As for `Simulator`; that of a simulator of the model, or another one of the same specimens.
+    *inputs
+        As for `predict`.
+    output : label, optional
+        Which output, where a run of the response gives several: a label, or its place.
+
+    Raises
+    ------
+    TypeError
+        If the response is not callable.
 
     Examples
     --------
@@ -114,7 +126,19 @@ class Mean(Quantity):
 class StandardDeviation(Quantity):
     """The standard deviation of a response over the population.
 
-    Parameters are those of `Quantity`.
+    Parameters
+    ----------
+    response : callable
+        As for `Simulator`; that of a simulator of the model, or another one of the same specimens.
+    *inputs
+        As for `predict`.
+    output : label, optional
+        Which output, where a run of the response gives several: a label, or its place.
+
+    Raises
+    ------
+    TypeError
+        If the response is not callable.
 
     Examples
     --------

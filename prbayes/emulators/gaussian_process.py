@@ -95,7 +95,7 @@ class GaussianProcess(KernelSurface):
         return (self,) if self.lengths is None else (Following(self),)
 
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, random_seed: int = 0
     ) -> Kriging | None:
         """Return the process given the runs; None if its matrix is singular."""
         n, d = z.shape

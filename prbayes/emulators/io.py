@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats, StrPath
+from prbayes._validate import FORMAT, Floats, StrPath, require_format
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Range, Ranges
@@ -66,7 +66,7 @@ def write_surrogate(path: StrPath, surrogate: Any, probes: Floats) -> None:
             "population_sd": (output, surrogate.error.population_sd),
             "probes": (["probe", *output], probes),
         },
-        attrs={"prbayes_surrogate": 1, "configuration": json.dumps(configuration)},
+        attrs={"prbayes_format": FORMAT, "configuration": json.dumps(configuration)},
     )
     replace_files({Path(path): bytes(data.to_netcdf(engine="h5netcdf"))}, "Surrogate.save: path")
 
@@ -76,6 +76,7 @@ def read_surrogate(path: StrPath) -> SavedSurrogate:
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:
             data.load()
+        require_format(data.attrs.get("prbayes_format"))
         config = json.loads(data.attrs["configuration"])
         # JSON has turned tuples into lists.
         kind = config["model"].pop("kind")

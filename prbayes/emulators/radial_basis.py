@@ -76,7 +76,7 @@ class RadialBasis(KernelSurface):
         return self.degree if isinstance(self.degree, int) else _LOWEST_DEGREE[self.kernel]
 
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, random_seed: int = 0
     ) -> Kriging | None:
         """Return the surface; None if the runs determine none."""
         n, d = z.shape

@@ -103,6 +103,10 @@ class Runs(Shown):
         delimiter, decimal : str
             Characters between columns, and before decimals.
 
+        Returns
+        -------
+        Runs
+
         Raises
         ------
         ValueError

@@ -94,7 +94,7 @@ class Surface(ABC):
         """
 
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, random_seed: int = 0
     ) -> FittedSurface | None:
         """Return the surface with its derivatives and errors; None if the runs determine none.
 
@@ -107,12 +107,12 @@ class Surface(ABC):
             Weights of squared left-out errors, of sum one.
         start : FittedSurface, optional
             A surface through earlier runs, whose settings are near those of this one.
-        seed : int
+        random_seed : int
             Of the tenths of the runs that are left out.
         """
         if len(z) <= self.terms(z.shape[1]):
             return None
-        order = np.random.default_rng(seed).permutation(len(z))
+        order = np.random.default_rng(random_seed).permutation(len(z))
         folds = np.zeros((min(FOLDS, len(z)), len(z)), dtype=bool)
         for fold, rows in zip(folds, np.array_split(order, len(folds)), strict=True):
             fold[rows] = True
@@ -135,7 +135,7 @@ class KernelSurface(Surface):
 
     @abstractmethod
     def fit(
-        self, z: Floats, y: Floats, weights: Floats, start: Any = None, seed: int = 0
+        self, z: Floats, y: Floats, weights: Floats, start: Any = None, random_seed: int = 0
     ) -> Kriging | None:
         """Return the surface with its derivatives and errors; None if the runs determine none."""
 

@@ -272,6 +272,10 @@ class Surrogate(RunRecord, Shown):
         progressbar : bool
             Whether work of more than two seconds shows a bar on stderr.
 
+        Returns
+        -------
+        Surrogate
+
         Raises
         ------
         TypeError, ValueError
@@ -365,6 +369,10 @@ class Surrogate(RunRecord, Shown):
         outside : OnFailure, optional
         random_seed : int, sequence of int, numpy.random.Generator or None
             Of the parts that cross-validation leaves out.
+
+        Returns
+        -------
+        Surrogate
 
         Raises
         ------
@@ -502,6 +510,11 @@ class Surrogate(RunRecord, Shown):
         -------
         ndarray, shape (...) or (..., m)
             In units of the response.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the inputs are not those of the surrogate.
         """
         columns, batch = self.domain.columns(inputs)
         residuals = self._surface.nearby(self.error.residuals, columns)
@@ -521,6 +534,15 @@ class Surrogate(RunRecord, Shown):
         ----------
         random_seed : int, sequence of int, numpy.random.Generator or None
 
+        Returns
+        -------
+        Surrogate
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the seed is none.
+
         Examples
         --------
         >>> import numpy as np, prbayes as prb
@@ -536,6 +558,13 @@ class Surrogate(RunRecord, Shown):
         Parameters
         ----------
         path : path-like
+
+        Raises
+        ------
+        ValueError
+            If the path is none, or its folder does not exist.
+        OSError
+            If the file cannot be written.
         """
         path = file_path(path, "path")
         if not path.absolute().parent.is_dir():
@@ -566,10 +595,14 @@ class Surrogate(RunRecord, Shown):
             The coarse response, where the surrogate follows one: for the same reason. It is called
             at the design. A surrogate that follows none needs none.
 
+        Returns
+        -------
+        Surrogate
+
         Raises
         ------
         StoreError
-            If the file cannot be read, or is no surrogate.
+            If the file cannot be read, is no surrogate, or has another format.
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """

@@ -272,6 +272,8 @@ class DensityDiscrepancy(Discrepancy):
 
     Attributes
     ----------
+    metric, observed, weights
+        As for `Discrepancy`.
     cells : Cells
         Laid out once, from the values that the metric was prepared with.
     density : ndarray, shape (m,) or (..., m)

@@ -18,6 +18,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
+from prbayes._validate import FORMAT
 from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
@@ -29,7 +30,16 @@ from prbayes.response.pymc_dims import is_random
 
 # Fields in the description of a variable, and in that of a simulator.
 _VARIABLE = ("name", "role", "distribution")
-_SIMULATOR = ("name", "response", "metric", "propagation", "n_points", "specimens")
+_SIMULATOR = (
+    "name",
+    "response",
+    "metric",
+    "propagation",
+    "n_points",
+    "specimens",
+    "n_specimens",
+    "runs",
+)
 
 _CONSTANT = "<constant>"  # PyMC prints this text instead of an array
 
@@ -157,16 +167,9 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
 
 
 def _stored_simulator(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored description of a simulator; 1.0.0rc1 has stored the inputs as one text."""
     texts = {key: str(stored[key]) for key in _SIMULATOR}
-    inputs = stored["inputs"]
-    rows = [["", "", inputs]] if isinstance(inputs, str) else inputs
-    return {
-        **texts,
-        "inputs": [[str(name), str(unit), str(text)] for name, unit, text in rows],
-        "n_specimens": str(stored.get("n_specimens", "")),
-        "runs": str(stored.get("runs", stored["propagation"])),
-    }
+    rows = [[str(name), str(unit), str(text)] for name, unit, text in stored["inputs"]]
+    return {**texts, "inputs": rows}
 
 
 def as_pymc_writes(rv: Any, named: Set[Any]) -> str:
@@ -224,10 +227,14 @@ def _parents(variable: Any, named: Set[Any]) -> str:
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
+    """Return the versions that a result depends on, and the format of its attributes."""
     packages = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy")
     result = {f"{package}_version": importlib.metadata.version(package) for package in packages}
-    return {**result, "python_version": platform.python_version()}
+    return {
+        **result,
+        "prbayes_format": str(FORMAT),
+        "python_version": platform.python_version(),
+    }
 
 
 def arviz_attributes() -> dict[str, str]:

@@ -22,7 +22,7 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Shape
+from prbayes._validate import Floats, Shape, require_format
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
@@ -297,7 +297,12 @@ def as_attributes(identity: Identity | None) -> dict[str, str]:
 
 
 def identity_from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
-    """Return the identity that a file has; None for results of other tools."""
+    """Return the identity that a file has; None for results of other tools.
+
+    Results of release candidates, and of later formats, raise a ValueError.
+    """
+    if "prbayes_version" in attributes:
+        require_format(attributes.get("prbayes_format"))
     try:
         return from_text(attributes["identity"])
     except (AttributeError, KeyError, TypeError, ValueError):

@@ -44,8 +44,8 @@ def plot_landscape(
     var_names: VarNames | None = None,
     filter_vars: FilterVars | None = None,
     coords: Coords | None = None,
-    points: int | None = None,
-    responses: int = 0,
+    n_points: int | None = None,
+    max_responses: int = 0,
     labels: Labels | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
@@ -70,9 +70,9 @@ def plot_landscape(
         How ``var_names`` are read, as by ArviZ.
     coords : mapping, optional
         Labels of the hyperparameters by dimension, such as ``{"supplier": "Adler"}``.
-    points : int, optional
-        Along each axis; 41, or 161 for a curve.
-    responses : int
+    n_points : int, optional
+        Number along each axis; 41, or 161 for a curve.
+    max_responses : int
         Largest number of responses that may be computed. With `Reweighted` none is; with
         `Resimulated` and `Fresh` every point of the picture costs n for each simulator.
     labels : mapping, optional
@@ -105,7 +105,7 @@ def plot_landscape(
     'discrepancy (area metric)'
     """
     check_options(labels, pc_kwargs)
-    positive_integer(responses, "responses", minimum=0)
+    positive_integer(max_responses, "max_responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
     hyperparameters = select_free(optimum)
@@ -114,22 +114,22 @@ def plot_landscape(
         raise ValueError(f"plot_landscape: var_names: got {names}, expected one or two of them")
     names = names[:2]
     refuse_labels(labels, hyperparameters, evaluator=evaluator)
-    if points is None:
+    if n_points is None:
         # Curve and contours look smooth, and take about a second.
-        points = 161 if len(names) == 1 else 41
+        n_points = 161 if len(names) == 1 else 41
     else:
         # Fewer points would not show where the objective is lowest.
-        points = positive_integer(points, "points", minimum=5)
-    n_points = points ** len(names)
-    cost = n_points * evaluator.responses_per_theta
-    if cost > responses:
+        n_points = positive_integer(n_points, "n_points", minimum=5)
+    n_all = n_points ** len(names)
+    cost = n_all * evaluator.responses_per_theta
+    if cost > max_responses:
         raise ValueError(
-            f"plot_landscape: got responses={responses}, expected at least {cost}: {n_points} "
-            f"points with {evaluator.responses_per_theta} responses each; pass responses={cost}, "
-            "fewer points, or use prb.Reweighted(), whose pictures cost none"
+            f"plot_landscape: got max_responses={max_responses}, expected at least {cost}: {n_all} "
+            f"points with {evaluator.responses_per_theta} responses each; pass "
+            f"max_responses={cost}, fewer points, or use prb.Reweighted(), whose pictures cost none"
         )
 
-    surface = landscape(optimum, evaluator, names, points)
+    surface = landscape(optimum, evaluator, names, n_points)
     if not np.isfinite(surface.heights).any():
         raise ValueError(
             "plot_landscape: got no finite objective, expected some around the optimum; look at "

@@ -21,12 +21,14 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
 from prbayes._stats import positive_scale
 from prbayes._validate import (
+    FORMAT,
     Floats,
     NamedArrays,
     StrPath,
     called,
     positive_integer,
     real_array,
+    require_format,
     share,
 )
 from prbayes.model.evaluator import Evaluator, epsilons
@@ -337,7 +339,6 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
     return thetas
 
 
-_FORMAT = 6  # version of a file's content; files of other versions are refused
 _DIGEST = hashlib.sha256
 
 
@@ -368,7 +369,7 @@ class Checkpoint:
             dims = [f"{name}_{i}" for i in range(np.ndim(array))]
             variables[name] = (dims, np.asarray(array))
         attributes = {
-            "prbayes_checkpoint": _FORMAT,
+            "prbayes_format": FORMAT,
             "problem": as_text(self.problem),
             "settings": json.dumps(self.settings),
             "note": json.dumps(note),
@@ -396,14 +397,12 @@ class Checkpoint:
                 raise ValueError("it is damaged, or of another version: no digest at its end")
             with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as file:
                 data = file.load()
-            written_in = int(data.attrs["prbayes_checkpoint"])
+            require_format(data.attrs.get("prbayes_format"))
             problem = from_text(data.attrs["problem"])
             settings, note = (json.loads(data.attrs[key]) for key in ("settings", "note"))
         except Exception as error:
             reason = f"cannot be read ({type(error).__name__}: {error})"
             raise StoreError(self._refusal(reason)) from error
-        if written_in != _FORMAT:
-            raise StoreError(self._refusal("was written by another version of prbayes"))
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = settings["entropy"]
         reasons = problem_differences(problem, self.problem, Level.RUN)

@@ -261,7 +261,13 @@ def valid_parents(bound: Bound, params: Sequence[Floats]) -> list[Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Propagation(ABC):
-    """How a population of inputs becomes responses, with options of calling the response."""
+    """How a population of inputs becomes responses, with options of calling the response.
+
+    Parameters
+    ----------
+    executor, store, version, on_failure, retry_failed, timeout
+        As for `Reweighted`.
+    """
 
     executor: Executor | None = field(default=None, repr=False)
     store: StrPath | None = field(default=None, repr=False)

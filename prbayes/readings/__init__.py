@@ -6,7 +6,7 @@ from prbayes.readings.combined import Combined
 from prbayes.readings.negative_binomial import NegativeBinomial
 from prbayes.readings.poisson import Poisson
 
-# Distributions of counts, by their index in `prbayes.metrics.readings`.
+# Distributions of counts; `prbayes.metrics.readings` stores their index.
 COUNTS: tuple[type[Count], ...] = (Poisson, NegativeBinomial, Binomial)
 
 __all__ = ["Binomial", "Combined", "NegativeBinomial", "Poisson", "ReadingDistribution"]

@@ -195,8 +195,14 @@ class Report:
         after : str, optional
             Title of the section that it follows, with all its parts; at the end by default.
 
+        Returns
+        -------
+        Report
+
         Raises
         ------
+        TypeError
+            If the section is no `Section`.
         KeyError
             If no section has that title.
         """
@@ -216,16 +222,47 @@ class Report:
         return replace(self, sections=sections)
 
     def to_html(self, path: StrPath) -> Path:
-        """Write one file with everything, for a browser and for print; return its path.
+        """Write one file with everything, for a browser and for print.
 
-        A file of this name is replaced; it is kept if the new one cannot be written (`OSError`).
+        A file of this name is replaced; it is kept if the new one cannot be written.
+
+        Parameters
+        ----------
+        path : path-like
+
+        Returns
+        -------
+        pathlib.Path
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the path is none.
+        OSError
+            If the file cannot be written.
         """
         return _write(file_path(path, "path"), self._html(), {})
 
     def to_markdown(self, folder: StrPath) -> Path:
-        """Write ``report.md`` into a folder, with pictures beside it; return its path.
+        """Write ``report.md`` into a folder, with pictures beside it.
 
         Files of these names are replaced, all of them or none.
+
+        Parameters
+        ----------
+        folder : path-like
+
+        Returns
+        -------
+        pathlib.Path
+            That of ``report.md``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the folder is none.
+        OSError
+            If a file cannot be written.
         """
         folder = folder_path(folder, "folder")
         files: list[str | None] = []

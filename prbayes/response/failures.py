@@ -104,7 +104,7 @@ class Retry(OnFailure):
 
     Parameters
     ----------
-    times : int
+    retries : int
         Number of further tries.
     then : OnFailure
         `Abort` or `Replace`.
@@ -112,20 +112,20 @@ class Retry(OnFailure):
     Raises
     ------
     TypeError, ValueError
-        If ``times`` is not a positive integer, or ``then`` is no policy or another `Retry`.
+        If ``retries`` is not a positive integer, or ``then`` is no policy or another `Retry`.
 
     Examples
     --------
     >>> Retry(2, then=Replace())
-    Retry(times=2, then=Replace(value=nan))
+    Retry(retries=2, then=Replace(value=nan))
     """
 
-    times: int = 1
+    retries: int = 1
     _: KW_ONLY
     then: OnFailure = Replace()
 
     def __post_init__(self) -> None:
-        positive_integer(self.times, "Retry: times")
+        positive_integer(self.retries, "Retry: retries")
         if not isinstance(self.then, OnFailure) or self.then.final is not self.then:
             got = type(self.then).__name__
             raise TypeError(
@@ -134,8 +134,8 @@ class Retry(OnFailure):
 
     @property
     def tries(self) -> int:
-        """One try more than ``times``."""
-        return 1 + self.times
+        """One try more than ``retries``."""
+        return 1 + self.retries
 
     @property
     def final(self) -> OnFailure:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Bools, Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import FORMAT, Bools, Floats, plain_text, positive_integer, stated_path
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -146,9 +146,22 @@ class Store:
         return len(self._read().values)
 
     def find(self, inputs: Floats) -> tuple[Floats, Bools]:
-        """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
+        """Return stored responses, and whether there is one.
 
-        Several outputs have shape (n, m).
+        Parameters
+        ----------
+        inputs : ndarray, shape (n, columns)
+
+        Returns
+        -------
+        responses : ndarray, shape (n,) or (n, m)
+            NaN where there is none.
+        is_known : ndarray of bool, shape (n,)
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be read, or is damaged.
         """
         session = self._read()
         values = [session.values.get(key) for key in _keys(inputs)]
@@ -157,7 +170,22 @@ class Store:
         return self._as_array(session, (v or missing for v in values)), is_known
 
     def failed(self, inputs: Floats) -> dict[int, str]:
-        """Return the reasons of those inputs, (n, columns), that are stored as failed, by row."""
+        """Return the reasons of inputs that are stored as failed.
+
+        Parameters
+        ----------
+        inputs : ndarray, shape (n, columns)
+
+        Returns
+        -------
+        dict of int to str
+            By row.
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be read, or is damaged.
+        """
         failed = self._read().failed
         if not failed:
             return {}
@@ -181,11 +209,27 @@ class Store:
         values : ndarray, shape (n,) or (n, m)
         reasons : mapping, optional
             Reasons of failed responses, by row.
+
+        Raises
+        ------
+        StoreError
+            If the file cannot be written, is locked for a minute, or is damaged.
         """
         self.add_all([(inputs, values, reasons or {})])
 
     def add_all(self, parts: Iterable[tuple[Floats, Floats, Mapping[int, str]]]) -> None:
-        """Append several batches of responses as `add` does, all or none of them."""
+        """Append several batches of responses, all or none of them.
+
+        Parameters
+        ----------
+        parts : sequence of tuple
+            Arguments of `add`, with ``reasons`` as a mapping.
+
+        Raises
+        ------
+        StoreError
+            As for `add`.
+        """
         session = self._read()
         rows = []
         for inputs, values, reasons in parts:
@@ -369,7 +413,6 @@ def _numbers(values: Iterable[bytes]) -> Floats:
 
 # Distinguishes stores from other databases (https://www.sqlite.org/pragma.html).
 _APPLICATION = int.from_bytes(b"prby")
-_LAYOUT = 2  # version of the tables below; files of other versions are refused
 # Seconds to wait for other writers. A chunk takes 10 ms, so that a thousand writers may queue.
 _PATIENCE = 60.0
 
@@ -410,7 +453,7 @@ def create(path: Path) -> None:
                 for table in _TABLES:
                     connection.execute(table)
                 connection.execute(f"PRAGMA application_id = {_APPLICATION}")
-                connection.execute(f"PRAGMA user_version = {_LAYOUT}")
+                connection.execute(f"PRAGMA user_version = {FORMAT}")
         try:
             os.link(part, path)
         except FileExistsError:
@@ -531,11 +574,11 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
             "a store of prbayes",
             "nothing was changed: pass another folder",
         )
-    (layout,) = connection.execute("PRAGMA user_version").fetchone()
-    if layout != _LAYOUT:
+    (number,) = connection.execute("PRAGMA user_version").fetchone()
+    if number != FORMAT:
         raise _FileError(
-            f"which has layout {layout}",
-            f"layout {_LAYOUT}",
+            f"which has format {number}",
+            f"format {FORMAT} (numbers below 10 are those of release candidates)",
             "use the version of prbayes that wrote it, or pass another folder",
         )
     tables = connection.execute("SELECT sql FROM sqlite_master ORDER BY name").fetchall()

@@ -29,7 +29,7 @@ from prbayes.response.outputs import Outputs
 
 def umbridge(
     url: str,
-    model: str = "forward",
+    name: str = "forward",
     *,
     config: Mapping[str, Any] | None = None,
     timeout: float | None = None,
@@ -45,7 +45,7 @@ def umbridge(
     url : str
         Address of the server, such as ``"http://localhost:4242"``. A name and a password in it
         are sent (HTTP Basic), and a query is kept; messages show neither.
-    model : str
+    name : str
         Name of one of its models.
     config : mapping, optional
         Settings that are passed to the model with each request, as JSON.
@@ -119,7 +119,7 @@ def umbridge(
     address = _address(url)
     limit = None if timeout is None else positive_number(timeout, "umbridge: timeout")
     patience = positive_number(patience, "umbridge: patience")
-    request = {"name": plain_text(model, "umbridge: model"), "config": _plain_config(config)}
+    request = {"name": plain_text(name, "umbridge: name"), "config": _plain_config(config)}
     version = _requested(address, "/Info", None, "protocolVersion")
     models = _requested(address, "/Info", None, "models")
     if version != 1.0:
@@ -127,22 +127,22 @@ def umbridge(
             f"umbridge: url: got a server that speaks version {version} of the protocol at "
             f"{address}, expected 1.0"
         )
-    if model not in models:
+    if name not in models:
         raise ValueError(
-            f"umbridge: model: got {model!r}, expected one of those that the server at "
+            f"umbridge: name: got {name!r}, expected one of those that the server at "
             f"{address} has: {', '.join(map(repr, models)) or 'none'}"
         )
-    support = _requested(address, "/ModelInfo", {"name": model}, "support")
+    support = _requested(address, "/ModelInfo", {"name": name}, "support")
     if not support.get("Evaluate"):
         raise ValueError(
-            f"umbridge: model: got {model!r}, which the server at {address} cannot evaluate, "
+            f"umbridge: name: got {name!r}, which the server at {address} cannot evaluate, "
             "expected a model that supports Evaluate"
         )
     inputs = _requested(address, "/InputSizes", request, "inputSizes")
     outputs = _requested(address, "/OutputSizes", request, "outputSizes")
     config_text = json.dumps(request["config"])
     return scalar(
-        RemoteModel(address, model, config_text, tuple(inputs), tuple(outputs), limit, patience)
+        RemoteModel(address, name, config_text, tuple(inputs), tuple(outputs), limit, patience)
     )
 
 

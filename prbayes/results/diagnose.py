@@ -45,6 +45,7 @@ from prbayes.optimize.optimum import (
     SMALLEST_SHARE,
     Optimum,
     compared_in,
+    identity_in,
     refuse_model,
     require_of_model,
 )
@@ -323,6 +324,7 @@ def _checked_tree(result: object, fewest: int = 2) -> xr.DataTree:
     tree = result.to_datatree() if isinstance(result, Optimum) else result
     if not isinstance(tree, xr.DataTree) or not {"posterior", "optimum"} & set(tree.children):
         raise wrong_type(result, "diagnose: result", RESULT)
+    identity_in(tree)  # raises for a file of another format
     n = tree["posterior"].sizes["draw"] if "posterior" in tree.children else fewest
     if n < fewest:
         raise ValueError(

@@ -12,6 +12,7 @@ from bent_response import BOX, FRESH, bent
 from sklearn.linear_model import Ridge
 
 import prbayes as prb
+from prbayes.emulators.io import _SHIPPED
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.store import StoreError
 
@@ -40,6 +41,12 @@ def test_a_file_keeps_the_surface_and_its_settings(tmp_path: Path, model: Any) -
         found.error.rms,
         found.error.population_sd,
     )
+
+
+def test_all_public_surfaces_are_saved_with_their_settings() -> None:
+    public = {getattr(prb.surrogate, name) for name in prb.surrogate.__all__}
+    surfaces = {cls for cls in public if issubclass(cls, prb.surrogate.Surface)}
+    assert surfaces - {prb.surrogate.Surface} == set(_SHIPPED)
 
 
 def test_multivariate_constant_and_abort_survive_a_file(tmp_path: Path) -> None:

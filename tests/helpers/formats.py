@@ -20,6 +20,7 @@ import pymc as pm
 import prbayes as prb
 
 FOLDER = Path(__file__).parents[1] / "formats"
+NEW = (1.4, 2.2, 2.7, 1.6)  # specimens of the validity test
 OBSERVED = (1.2, 2.9, 2.1, 1.7, 2.4, 1.5, 2.2, 1.9, 2.6, 1.8)
 SAMPLED = {"draws": 40, "chains": 2, "random_seed": 3, "progressbar": False}
 
@@ -52,12 +53,21 @@ def write(folder: Path) -> None:
     optimum.to_datatree().to_netcdf(folder / "optimum.nc")
     posterior = sampled(model, folder)
     posterior.to_netcdf(folder / "posterior.nc")
+    x = pm.Normal.dist(model["mu"], model["sigma"])
+    predicted = prb.predict(posterior, square, x, model=model, n_samples=20, n_draws=20)
+    predicted.to_netcdf(folder / "prediction.nc")
+    test = prb.area_test(NEW, predicted, random_seed=5, progressbar=False)
+    test.to_dataset().to_netcdf(folder / "validity.nc")
+    beyond = prb.exceedance(posterior, square, 3, x, model=model, n_draws=20, n_points=200)
+    beyond.to_netcdf(folder / "exceedance.nc")
     surrogate = prb.Surrogate.fit(square, {"x": (0, 4)}, 16, progressbar=False)
     surrogate.save(folder / "surrogate.nc")
+    (folder / "run.nc.lock").unlink(missing_ok=True)
     numbers = {
         "version": prb.__version__,
         "optimum": {name: float(optimum.point[name]) for name in ("mu", "sigma")},
         "posterior": {name: float(posterior.posterior[name].mean()) for name in ("mu", "sigma")},
+        "statistic": float(test.statistic),
         "surrogate": float(surrogate(np.array([1.5]))[0]),
     }
     (folder / "numbers.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")

@@ -105,12 +105,6 @@ def test_a_description_comes_back_from_a_file(model: pm.Model) -> None:
     text["variables"][0]["code"] = "x"
     text["more"] = "x"
     assert from_attributes({"model": json.dumps(text)}) == describe(model)
-    (simulator,) = text["simulators"]
-    del simulator["runs"], simulator["n_specimens"]
-    simulator["inputs"] = "x ~ Normal(mu, sigma)"  # as 1.0.0rc1 stored them
-    (old,) = (from_attributes({"model": json.dumps(text)}) or {})["simulators"]
-    assert old["inputs"] == [["", "", "x ~ Normal(mu, sigma)"]]
-    assert old["runs"] == simulator["propagation"]
     assert json_attribute("text", {"x": "x" * 60_000}) == {}
 
 

@@ -309,7 +309,7 @@ PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     ),
     "plot_landscape: model": (
         Level.POPULATIONS,
-        lambda change: prb.plots.plot_landscape(optimum(), model=model_with(change), points=5),
+        lambda change: prb.plots.plot_landscape(optimum(), model=model_with(change), n_points=5),
     ),
     "plot_population: model": (
         Level.POPULATIONS, lambda change: prb.plots.plot_population(posterior(), model=model_with(change))

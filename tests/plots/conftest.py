@@ -127,8 +127,8 @@ def pictures(
             posterior, optimum=optimum, model=model, **k
         ),
         "optimizer": lambda **k: prb.plots.plot_optimizer(optimum, **k),
-        "landscape": lambda **k: prb.plots.plot_landscape(optimum, points=21, **k),
-        "curve": lambda **k: prb.plots.plot_landscape(optimum, var_names="sigma", points=21, **k),
+        "landscape": lambda **k: prb.plots.plot_landscape(optimum, n_points=21, **k),
+        "curve": lambda **k: prb.plots.plot_landscape(optimum, var_names="sigma", n_points=21, **k),
         "stages": lambda **k: prb.plots.plot_stages(posterior, **k),
         "comparison": lambda **k: prb.plots.plot_comparison(comparison, **k),
         "scores": lambda **k: prb.plots.plot_comparison(comparison, scores=True, **k),

@@ -62,7 +62,7 @@ def test_a_curve_over_one_hyperparameter(optimum: prb.Optimum, drawn: Callable[.
 def test_other_optima_are_marked() -> None:
     optimum = prb.minimize(_one(), starts=0)
     modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
-    pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), points=21)
+    pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), n_points=21)
     np.testing.assert_allclose(read.xy(pc, "local_optima", "landscape")[0], -optimum.theta)
     path = read.xy(pc, "evaluated", "landscape")[0]
     largest = np.abs(optimum.search.trace["theta"]).max()
@@ -71,15 +71,15 @@ def test_other_optima_are_marked() -> None:
 
 def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.Model]) -> None:
     found = prb.minimize(build(prb.Resimulated(64)))
-    match = "got responses=0, expected at least 1600: 25 points with 64 responses each"
+    match = "got max_responses=0, expected at least 1600: 25 points with 64 responses each"
     with pytest.raises(ValueError, match=match):
-        prb.plots.plot_landscape(found, points=5)
-    assert read.panels(prb.plots.plot_landscape(found, points=5, responses=1600), "landscape")
+        prb.plots.plot_landscape(found, n_points=5)
+    assert read.panels(prb.plots.plot_landscape(found, n_points=5, max_responses=1600), "landscape")
 
 
 def test_the_landscape_of_another_metric(optimum: prb.Optimum, known: SimpleNamespace) -> None:
     other = one_input(known.observed, prb.ProbabilityResidual(), sigma=2)
-    pc = prb.plots.plot_landscape(optimum, model=other, var_names="mu", points=9)
+    pc = prb.plots.plot_landscape(optimum, model=other, var_names="mu", n_points=9)
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])

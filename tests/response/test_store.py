@@ -224,7 +224,7 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
         Store(tmp_path / "file", "y", columns=3)
 
 
-def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
+def test_another_format_and_other_inputs_are_refused(folder: Path) -> None:
     held = r"y: store: .* has inputs of 3 values for simulator 'y', expected 2 values; no"
     with pytest.raises(StoreError, match=held):
         Store(folder, "y", columns=2)
@@ -236,7 +236,9 @@ def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
         Store(folder / "empty", "x")
     assert all_right(Store(folder, "y", columns=3))
     changed(folder, "PRAGMA user_version = 3")
-    refused(folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote")
+    refused(
+        folder, r"which has format 3, expected format 10 \(numbers below 10 are .*use the version"
+    )
 
 
 # -- a disk that is full, a file that is locked --------------------------------------------------
