@@ -60,6 +60,8 @@ class Measurement:
     at_conditions: bool = False
     # Model variables of the measurement: `ROLES` of the readings, and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
+    # (N,): observed row of each specimen if the weights are frequencies
+    observed_rows: Indices | None = None
 
     @property
     def event(self) -> Shape:
@@ -95,7 +97,8 @@ class Measurement:
         is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
         is_aligned = is_aligned or of_specimens(self.responses.function) is not None
         aligned = "groups, conditions, records, functions, weights= or specimens="
-        return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
+        observed = new_observed(self, values, aligned, is_aligned=is_aligned)
+        return replace(self, observed=observed, observed_rows=None)
 
 
 def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
@@ -424,7 +427,7 @@ class SpecimenLikelihood:
     def of_rows(self, rows: Indices) -> SpecimenLikelihood:
         """Return the likelihood of some rows of a single simulator."""
         (measurement,) = self.measurements
-        part = replace(measurement, observed=measurement.observed[rows])
+        part = replace(measurement, observed=measurement.observed[rows], observed_rows=None)
         result = replace(self, measurements=(part,))
         # Compiled functions and coordinates depend on the populations only, and are reused.
         vars(result).update(density=self.density, coordinates=self.coordinates)
