@@ -88,17 +88,19 @@ class Measurement:
         """Observed values and their errors; unknown parameters have their prior's 84 % quantile."""
         return readings_at(self, 0.84, 512)
 
-    def observing(self, data: Any) -> Measurement:
-        """Return the measurement with other observed values; the same object for equal ones."""
-        values = np.asarray(data, dtype=np.float64)
-        if np.array_equal(values, self.observed, equal_nan=True):
-            return self
-        of_rows = (self.groups, self.weights, self.specimens, self.conditions)
-        is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
-        is_aligned = is_aligned or of_specimens(self.responses.function) is not None
-        aligned = "groups, conditions, records, functions, weights= or specimens="
-        observed = new_observed(self, values, aligned, is_aligned=is_aligned)
-        return replace(self, observed=observed, observed_rows=None)
+
+def with_observed(measurement: Measurement, data: Any) -> Measurement:
+    """Return the measurement with other observed values; the same object for equal ones."""
+    values = np.asarray(data, dtype=np.float64)
+    if np.array_equal(values, measurement.observed, equal_nan=True):
+        return measurement
+    m = measurement
+    of_rows = (m.groups, m.weights, m.specimens, m.conditions)
+    is_aligned = bool(m.covariates) or any(x is not None for x in of_rows)
+    is_aligned = is_aligned or of_specimens(m.responses.function) is not None
+    aligned = "groups, conditions, records, functions, weights= or specimens="
+    observed = new_observed(m, values, aligned, is_aligned=is_aligned)
+    return replace(m, observed=observed, observed_rows=None)
 
 
 def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
@@ -441,7 +443,8 @@ class SpecimenLikelihood:
         posterior points are drawn.
         """
         changed = tuple(
-            m if data.get(m.name) is None else m.observing(data[m.name]) for m in self.measurements
+            m if data.get(m.name) is None else with_observed(m, data[m.name])
+            for m in self.measurements
         )
         models = [m for m in (self.model(), model) if m is not None] if model is not None else []
         names = [{str(rv.name) for rv in m.free_RVs} for m in models]
