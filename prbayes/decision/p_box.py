@@ -225,7 +225,7 @@ def _evaluation_points(samples: list[ResponseSample]) -> Floats:
     points = []
     for sample in samples:
         is_finite = np.isfinite(sample.values)
-        weights = sample.mean_weights()[is_finite]
+        weights = sample.mean_weights[is_finite]
         points.append(quantile(sample.values[is_finite], weights / weights.sum(), levels))
     return np.unique(np.concatenate(points))
 

@@ -341,8 +341,9 @@ class ResponseSample:
         for first in range(0, len(thetas), step):
             yield self.weights(thetas[first : first + step])
 
+    @cached_property
     def mean_weights(self) -> Floats:
-        """Return the mean weights over all valid populations, (n,)."""
+        """The mean weights over all valid populations, (n,)."""
         total = np.zeros(self.values.size)
         for weights in self.weight_batches(self.populations.thetas):
             total += np.nansum(weights, axis=0)
@@ -371,7 +372,7 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
     runs.
     """
     is_counted = counts(sample.values)
-    weights = sample.mean_weights()
+    weights = sample.mean_weights
     without = []
     for block in range(N_BLOCKS):
         rest = weights * (sample.blocks != block)
@@ -392,7 +393,7 @@ def rough_sample(sample: ResponseSample) -> Findings:
     """Return a finding if the emulator of a response has a large error beside its spread."""
     if not isinstance(sample.design, EmulatedSample):
         return ()
-    weights = sample.mean_weights() * np.isfinite(sample.values)
+    weights = sample.mean_weights * np.isfinite(sample.values)
     values = np.where(weights > 0, sample.values, 0.0)
     mean = weights @ values / weights.sum()
     spread = np.sqrt(weights @ (values - mean) ** 2 / weights.sum())
@@ -439,11 +440,11 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     if not np.isin(is_beyond, (0.0, 1.0)).all():
         findings += _beyond_runs(sample, quantity)
         return findings, _jackknife_error(sample, quantity)
-    share = float(sample.mean_weights() @ is_beyond)
+    share = float(sample.mean_weights @ is_beyond)
     is_upper = share <= 0.5
     if not is_upper:  # because the rarer side decides how well the quantity is known
         at, side = np.nextafter(value, np.inf), "on its other side"
-        share = float(sample.mean_weights() @ (1 - quantity.of_specimen(sample.values, at)))
+        share = float(sample.mean_weights @ (1 - quantity.of_specimen(sample.values, at)))
     error = float(share_error(sample, lambda values: quantity.of_specimen(values, at)))
     more = "pass more responses to the propagation"
     if not sample.design.has_runs:

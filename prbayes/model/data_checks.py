@@ -408,6 +408,7 @@ def data_findings(
     labels: Sequence[str] | None = None,
     several_roots: bool = False,
     rounded: ArrayLike = np.nan,
+    rows: Indices | None = None,
     options: DataCheckOptions | None = None,
 ) -> Findings:
     """Return findings of rounded, censored and repeated data, (N,) or (N, m), by output.
@@ -415,6 +416,7 @@ def data_findings(
     Values that are not finite count as not measured. With several roots inputs have the same
     response, as beside a turning point, and rounding is never harmless. ``rounded`` are the steps
     that the user stated, () or (m,), NaN where none was: such an output has no finding of rounding.
+    ``rows``, (N,), are the observed rows of specimens that frequencies repeat, as in a histogram.
 
     Examples
     --------
@@ -435,6 +437,9 @@ def data_findings(
     copies = [i for group in identical_specimens(y) for i in group[1:]]
     counted = np.ones(len(y), dtype=bool)
     counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
+    if rows is not None:
+        counted[:] = False
+        counted[np.unique(rows, return_index=True)[1]] = True
     findings: list[Finding] = []
     # Label, step, and step in standard deviations.
     rounded_outputs: list[tuple[str, float, float]] = []
@@ -465,6 +470,8 @@ def data_findings(
                     Finding("censored-data", text, "likelihood_findings.md#censored-data")
                 )
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
+    if rows is not None:
+        exact[~counted] = np.nan
     if rounded_outputs:
         findings.insert(0, _rounding_finding(rounded_outputs, largest_step))
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:

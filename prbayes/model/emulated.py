@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from scipy.special import logsumexp
 
-from prbayes._validate import AT_ONCE, ArrayFunction, Floats, Indices, Shape
+from prbayes._validate import ArrayFunction, Floats, Indices, Shape
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -33,9 +33,10 @@ from prbayes.model.specimen_likelihood import measurements_of, specimen_likeliho
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.mixtures import effective_sample_size, normalised_weights
 from prbayes.propagation.base import MAX_LOST, DesignError, responding_weights
-from prbayes.propagation.importance import new_specimens
+from prbayes.propagation.importance import MixtureSampler, new_specimens
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.response.condition import is_condition
-from prbayes.response.distributions import compiled_log_density
+from prbayes.response.distributions import normal_scores
 from prbayes.response.inputs import Inputs, aleatory_names, event_shape
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
@@ -49,10 +50,10 @@ class EmulatedPopulationSizes:
     # Number of specimens of a population in plots and scores. The error of a quantile is then far
     # below the width of a posterior band.
     specimens: int = 1024
-    # Number of populations, and number of specimens of each, in the weighted sample of a decision.
-    # Twice as many change probabilities by less than their reported error.
+    # Number of populations, and number of specimens, in the weighted sample of a decision. Twice as
+    # many change probabilities by less than their reported error.
     populations: int = 64
-    of_each: int = 64
+    points: int = 8192
     blocks: int = 8  # number of batches of the sample, whose scatter gives the Monte Carlo error
 
 
@@ -236,13 +237,19 @@ def draw_specimens(
     simulator: EmulatedSimulator, inputs: Inputs, parents: Sequence[Floats], n: int
 ) -> list[Floats]:
     """Return n specimens of each of k populations, (k n, *event) by input."""
-    conditions = simulator.measurement.conditions
-    if conditions is not None:
-        conditions = conditions[simulator.rows]
     rng = np.random.default_rng(0)
     specimens, _ = new_specimens(simulator.name, inputs, list(parents), n, rng)
-    specimens = at_conditions(inputs, specimens, conditions)
+    specimens = _at_conditions(simulator, inputs, specimens)
     return [x.reshape(-1, *x.shape[2:]) for x in specimens]
+
+
+def _at_conditions(
+    simulator: EmulatedSimulator, inputs: Inputs, specimens: Sequence[Floats]
+) -> list[Floats]:
+    """Return inputs of specimens with the conditions of those of the simulator in turn."""
+    conditions = simulator.measurement.conditions
+    rows = None if conditions is None else conditions[simulator.rows]
+    return at_conditions(inputs, specimens, rows)
 
 
 def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedResponse:
@@ -365,6 +372,7 @@ class EmulatedSample:
     n_points: int  # number of specimens
     # inputs of the simulator that are those of another population here
     replaced: Mapping[Variable[Any, Any], Variable[Any, Any]]
+    density: PopulationDensity
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
@@ -385,13 +393,29 @@ class EmulatedSample:
         places = np.linspace(0, len(parents[0]) - 1, _SIZES.populations)
         rows = np.unique(places.round().astype(int))
         parents = [parent[rows] for parent in parents]
-        of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
-        of_each *= _SIZES.blocks
-        flat = draw_specimens(simulator, inputs, parents, of_each)
-        log_p = _population_log_densities(inputs, parents, flat)
-        log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
-        blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
-        return cls(simulator, flat, log_mixture, blocks, inputs, len(log_mixture), replaced)
+        n, density = _SIZES.points, PopulationDensity(inputs)
+        sampler = MixtureSampler(simulator.name, inputs, density)
+        scores = normal_scores(inputs)
+        # Wide populations have many points in the tails. The effective number of points is at least
+        # n / e^2.
+        size = inputs.dimensions - len(inputs.conditions)
+        spread = 1.0 if scores is None else 1 + size**-0.5
+        try:
+            points, _ = sampler.draw(parents, n, 0, spread=spread)
+        except TypeError:  # without an inverse distribution function
+            spread = 1.0
+            points, _ = sampler.draw(parents, n, 0)
+        log_q = density.at(parents, points)(slice(None))
+        if spread > 1:
+            squares = _squared_scores(inputs, scores(*parents, *points))
+            log_q += squares * (1 - spread**-2) / 2 - size * np.log(spread)
+        order = np.random.default_rng(0).permutation(n)  # because conditions repeat periodically
+        shuffled = _at_conditions(simulator, inputs, [x[order] for x in points])
+        log_mixture = (logsumexp(log_q, axis=0) - np.log(len(rows)))[order]
+        # Points that were rounded beyond the end of a support have no weight.
+        log_mixture[np.isneginf(log_mixture)] = np.inf
+        blocks = order * _SIZES.blocks // n
+        return cls(simulator, shuffled, log_mixture, blocks, inputs, n, replaced, density)
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
@@ -424,7 +448,7 @@ class EmulatedSample:
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
-        log_p = _population_log_densities(self.inputs, parents, self.points) - self.log_mixture
+        log_p = self.density.at(parents, self.points)(slice(None)) - self.log_mixture
         with np.errstate(invalid="ignore"):
             return None, normalised_weights(log_p)
 
@@ -432,29 +456,28 @@ class EmulatedSample:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(parents)
         size = float(np.median(effective_sample_size(weights)))
-        if not size >= _SIZES.of_each / 2:
+        if not size >= 32:
             raise DesignError(
                 f"{name}: got a weight effective sample size of {size:.0f} of {self.n_points} "
-                "emulated specimens (median over the populations), expected at least "
-                f"{_SIZES.of_each // 2}; the populations of this result are too different from "
-                "each other; compute the quantity from prb.predict"
+                "emulated specimens (median over the populations), expected at least 32; the "
+                "populations of this result are too different from each other; compute the "
+                "quantity from prb.predict"
             )
+
+
+def _squared_scores(inputs: Inputs, scores: Sequence[Floats]) -> Floats:
+    """Return the squared lengths of normal scores, (k, n, *event) by input -> (k, n)."""
+    total: Any = 0.0
+    for dist, z in zip(inputs.aleatory, scores, strict=True):
+        if is_condition(dist):
+            continue
+        # PyMC returns NaN for some distribution functions of far tails.
+        squares = np.nan_to_num(z, nan=8.0) ** 2
+        total = total + squares.reshape(*squares.shape[:2], -1).sum(axis=-1)
+    return np.asarray(total)
 
 
 def emulator_error(sample: EmulatedSample, responses: Responses) -> Floats:
     """Return the cross-validation error of the emulator of a response, () or (m,)."""
     emulator = sample._emulator(responses)
     return emulator.error.reshape(emulator.event)
-
-
-def _population_log_densities(
-    inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]
-) -> Floats:
-    """Return log-densities of n specimens in k populations, (k, n)."""
-    function = compiled_log_density(inputs)
-    step = max(1, AT_ONCE // len(points[0]))
-    parts = []
-    for first in range(0, len(parents[0]), step):
-        (log_p,) = function(*[parent[first : first + step] for parent in parents], *points)
-        parts.append(np.broadcast_to(log_p, (len(log_p), len(points[0]))))
-    return np.concatenate(parts)

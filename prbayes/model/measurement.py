@@ -60,6 +60,8 @@ class Measurement:
     at_conditions: bool = False
     # Model variables of the measurement: `ROLES` of the readings, and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
+    # (N,): observed row of each specimen if the weights are frequencies
+    observed_rows: Indices | None = None
 
     @property
     def event(self) -> Shape:
@@ -86,16 +88,19 @@ class Measurement:
         """Observed values and their errors; unknown parameters have their prior's 84 % quantile."""
         return readings_at(self, 0.84, 512)
 
-    def observing(self, data: Any) -> Measurement:
-        """Return the measurement with other observed values; the same object for equal ones."""
-        values = np.asarray(data, dtype=np.float64)
-        if np.array_equal(values, self.observed, equal_nan=True):
-            return self
-        of_rows = (self.groups, self.weights, self.specimens, self.conditions)
-        is_aligned = bool(self.covariates) or any(x is not None for x in of_rows)
-        is_aligned = is_aligned or of_specimens(self.responses.function) is not None
-        aligned = "groups, conditions, records, functions, weights= or specimens="
-        return replace(self, observed=new_observed(self, values, aligned, is_aligned=is_aligned))
+
+def with_observed(measurement: Measurement, data: Any) -> Measurement:
+    """Return the measurement with other observed values; the same object for equal ones."""
+    values = np.asarray(data, dtype=np.float64)
+    if np.array_equal(values, measurement.observed, equal_nan=True):
+        return measurement
+    m = measurement
+    of_rows = (m.groups, m.weights, m.specimens, m.conditions)
+    is_aligned = bool(m.covariates) or any(x is not None for x in of_rows)
+    is_aligned = is_aligned or of_specimens(m.responses.function) is not None
+    aligned = "groups, conditions, records, functions, weights= or specimens="
+    observed = new_observed(m, values, aligned, is_aligned=is_aligned)
+    return replace(m, observed=observed, observed_rows=None)
 
 
 def readings_at(measurement: Measurement, prob: float, draws: int) -> Readings:
@@ -424,7 +429,7 @@ class SpecimenLikelihood:
     def of_rows(self, rows: Indices) -> SpecimenLikelihood:
         """Return the likelihood of some rows of a single simulator."""
         (measurement,) = self.measurements
-        part = replace(measurement, observed=measurement.observed[rows])
+        part = replace(measurement, observed=measurement.observed[rows], observed_rows=None)
         result = replace(self, measurements=(part,))
         # Compiled functions and coordinates depend on the populations only, and are reused.
         vars(result).update(density=self.density, coordinates=self.coordinates)
@@ -438,7 +443,8 @@ class SpecimenLikelihood:
         posterior points are drawn.
         """
         changed = tuple(
-            m if data.get(m.name) is None else m.observing(data[m.name]) for m in self.measurements
+            m if data.get(m.name) is None else with_observed(m, data[m.name])
+            for m in self.measurements
         )
         models = [m for m in (self.model(), model) if m is not None] if model is not None else []
         names = [{str(rv.name) for rv in m.free_RVs} for m in models]

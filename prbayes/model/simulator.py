@@ -417,6 +417,7 @@ def _add_measurement(arguments: _Arguments, metric: LogLikelihood) -> TensorVari
         stacked_values(conditions),
         arguments.at_conditions,
         _measurement_variables(name, model, metric, partners),
+        data.rows,
     )
     if measurement.responses.repeats > 1:
         refuse_random(measurement, partners)

@@ -742,6 +742,7 @@ def _data_findings(
             labels=output_labels(m.name, m.outputs.names),
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
+            rows=m.observed_rows,
         )
     repeats, gross_errors = likelihood.stacked.repeats, likelihood.measurements[0].gross_errors
     if repeats is not None and likelihood.error_is_known and gross_errors is False:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from scipy.special import ndtr, ndtri
 
 from prbayes._stats import positive_scale
 from prbayes._validate import IN_CACHE, Bools, Floats, Indices, Shape
@@ -50,10 +51,19 @@ class MixtureSampler:
     density: PopulationDensity
 
     def draw(
-        self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None = None
+        self,
+        components: Sequence[Floats],
+        n: int,
+        seed: int,
+        shares: Floats | None = None,
+        spread: float = 1.0,
     ) -> tuple[tuple[Floats, ...], Mixture]:
-        """Return n points of populations with ``shares``, (k,), equal by default."""
-        points, mixture = self._drawn(components, n, seed, shares)
+        """Return n points of populations with ``shares``, (k,), equal by default.
+
+        Their normal scores have the standard deviation ``spread``. If it is not one, an input
+        without an inverse distribution function raises TypeError.
+        """
+        points, mixture = self._drawn(components, n, seed, shares, spread)
         return self._off_the_edges(points, mixture), mixture
 
     def equal_mass(
@@ -110,7 +120,12 @@ class MixtureSampler:
         return result
 
     def _drawn(
-        self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None
+        self,
+        components: Sequence[Floats],
+        n: int,
+        seed: int,
+        shares: Floats | None,
+        spread: float = 1.0,
     ) -> tuple[list[Floats], Mixture]:
         """Return points and the mixture from which they were drawn.
 
@@ -119,6 +134,8 @@ class MixtureSampler:
         """
         k = len(components[0])
         selector, uniforms = base_points(self.inputs.event_shapes, n, seed)
+        if spread != 1.0:
+            uniforms = [inside(ndtr(spread * ndtri(u))) for u in uniforms]
         if shares is None:
             population = (selector * k).astype(int)
         else:
@@ -130,6 +147,8 @@ class MixtureSampler:
             if any(np.isnan(x).any() for x in points):
                 raise TypeError("an inverse distribution function without a number")
         except TypeError:  # without an inverse distribution function points are drawn at random
+            if spread != 1.0:
+                raise
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(parents, 1, rng)
             points = [x[:, 0] for x in draws]

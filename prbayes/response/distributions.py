@@ -197,6 +197,32 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         ) from None
 
 
+def normal_scores(inputs: Inputs) -> Any:
+    """Return normal scores by input, (k, n, *event), as a function of parents, then points.
+
+    Returns None if inputs depend on each other, or if one has no distribution function.
+    """
+    if inputs.nested:
+        return None
+    symbols = inputs.placeholders()
+    dists, _ = inputs.rebuilt(symbols)
+    graphs, points = [], []
+    for dist, shape in zip(dists, inputs.event_shapes, strict=True):
+        x = pt.tensor(dtype="float64", shape=(None,) * (len(shape) + 1))
+        points.append(x)
+        if isinstance(dist.owner.op, MVNORMAL):
+            mean, covariance = dist.owner.op.dist_params(dist.owner)
+            inverse = pt.linalg.inv(pt.linalg.cholesky(covariance))
+            graphs.append((inverse @ (x - mean)[..., None])[..., 0])
+            continue
+        try:
+            share = pt.exp(pm.logcdf(dist, x, warn_rvs=False))
+        except NotImplementedError:
+            return None
+        graphs.append(-np.sqrt(2) * pt.erfcinv(2 * pt.clip(share, 1e-300, 1 - 1e-16)))
+    return compile_batched(symbols, graphs, points)
+
+
 def _density(dist: TensorVariable) -> TensorVariable | None:
     """Return the log-density at zero as a graph; None if PyMC has none, or only a random one."""
     try:

@@ -11,8 +11,6 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-import pymc as pm
-import pytensor.tensor as pt
 import xarray as xr
 from scipy.special import softmax
 
@@ -23,7 +21,6 @@ from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
     failing_region_findings,
-    normal_scores,
     population_findings,
     population_statistics,
     population_test,
@@ -42,10 +39,9 @@ from prbayes.optimize.maximum_likelihood import (
     specimen_refits,
 )
 from prbayes.optimize.optimum import Optimum, require_minimiser
-from prbayes.response.compile import compile_batched
 from prbayes.response.condition import is_condition
-from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
-from prbayes.response.inputs import Inputs, aleatory_names
+from prbayes.response.distributions import PopulationSampler, compiled_log_density, normal_scores
+from prbayes.response.inputs import aleatory_names
 
 
 @dataclass(frozen=True)
@@ -156,7 +152,7 @@ def check_population(optimum: Optimum) -> Checked:
     difference = np.abs(optimum.theta - theta)
     if earlier == preparations and (difference**2 <= 1e-4 * np.diag(optimum.covariance)).all():
         return checked
-    functions = [score_function(likelihood.inputs) for likelihood in likelihoods]
+    functions = [normal_scores(likelihood.inputs) for likelihood in likelihoods]
     for likelihood, function in zip(likelihoods, functions, strict=True):
         if function is None:
             reason = f"PyMC has no distribution function of an input of {likelihood.name}"
@@ -257,34 +253,6 @@ def _without_sampling(optimum: Optimum) -> str:
     )
 
 
-def score_function(inputs: Inputs) -> Any:
-    """Compile a function from (*parents, *points) to logs of distribution functions by input.
-
-    A multivariate normal input has normal scores instead. The result is None if inputs depend on
-    each other, or if one has no distribution function.
-    """
-    if inputs.nested:
-        return None
-    symbols = inputs.placeholders()
-    dists, _ = inputs.rebuilt(symbols)
-    graphs, points = [], []
-    for dist, shape in zip(dists, inputs.event_shapes, strict=True):
-        x = pt.tensor(dtype="float64", shape=(None,) * (len(shape) + 1))
-        points.append(x)
-        if isinstance(dist.owner.op, MVNORMAL):
-            mean, covariance = dist.owner.op.dist_params(dist.owner)
-            if covariance.type.ndim > 2:
-                return None  # The covariance differs between specimens.
-            root = pt.linalg.cholesky(covariance)
-            graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
-            continue
-        try:
-            graphs.append(pm.logcdf(dist, x))
-        except NotImplementedError:
-            return None
-    return compile_batched(symbols, graphs, points)
-
-
 def scored_specimens(
     evaluator: Evaluator,
     scores: Sequence[tuple[Any, Any]],
@@ -295,7 +263,7 @@ def scored_specimens(
 
     Conditions of the specimens have no score.
 
-    ``scores`` are `score_function` and the compiled log-density of each likelihood's inputs, and
+    ``scores`` are `normal_scores` and the compiled log-density of each likelihood's inputs, and
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
     result = []
@@ -316,9 +284,7 @@ def scored_specimens(
                 if is_condition(dist):
                     continue
                 column = np.broadcast_to(value, (1, *x.shape))[0].reshape(size, -1)
-                columns.append(
-                    column if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(column))
-                )
+                columns.append(np.clip(column, -6.0, 6.0))
             z[rows] = np.concatenate(columns, axis=1).reshape(*log_a[rows].shape, -1)
             weights[rows] = np.broadcast_to(log_p, (1, size))[0].reshape(log_a[rows].shape)
         # Points that fill up the arrays have no weight. Their scores are arbitrary.

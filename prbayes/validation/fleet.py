@@ -498,12 +498,18 @@ class SpecimenFleet(Fleet):
         evaluator = replace(self.evaluator, emulated=emulated, has_graph=False)
         target = specimen_target(evaluator, None)
         modes = modes_of(target.log_posterior, target.starts, target.scale)
-        chains = None if modes is None else importance_chains(target, modes, self.settings)
+        draws = self.settings.draws
+        # The wide posterior of few specimens has few points in its tails: draw from four times as
+        # many.
+        factor = 4 if len(self.observed[name]) < 8 else 1
+        many = replace(self.settings, draws=factor * draws)
+        chains = None if modes is None else importance_chains(target, modes, many)
         if modes is None or chains is None:
             values, pareto_k, finding = self._samples(evaluator)
         else:
             refuse_lost_specimens(evaluator, chains.thetas[0].mean(axis=0))
-            values = evaluator.hyperparameters.constrained(chains.thetas[0])
+            # The draws are in random order.
+            values = evaluator.hyperparameters.constrained(chains.thetas[0, :draws])
             pareto_k = chains.sampler["pareto_k"]
             finding = " ".join(f.text for f in mode_findings(target, modes, chains.thetas))
         finding = " ".join(

@@ -94,7 +94,7 @@ def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
     sample: Any = SimpleNamespace(
         values=values,
         blocks=blocks,
-        mean_weights=lambda: np.full(64, 1 / 64),
+        mean_weights=np.full(64, 1 / 64),
         emulated=lambda points: [],
         points=[],
     )

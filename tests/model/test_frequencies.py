@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.model.data_checks import data_findings
 from prbayes.model.random_variable import simulators
 
 SAMPLE = np.random.default_rng(0).normal(10, 2, 400)
@@ -98,3 +99,27 @@ def test_whole_numbers_of_type_float_are_reported(caplog: pytest.LogCaptureFixtu
 def test_wrong_frequencies(given: Any, error: Any, words: str) -> None:
     with pytest.raises(error, match=f"y: weights: got .*{words}"):
         model(METRICS[0], **given)
+
+
+@pytest.mark.parametrize("n_outputs", [1, 2])
+def test_equal_specimens_of_a_frequency_are_neither_censored_nor_copies(n_outputs: int) -> None:
+    values = np.random.default_rng(1).exponential(1.0, (12, n_outputs))
+    counts = np.sort(np.random.default_rng(2).integers(2, 30, 12))[
+        np.argsort(-values[:, 0]).argsort()
+    ]
+    rows = np.repeat(np.arange(12), counts)
+    codes = {finding.code for finding in data_findings(values[rows])}
+    assert "identical-specimens" in codes
+    assert data_findings(values[rows], rows=rows) == ()
+    # Copies among the observed rows remain.
+    copied = np.concatenate([values, values[:4]])
+    rows = np.repeat(np.arange(16), 3)
+    copies = data_findings(copied[rows], rows=rows)
+    assert [finding.code for finding in copies] == ["identical-specimens"]
+
+
+def test_a_histogram_of_a_skewed_population_has_no_findings() -> None:
+    middles, counts = np.array([0.3, 0.9, 1.7, 2.9, 5.0]), np.array([30, 12, 8, 5, 5])
+    optimum = prb.minimize(model(prb.LogLikelihood(), middles, weights=counts), starts=0)
+    codes = {finding.code for finding in optimum.findings}
+    assert not codes & {"censored-data", "identical-specimens"}

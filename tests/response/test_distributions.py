@@ -18,6 +18,7 @@ from prbayes.response.distributions import (
     PriorSampler,
     compiled_log_density,
     fixed_ends,
+    normal_scores,
     quantiles,
     refuse_lopsided,
     refuse_without_density,
@@ -121,6 +122,38 @@ def test_quantiles_of_a_vector_of_truncated_normals(ends: dict[str, Any]) -> Non
     low, high = (np.asarray(ends.get(k, e)) for k, e in (("lower", -np.inf), ("upper", np.inf)))
     found = quantiles("y", pm.TruncatedNormal.dist(mu, 1.0, **ends), u).eval(mode=PLAIN)
     np.testing.assert_allclose(found, stats.truncnorm.ppf(u, low - mu, high - mu, mu), rtol=1e-7)
+
+
+def test_normal_scores_are_the_inverse_of_quantiles() -> None:
+    scale = pt.constant(COVARIANCE)
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [
+            pm.LogNormal.dist(mu, sigma),
+            pm.Gamma.dist(2.0, sigma, shape=3),
+            pm.MvNormal.dist(pt.stack([mu, 0.5]), scale, shape=(3, 2)),
+        ]
+    )
+    z = [np.array([-6.0, 0.0, 5.0]), np.linspace(-4, 4, 9).reshape(3, 3)]
+    z.append(np.random.default_rng(1).normal(size=(3, 3, 2)))
+    mu, sigma = np.array([2.0, -1.0]), np.array([0.7, 1.5])
+    root = np.linalg.cholesky(COVARIANCE)
+    for i in range(2):
+        points = [
+            np.exp(mu[i] + sigma[i] * z[0]),
+            stats.gamma(2.0, scale=1 / sigma[i]).ppf(stats.norm.cdf(z[1])),
+            np.array([mu[i], 0.5]) + z[2] @ root.T,
+        ]
+        parents = {"mu": mu, "sigma": sigma}
+        found = normal_scores(inputs)(*[parents[str(p.name)] for p in inputs.parents], *points)
+        for got, expected in zip(found, z, strict=True):
+            np.testing.assert_allclose(got[i], expected, atol=1e-8)
+
+
+def test_inputs_without_distribution_functions_have_no_normal_scores() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [pm.MvStudentT.dist(5.0, mu=mu * np.ones(2), scale=COVARIANCE)]
+    )
+    assert normal_scores(inputs) is None
 
 
 def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from prbayes._finding import Finding, Findings
 from prbayes._stats import adjusted_p_values, upper_p_values
@@ -30,12 +30,6 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import refuse_lost_share
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.response import Responses
-
-
-def normal_scores(u: Floats) -> Floats:
-    """Return the normal scores of distribution functions, within 6 standard deviations."""
-    scores: Floats = ndtri(np.clip(u, 1e-9, 1 - 1e-9))
-    return scores
 
 
 def zhang_statistic(z: Floats, weights: Floats) -> Floats:

@@ -18,7 +18,6 @@ from prbayes._validate import Floats
 from prbayes.inference.checks.population import (
     PopulationTest,
     mixture_ratio,
-    normal_scores,
     population_findings,
     population_statistics,
     population_test,
@@ -114,11 +113,6 @@ def test_the_mixture_ratio_is_small_at_the_center_and_large_for_two_modes() -> N
     assert 0 <= mixture_ratio(scores, weights)[0] < 1
     z = two_modes(rng, (100, 1, 1))
     assert mixture_ratio(z / z.std(), weights)[0] > 5
-
-
-def test_normal_scores_are_finite_at_the_ends() -> None:
-    u = np.array([0.0, 0.5, ndtr(1.5), 1.0])
-    assert normal_scores(u) == pytest.approx([-5.9978, 0, 1.5, 5.9978], abs=1e-4)
 
 
 def test_small_samples_and_equal_inputs() -> None:
