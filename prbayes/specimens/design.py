@@ -697,9 +697,7 @@ def without_spurious_modes(
         if not len(doubtful):
             return emulation
         runs = farthest(emulation.z, doubtful, min(2, len(doubtful)), scale)
-        emulation, misfit = with_audited_runs(
-            run, data, emulation, runs, likely, likely.population
-        )
+        emulation, misfit = with_audited_runs(run, data, emulation, runs, likely, likely.population)
         change = emulation.surface.values(likeliest) - before.surface.values(likeliest)
         exist = (np.abs(misfit) < 0.1 * spread).all()
         if exist or (np.abs(change) > largest).any():
