@@ -199,8 +199,8 @@ def relative_error(readings: Readings, error: Floats) -> Floats:
     return np.where(few, np.sqrt(squares), error) / robust_spread(readings)
 
 
-def scaled_errors(readings: Readings, factor: float) -> Readings:
-    """Return the readings with their errors multiplied by a factor."""
+def scaled_errors(readings: Readings, factor: float | Floats) -> Readings:
+    """Return the readings with their errors multiplied by a factor, a number or (m,)."""
     power = np.ones(readings.family.shape)
     for code in _codes(readings):
         power[readings.family == code] = 1.0 if COUNTS[code].widens else -2.0

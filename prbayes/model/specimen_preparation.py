@@ -392,21 +392,65 @@ def _coordinate_names(likelihood: SpecimenLikelihood) -> list[str]:
     return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
 
-def _error_scales(likelihood: SpecimenLikelihood) -> tuple[float, ...]:
-    """Return factors of the reading errors that span 98 % of the prior of an unknown error."""
-    ends = []
+def _error_scales(likelihood: SpecimenLikelihood) -> Floats:
+    """Return factors of the reading errors that span 98 % of the prior of unknown errors, (J, M).
+
+    Outputs with the same unknown parameters have the same factor; (J, 1) if all outputs have.
+    """
+    columns: dict[Any, list[int]] = {}
+    ends: dict[Any, list[Floats]] = {}
+    first = 0
     for m in likelihood.measurements:
-        if m.unknown:
-            sd = [readings_at(m, prob, 2048) for prob in (0.01, 0.84, 0.99)]
-            low, middle, high = (r.error_sd(np.nan_to_num(r.values)) for r in sd)
-            usable = middle > 0
-            low, middle, high = low[usable], middle[usable], high[usable]
-            ends.append((np.min(low / middle), np.max(high / middle)))
-    if not ends:
-        return (1.0,)
-    lowest, highest = np.log(np.min(ends)), np.log(np.max(ends))
-    count = 1 + int(np.ceil((highest - lowest) / np.log(3.0)))
-    return tuple(np.exp(np.linspace(lowest, highest, count)).tolist())
+        width = m.rows.shape[1]
+        sd = [readings_at(m, p, 2048) for p in (0.01, 0.84, 0.99)] if m.unknown else []
+        errors = [r.error_sd(np.nan_to_num(r.values)) for r in sd]
+        by_output = [v for v in m.unknown.values() if v.type.shape not in ((), (1,))]
+        for k in range(width):
+            key = (*m.unknown.values(), k if by_output else 0) if m.unknown else ()
+            columns.setdefault(key, []).append(first + k)
+            if errors:
+                low, middle, high = (error[:, k][errors[1][:, k] > 0] for error in errors)
+                ends.setdefault(key, []).extend([low / middle, high / middle])
+        first += width
+    joined = {key: np.concatenate(values) for key, values in ends.items()}
+    ranges = {key: (values.min(), values.max()) for key, values in joined.items() if values.size}
+    if not ranges:
+        return np.ones((1, 1))
+    rows = factor_design([*ranges.values()])
+    if len(columns) == 1:
+        return rows
+    result = np.ones((len(rows), first))
+    for key, row in zip(ranges, rows.T, strict=True):
+        result[:, columns[key]] = row[:, None]
+    return result
+
+
+def factor_design(ranges: Sequence[tuple[float, float]]) -> Floats:
+    """Return factors of several errors between the ends of each, (J, G), from larger ones on.
+
+    One error has a ladder of steps by a factor of three. Two or three have all combinations of
+    coarse ladders, because coarser proposals that are fewer have more points each. More errors
+    have a common ladder, and ladders of each error beside the largest of the others.
+    """
+    low, high = np.log(np.array(ranges)).T
+    count = len(low)
+
+    def ladder(k: int, step: float, most: int) -> Floats:
+        steps = int(np.ceil((high[k] - low[k]) / np.log(step)))
+        return np.linspace(0.0, 1.0, min(1 + steps, most))
+
+    if count == 1:
+        places = ladder(0, 3.0, 99)[:, None]
+    elif count <= 3:
+        ladders = [ladder(k, 16.0, 6 - count) for k in range(count)]
+        places = np.stack(np.meshgrid(*ladders, indexing="ij"), axis=-1).reshape(-1, count)
+    else:
+        widest = int(np.argmax(high - low))
+        common = ladder(widest, 3.0, 99)[:, None] * np.ones(count)
+        alone = [step * np.eye(count) for step in (0.5, 1.0)]
+        places = np.concatenate([common, *alone])
+    logs = high + (low - high) * places
+    return np.asarray(np.exp(logs[np.argsort(-logs.sum(axis=1), kind="stable")]))
 
 
 def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:
@@ -511,20 +555,20 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
 
 
 def error_findings(likelihood: SpecimenLikelihood) -> list[Finding]:
-    """Report several unknown errors: the points are those of errors with a common factor."""
+    """Report more unknown errors than have points for all combinations of small and large ones."""
     sizes = {
         m.unknown["error"]: m.readings.values.shape[1] if m.unknown["error"].type.ndim else 1
         for m in likelihood.measurements
         if "error" in m.unknown
     }
-    count = sum(sizes.values())
-    if count < 2:
+    count, n_inputs = sum(sizes.values()), len(likelihood.coordinates.inputs_of_population)
+    if count <= 2 or (count == 3 and n_inputs <= 2):
         return []
     text = (
-        f"{likelihood.name}: got {count} unknown errors of readings, expected one: where one of "
-        "them is far smaller than the others the log-likelihood is too low, and means of errors "
-        "and spreads may be .3 posterior standard deviations off; scale outputs and readings so "
-        "that one error= serves all, or pass known errors."
+        f"{likelihood.name}: got {count} unknown errors of readings of {n_inputs} inputs, expected "
+        "at most two, or three of two inputs: where some of them are far smaller than the others "
+        "the log-likelihood is inaccurate; scale outputs and readings so that one error= serves "
+        "several, or pass known errors."
     )
     return [Finding("several-errors", text, "measurement_error.md#what-it-changes")]
 

@@ -67,16 +67,18 @@ class ReadingDensity:
         sums, constant = [], np.zeros((len(readings), 1))
         for m in likelihood.measurements:
             columns = output_columns(likelihood, m)
-            if list(m.unknown) != ["error"] or m.extras["error"].type.ndim:
+            if list(m.unknown) != ["error"]:
                 continue
-            is_counted = numbers >= columns.start
-            is_counted &= numbers < columns.stop
-            is_counted &= readings.is_measured | readings.is_censored
-            plain = _sums_of_squares(readings, scales[0], outputs, variances, is_counted)
-            if plain is not None:
-                sums.append((columns.start, *plain[0]))
-                constant -= plain[1]
-                is_missing |= is_counted
+            is_scalar = not m.extras["error"].type.ndim
+            width = columns.stop - columns.start if is_scalar else 1
+            for start in range(columns.start, columns.stop, width):
+                is_counted = (numbers >= start) & (numbers < start + width)
+                is_counted &= readings.is_measured | readings.is_censored
+                plain = _sums_of_squares(readings, scales[0], outputs, variances, is_counted)
+                if plain is not None:
+                    sums.append((start, *plain[0]))
+                    constant -= plain[1]
+                    is_missing |= is_counted
         variance, places = variances[:, None], None
         size = (~is_missing).sum(axis=1).max()
         if size < outputs.shape[-1]:

@@ -9,7 +9,7 @@ normal reference population, which follows from posterior draws of the hyperpara
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -192,7 +192,9 @@ class SpecimenData:
     coordinates: Coordinates | None = None  # the map to inputs; None if they have no ends
     # (free,): columns of unknown coordinates, the narrowest possible populations first
     order: Indices | None = None
-    scales: tuple[float, ...] = (1.0,)  # factors of an unknown reading error, from its prior
+    # (J, m): factors of unknown reading errors, from larger to smaller ones of their prior; (J, 1)
+    # if all outputs have the same
+    scales: Floats = field(default_factory=lambda: np.ones((1, 1)))
     gross_errors: bool = False  # whether readings of single specimens may have gross errors
     options: SpecimenOptions = SpecimenOptions()
     name: str = "response"
@@ -269,6 +271,7 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
         data.order,
         columns,
         data.columns is not None,
+        data.scales,
     )
 
 
@@ -297,7 +300,7 @@ def fit_proposals(
     else:
         starts = _as_starts(earlier, np.zeros((len(target), 1, len(data.free))))
     parts = []
-    for scale in sorted(data.scales, reverse=True):
+    for scale in range(len(data.scales)):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
         proposals = without_covered(Proposals.at_modes(residuals, modes))
         parts.append(with_covered_fibres(proposals, starts, scale).modes)
@@ -415,7 +418,7 @@ class Plausible:
     draws: Draws
     proposals: Proposals
     points: SpecimenPoints
-    scale: float  # the likely factor of an unknown error
+    scale: int  # row of the likely factors of unknown errors
     count: int  # points of each half to begin with
 
     @classmethod
@@ -503,11 +506,12 @@ class Plausible:
         # allows them.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
             proposals = replace(proposals, share=mixing_weights(modes, masses[0] + masses[1]))
+        proposals = replace(proposals, likely=self.scale)
         result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
         largest = np.zeros(len(data.known))
         np.maximum.at(largest, modes.specimen, masses[0])
-        scale = modes.scale[np.abs(modes.scale - self.scale).argmin()]
-        counts = (masses[0] > 1e-3 * largest[modes.specimen]) & (modes.scale == scale)
+        counts = masses[0] > 1e-3 * largest[modes.specimen]
+        counts &= modes.scale == self.scale
         n_roots = np.bincount(modes.specimen[counts], minlength=len(data.known))
         result = replace(result, n_roots=np.maximum(n_roots, 1))
         if len(data.scales) > 1:
@@ -532,26 +536,26 @@ def specimen_points(
 
 
 def at_scale(
-    data: SpecimenData, points: SpecimenPoints, error: Floats, scale: float
+    data: SpecimenData, points: SpecimenPoints, error: Floats, scale: int
 ) -> SpecimenPoints:
-    """Return points with weights for readings whose errors are larger by a factor."""
-    if scale == 1.0:
+    """Return points with weights for readings whose errors have the factors of a row."""
+    if len(data.scales) == 1:
         return points
-    readings = scaled_errors(data.readings, scale)
+    readings = scaled_errors(data.readings, data.scales[scale])
     log_a = reading_log_density(data, readings, points.outputs, error) - points.log_proposal
     return replace(points, log_a=np.where(np.isnan(log_a), -np.inf, log_a))
 
 
-def likely_scale(data: SpecimenData, points: SpecimenPoints, error: Floats) -> float:
-    """Return the factor of the readings' errors that a fitted normal population makes likeliest."""
+def likely_scale(data: SpecimenData, points: SpecimenPoints, error: Floats) -> int:
+    """Return the row of factors of errors that a fitted normal population makes likeliest."""
     totals = []
-    for scale in data.scales if len(data.scales) > 1 else ():
+    for scale in range(len(data.scales)) if len(data.scales) > 1 else ():
         log_a = at_scale(data, points, error, scale).log_a
         rows = np.isfinite(log_a).any(axis=1)
         z = points.z[rows][..., data.free]
         logs = log_a[rows] + normal_log_density(z, *fit_normal(z, log_a[rows]))
         totals.append(log_sum_exp(logs).sum() if rows.all() else -np.inf)
-    return data.scales[int(np.argmax(totals))] if totals else 1.0
+    return int(np.argmax(totals)) if totals else 0
 
 
 def likely_weights(data: SpecimenData, points: SpecimenPoints, population: Normal) -> Floats:
@@ -567,11 +571,11 @@ def agreeing_points(
     proposals: Proposals,
     count: int,
     draws: Draws,
-    scale: float = 1.0,
+    scale: int = 0,
 ) -> tuple[SpecimenPoints, Proposals]:
     """Return points whose halves agree at draws, doubled from ``count`` in each half.
 
-    ``scale`` is the likely factor of an unknown error; the halves agree over all factors, too.
+    ``scale`` is the row of the likely factors of errors; the halves agree over all rows, too.
     """
     options = data.options
     over_scales = 0.03 * np.sqrt(max(len(data.readings), 10) / 10)
@@ -593,7 +597,8 @@ def agreeing_points(
         if is_precise and (
             len(data.scales) == 1
             or count >= 512
-            or _half_difference(data, proposals, halves, draws, data.scales)[0] <= over_scales
+            or _half_difference(data, proposals, halves, draws, range(len(data.scales)))[0]
+            <= over_scales
         ):
             return replace(joined(*halves), difference=difference[1]), proposals
         if 4 * count > most:
@@ -608,9 +613,9 @@ def _half_difference(
     proposals: Proposals,
     halves: Sequence[SpecimenPoints],
     draws: Draws,
-    scales: Sequence[float],
+    scales: Sequence[int],
 ) -> tuple[float, float, float]:
-    """Return the Monte Carlo error over draws, and over scales of an unknown error.
+    """Return the Monte Carlo error over draws, and over rows of factors of unknown errors.
 
     The second number has no contribution of the few populations that are narrower than the
     distances between points. The third is that of a constant.
@@ -624,6 +629,10 @@ def _half_difference(
         typical = typical_specimens(proposals.modes, len(data.readings))
         a, b = a[:, typical], b[:, typical]
     finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    if len(scales) > 1 and (np.ptp(data.scales, axis=1) > 0).any():
+        # Combinations of errors that the readings exclude do not count.
+        totals = a.sum(axis=1)
+        finite &= totals > totals.max() - 100.0
     return half_difference(a[finite], b[finite]) if finite.any() else (np.inf, np.inf, np.inf)
 
 
@@ -648,7 +657,7 @@ def reliable_draws(
     proposals: Proposals,
     count: int,
     seed: int,
-    scale: float = 1.0,
+    scale: int = 0,
 ) -> tuple[Draws, SpecimenPoints, Proposals]:
     """Return draws at which both halves of at least ``count`` points agree, and these points.
 

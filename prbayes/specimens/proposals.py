@@ -33,7 +33,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -74,6 +74,9 @@ class Residuals:
     # (N, m): columns of the outputs that were measured of a specimen; None if all were.
     columns: Indices | None = None
     allows_linear: bool = False  # whether maps that are nearly linear are replaced by linear ones
+    # (J, m): factors of the readings' errors, from larger to smaller ones; (J, 1) if the same of
+    # all outputs
+    scales: Floats = field(default_factory=lambda: np.ones((1, 1)))
 
     @property
     def free(self) -> Indices:
@@ -104,11 +107,11 @@ class Residuals:
         return centred @ np.linalg.inv(self.population.root).T
 
     def errors(
-        self, specimen: Indices, a: Floats, scale: float | Floats = 1.0
+        self, specimen: Indices, a: Floats, scale: int | Indices = 0
     ) -> tuple[Floats, Floats]:
         """Return standardised errors e, (k, m), and G = -de/da, (k, m, free).
 
-        ``scale`` is a factor of the readings' errors, a number or (k,). NaN without a response.
+        ``scale`` is a row of ``scales``, a number or (k,). NaN without a response.
         """
         scales = np.broadcast_to(scale, len(a))
         m = self.target.shape[1]
@@ -134,10 +137,12 @@ class Residuals:
 
     @np.errstate(all="ignore")
     def standardised(
-        self, specimen: Indices, values: Floats, jacobian: Floats, scale: Floats
+        self, specimen: Indices, values: Floats, jacobian: Floats, scale: Indices
     ) -> tuple[Floats, Floats]:
         """Return e, (k, m), and G, (k, m, free), of outputs and their Jacobian."""
-        factor = np.square(scale)[:, None]
+        factor = np.square(self.scales)[scale]
+        if self.columns is not None and factor.shape[1] > 1:
+            factor = np.take_along_axis(factor, self.columns[specimen], axis=1)
         relative = factor * self.relative[specimen] ** 2
         error = self.error[specimen]
         variance = self.emulator_error[specimen] ** 2 + factor * error**2 + relative * values**2
@@ -165,7 +170,7 @@ class Modes:
     misfit: Floats  # (R,): half the squared standardised errors, in nats
     errors: Floats  # (R, m): standardised errors e of the readings
     slopes: Floats  # (R, m, free): G = -de/da
-    scale: Floats  # (R,): factor of the readings' errors
+    scale: Indices  # (R,): row of the factors of the readings' errors
 
     @classmethod
     def joined(cls, parts: Sequence[Modes]) -> Modes:
@@ -196,14 +201,14 @@ def find_modes(
     residuals: Residuals,
     starts: Floats,
     *,
-    scale: float = 1.0,
+    scale: int = 0,
     precision: float = 0.1,
     gap: float = 20.0,
 ) -> Modes:
     """Find the modes of each specimen by Levenberg-Marquardt [1]_ from starts, (N, S, free).
 
     The population is wide: it has this precision, relative to the reference. A mode within ``gap``
-    nats of the specimen's best is kept. ``scale`` is a factor of the readings' errors.
+    nats of the specimen's best is kept. ``scale`` is a row of the factors of the readings' errors.
 
     References
     ----------
@@ -248,7 +253,7 @@ def _minimised(
     a: Floats,
     precision: float,
     iterations: int,
-    scale: float,
+    scale: int,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return local minima of half the squared residuals, their values, errors and slopes."""
     a, d = a.copy(), a.shape[1]
@@ -375,6 +380,7 @@ class Proposals:
     heavy_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
     linear: LinearMaps | None = None  # maps that replace some of the others
+    likely: int | None = None  # row of the likely factors of the readings' errors, once it is known
 
     @classmethod
     @one_thread()
@@ -407,17 +413,20 @@ class Proposals:
         )
         return with_linear_maps(proposals) if residuals.allows_linear else proposals
 
-    def is_open(self, scale: float = 1.0) -> bool:
+    def is_open(self, scale: int | None = None) -> bool:
         """Return whether readings leave inputs of a tenth of the specimens open.
 
         Along an open direction their precision is less than four times the population's. With a
-        larger one the reference population has little influence. ``scale`` is the likely factor of
-        the readings' errors.
+        larger one the reference population has little influence. ``scale`` is a row of the factors
+        of errors: by default the likely one, and before it is known that nearest to one.
         """
         _, m, d = self.modes.slopes.shape
         if m < d:
             return True
-        rows = self.modes.scale == self.modes.scale[np.abs(self.modes.scale - scale).argmin()]
+        scale = self.likely if scale is None else scale
+        if scale is None:
+            scale = int(np.abs(self.residuals.scales - 1).max(axis=1).argmin())
+        rows = self.modes.scale == scale
         least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
         return bool(np.quantile(least, 0.1) < self.least_precision)
 
@@ -590,10 +599,10 @@ class Proposals:
         the larger error. Points that one of them reaches are reached by the other.
         """
         modes, table = self.modes, self.modes.table
-        scale = np.where(table >= 0, modes.scale[table], np.nan)
+        scale = np.where(table >= 0, modes.scale[table], -1)
         # The Jacobian at a mode: D V' + D S U' G.
         maps = self.inputs + self.readings @ modes.slopes
-        is_wide = scale[:, :, None] >= scale[:, None]
+        is_wide = scale[:, :, None] <= scale[:, None]
         a = modes.a[table]
         difference = a[:, None] - a[:, :, None]  # (N, most, most, free)
         of_first = np.einsum("npij,npqj->npqi", maps[table], difference)
@@ -670,6 +679,8 @@ def _log_mixture(
     modes, residuals = proposals.modes, proposals.residuals
     values, jacobian = residuals.simulated(specimen, a)
     largest, terms = np.full(len(a), -np.inf), []
+    # Terms that are left out have one percent of a density together.
+    least = 5 + np.log(len(residuals.scales))
     if drawn is not None:
         largest = drawn[1] + logs[drawn[0]]
         terms = [largest]
@@ -684,7 +695,7 @@ def _log_mixture(
         value, slopes = proposals.mapped_errors(at, a[rows], *errors)
         sign, log_det = np.linalg.slogdet(slopes)
         density = log_det + proposals.log_density(at, value) + logs[at]
-        matters = (sign == proposals.orientation[at]) & (density > largest[rows] - 5)
+        matters = (sign == proposals.orientation[at]) & (density > largest[rows] - least)
         rows, at, density = rows[matters], at[matters], density[matters]
         is_reached = np.zeros(len(rows), dtype=bool)
         if drawn is not None:
@@ -728,7 +739,7 @@ def without_covered(proposals: Proposals) -> Proposals:
     return Proposals.at_modes(residuals, modes.rows(np.flatnonzero(is_kept)))
 
 
-def with_covered_fibres(proposals: Proposals, starts: Floats, scale: float) -> Proposals:
+def with_covered_fibres(proposals: Proposals, starts: Floats, scale: int) -> Proposals:
     """Return proposals with up to four more where the fibre of a specimen is not covered.
 
     A proposal ends at folds. Candidates are points at which the readings are met, nearest to

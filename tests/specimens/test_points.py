@@ -146,7 +146,7 @@ def test_the_log_proposal_serves_another_error() -> None:
     draws = draws_of(2)
     a, response = linear_response(2, 3)
     readings = with_error(response(specimens_of(draws)), 0.1)
-    points = points_of(response, readings, draws, scales=(0.6, 1.0, 1.6))
+    points = points_of(response, readings, draws, scales=np.array([[1.6], [1.0], [0.6]]))
     for scale in (0.6, 1.0, 1.6):
         other = scaled_errors(readings, scale)
         log_a = other.log_density(points.outputs, np.full(3, 1e-5)) - points.log_proposal
