@@ -17,7 +17,7 @@ import prbayes as prb
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
-from prbayes.model.measurement import with_observed
+from prbayes.model.measurement import observing
 from prbayes.model.random_variable import simulators
 
 N = 12
@@ -201,7 +201,7 @@ def test_frequencies_and_other_data_keep_the_covariates() -> None:
     (measurement,) = next(iter(Evaluator.of(repeated).likelihoods)).measurements
     assert measurement.covariates["hardness"].tolist() == np.repeat(HARDNESS, frequencies).tolist()
     with pytest.raises(ValueError, match="as many as there are groups, conditions"):
-        with_observed(measurement, np.ones(3))
+        observing(measurement, np.ones(3))
 
 
 def as_in_pymc(hardness: Any, with_dims: bool = False) -> None:

@@ -19,7 +19,7 @@ from scipy.special import bdtrc
 
 from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
-from prbayes._validate import Floats, Indices
+from prbayes._validate import Bools, Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import (
     Readings,
@@ -433,13 +433,7 @@ def data_findings(
     m = y.shape[1]
     labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
     largest_step = options.step_at_turning_point if several_roots else options.step
-    # Copies of a specimen count once, because they would look like censored values at the ends.
-    copies = [i for group in identical_specimens(y) for i in group[1:]]
-    counted = np.ones(len(y), dtype=bool)
-    counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
-    if rows is not None:
-        counted[:] = False
-        counted[np.unique(rows, return_index=True)[1]] = True
+    counted = _counted_once(y, rows)
     findings: list[Finding] = []
     # Label, step, and step in standard deviations.
     rounded_outputs: list[tuple[str, float, float]] = []
@@ -477,6 +471,17 @@ def data_findings(
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
         findings.append(_repeats_finding(identical_specimens(exact)))
     return tuple(findings)
+
+
+def _counted_once(y: Floats, rows: Indices | None) -> Bools:
+    """Return which rows of data, (N, m), are no copies: these would look like values at a limit."""
+    if rows is not None:
+        first = np.unique(rows, return_index=True)[1]
+        return np.isin(np.arange(len(y)), first)
+    copies = [i for group in identical_specimens(y) for i in group[1:]]
+    counted = np.ones(len(y), dtype=bool)
+    counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
+    return counted
 
 
 def _repeats_finding(groups: Sequence[Sequence[int]]) -> Finding:

@@ -89,7 +89,7 @@ class Measurement:
         return readings_at(self, 0.84, 512)
 
 
-def with_observed(measurement: Measurement, data: Any) -> Measurement:
+def observing(measurement: Measurement, data: Any) -> Measurement:
     """Return the measurement with other observed values; the same object for equal ones."""
     values = np.asarray(data, dtype=np.float64)
     if np.array_equal(values, measurement.observed, equal_nan=True):
@@ -443,8 +443,7 @@ class SpecimenLikelihood:
         posterior points are drawn.
         """
         changed = tuple(
-            m if data.get(m.name) is None else with_observed(m, data[m.name])
-            for m in self.measurements
+            m if data.get(m.name) is None else observing(m, data[m.name]) for m in self.measurements
         )
         models = [m for m in (self.model(), model) if m is not None] if model is not None else []
         names = [{str(rv.name) for rv in m.free_RVs} for m in models]

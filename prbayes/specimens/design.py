@@ -230,48 +230,47 @@ def sequential_design(
     run: Run, data: SpecimenData, previous: Emulation | None
 ) -> tuple[Emulation, Plausible]:
     """Return an emulation whose bias is small, or raise, and coarse points of the specimens."""
-    emulation = first_emulation(run, data) if previous is None else previous
+    if previous is None:
+        emulation = first_emulation(run, data)
+    else:
+        emulation = replace(previous, bias=np.inf, offsets=None)
     population = normal_of(data.inner[:, data.free])
-    most = data.options.max_runs or most_runs(data.known.shape[1]) + (data.options.n_first or 0)
+    most = largest_design(data)
     rng = np.random.default_rng([data.seed, 1])
-    has_fewer_readings = np.median(data.readings.is_measured.sum(axis=1)) < len(data.free)
+    enough_batches = 1 if has_fewer_readings(data) else 2
     # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # number of batches since the bias was small
     plausible = None
-    if previous is not None:
-        emulation = replace(emulation, bias=np.inf, offsets=None)
     while True:
         likely = Likely.of(data, emulation, population, batches)
         is_complete = batches >= enough or len(emulation.z) >= most
         is_unbiased = emulation.bias <= data.options.bias and is_complete
         if is_unbiased and len(emulation.z) < most and not likely.has_runs(data, emulation.z):
             # The bias is that at another population. Far from runs an emulator is often wrong.
-            runs = farthest(emulation.z, likely.best(), 4, likely.scale(data))
-            emulation, _ = with_audited_runs(run, data, emulation, runs, likely, population)
+            emulation = with_likely_runs(run, data, emulation, likely, population)
             batches += 1
             continue
         population = likely.population
         can_correct = may_correct(data, likely) and likely.is_known()
         # More runs decrease an error that would be reported, where corrections cannot. With fewer
         # readings than inputs it matters less, because the inputs are not known well.
-        is_last = further >= (1 if has_fewer_readings else 2) or len(emulation.z) >= most
+        is_last = further >= enough_batches or len(emulation.z) >= most
         may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if is_unbiased and is_smooth:
             emulation = without_spurious_modes(run, data, emulation, likely)
             plausible = Plausible.of(data, emulation, wider(population), plausible)
-            before, measured = emulation.surface, emulation.z
+            before = emulation
             # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
             is_good = emulation.bias <= 1.5 * data.options.bias
-            if not is_good and not likely.has_runs(data, measured):
-                batches += 1
+            if not is_good and not likely.has_runs(data, before.z):
                 continue
-            if is_good and emulation.surface is not before:
+            if is_good and emulation.surface is not before.surface:
                 # The audit's runs changed the surface, so that another population may be likely.
-                likely, earlier = Likely.of(data, emulation, population, batches), plausible
+                earlier, likely = plausible, Likely.of(data, emulation, population, batches)
                 emulation = without_spurious_modes(run, data, emulation, likely)
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
@@ -284,11 +283,29 @@ def sequential_design(
         if len(emulation.z) >= most:
             return at_most_runs(run, data, emulation, likely, population)
         count = data.options.sampled + 2
-        if previous is None:
-            count = max(count, batch_size(data, emulation))
+        count = count if previous else max(count, batch_size(data, emulation))
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def has_fewer_readings(data: SpecimenData) -> bool:
+    """Return whether most specimens have fewer readings than unknown inputs."""
+    return bool(np.median(data.readings.is_measured.sum(axis=1)) < len(data.free))
+
+
+def largest_design(data: SpecimenData) -> int:
+    """Return the number of runs at which a design ends."""
+    options = data.options
+    return options.max_runs or most_runs(data.known.shape[1]) + (options.n_first or 0)
+
+
+def with_likely_runs(
+    run: Run, data: SpecimenData, emulation: Emulation, likely: Likely, population: Normal
+) -> Emulation:
+    """Return the emulation with four runs at likely inputs, near another population."""
+    runs = farthest(emulation.z, likely.best(), 4, likely.scale(data))
+    return with_audited_runs(run, data, emulation, runs, likely, population)[0]
 
 
 def at_most_runs(

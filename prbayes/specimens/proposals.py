@@ -46,6 +46,8 @@ from prbayes._validate import IN_CACHE, Bools, Floats, Indices
 from prbayes.numerics.points import lattice, sobol
 from prbayes.numerics.threads import one_thread
 
+DEGREES = 5.0  # of Student's t distributions of the proposals
+
 
 @dataclass(frozen=True, eq=False)
 class Normal:
@@ -368,7 +370,6 @@ class Proposals:
     # A direction is open if the readings' precision along it is less than this many times that of
     # the population.
     least_precision: ClassVar[float] = 4.0
-    degrees: ClassVar[float] = 5.0  # of Student's t distribution
 
     residuals: Residuals
     modes: Modes
@@ -441,9 +442,9 @@ class Proposals:
         .. [1] Hesterberg, T. (1995), Weighted average importance sampling and defensive mixture
            distributions, Technometrics 37, doi:10.1080/00401706.1995.10484303.
         """
-        half = self.degrees / 2
+        half = DEGREES / 2
         constant = gammaln(half + 0.5) - gammaln(half) - np.log(half) / 2
-        student = constant - (half + 0.5) * np.log1p(xi**2 / self.degrees)
+        student = constant - (half + 0.5) * np.log1p(xi**2 / DEGREES)
         return np.where(self.heavy_axes[mode], student, -(xi**2) / 2).sum(axis=1)
 
     def mapped(self, mode: Indices, a: Floats) -> tuple[Floats, Floats]:
@@ -545,7 +546,7 @@ class Proposals:
         points = lattice(place, counts[mode], d)
         u = (points + shifts[mode]) % 1.0
         u = np.clip(u, 1e-12, 1 - 1e-12)
-        xi = np.where(self.heavy_axes[mode], stdtrit(self.degrees, u), ndtri(u))
+        xi = np.where(self.heavy_axes[mode], stdtrit(DEGREES, u), ndtri(u))
         a, value, log_det, converged = self.solved(mode, xi)
         rows = np.flatnonzero(converged)
         log_q = np.full(len(a), np.inf)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
 import prbayes as prb
-from prbayes.model.measurement import SpecimenLikelihood, with_observed
+from prbayes.model.measurement import SpecimenLikelihood, observing
 from prbayes.model.specimen_likelihood import log_likelihoods, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.response.by_specimen import BySpecimen
@@ -192,7 +192,7 @@ def test_optimum_prediction_and_individuals() -> None:
     subjects = prb.individuals(optimum)
     np.testing.assert_allclose(subjects["posterior"]["x"].mean(("chain", "draw")), X, atol=1e-3)
     with pytest.raises(ValueError, match="as many as there are groups, conditions, records"):
-        with_observed(likelihood_of(model).measurements[0], np.ones((2, N)))
+        observing(likelihood_of(model).measurements[0], np.ones((2, N)))
 
 
 def test_a_changed_record_is_noticed() -> None:
