@@ -386,7 +386,8 @@ def share_error(sample: ResponseSample, counts: ArrayFunction) -> Floats:
         return error
     mass = np.nanmean(sample.masses(sample.populations.thinned()), axis=0)
     means = np.array([mass @ counts(values) for values in outputs])
-    return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
+    squares = (means[1:] - means[0]) ** 2
+    return np.asarray(np.hypot(error, np.sqrt(squares.sum(axis=0))))
 
 
 def rough_sample(sample: ResponseSample) -> Findings:

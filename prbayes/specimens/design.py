@@ -89,7 +89,9 @@ def _least_error(data: SpecimenData, z: Floats, surface: Surface) -> Floats:
     z = z[-32:]
     step = 1e-9 * np.ptp(z, axis=0)
     # Second differences at so small a distance have rounding errors alone.
-    change = surface.values(z - step) - 2 * surface.values(z) + surface.values(z + step)
+    below = surface.values(z - step)
+    above = surface.values(z + step)
+    change = below + above - 2 * surface.values(z)
     rounding = np.sqrt(np.median(change**2, axis=0) / 6)
     return np.asarray(np.maximum(data.options.floor * data.readings.spread(), 1e3 * rounding))
 
@@ -511,7 +513,8 @@ def error_and_bias(
     # The error is part of the comparison at each specimen. If it is overestimated, it takes a part
     # of the scatter, so that the population is too narrow.
     by_error = gain * relative[1][:, None]
-    narrowing = np.sqrt(len(data.readings) / 2) * (by_error**2).sum(axis=2).mean(axis=0).max()
+    share = (by_error**2).sum(axis=2)
+    narrowing = np.sqrt(len(data.readings) / 2) * share.mean(axis=0).max()
     return error, float(max(bias, narrowing))
 
 
@@ -572,7 +575,8 @@ def _near_population(data: SpecimenData, z: Floats, population: Normal) -> Bools
     a = np.linalg.solve(population.root, (z[:, data.free] - population.mean).T)
     distance = (a**2).sum(axis=0)
     least = 2 * first_runs(z.shape[1])
-    limit = max(6.0**2, float(np.sort(distance)[min(least, len(z)) - 1]))
+    nearest = np.sort(distance)
+    limit = max(6.0**2, float(nearest[min(least, len(z)) - 1]))
     return np.asarray(distance <= limit)
 
 

@@ -113,7 +113,8 @@ def of_all_specimens(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenP
         return np.concatenate(wide)
 
     sizes = [points.log_a.shape[1] for points in (first, second)]
-    is_point = np.arange(count) < np.repeat(sizes, [len(first.z), len(second.z)])[:, None]
+    numbers = [len(first.z), len(second.z)]
+    is_point = np.arange(count) < np.repeat(sizes, numbers)[:, None]
     return SpecimenPoints(
         z=together("z"),
         outputs=together("outputs"),
@@ -135,7 +136,9 @@ def points_by_mode(points: SpecimenPoints, modes: Modes) -> SpecimenPoints:
     slot = points.mode - first[:, None]
     largest = points.log_a.max(axis=1, keepdims=True)
     weights = np.exp(points.log_a - np.where(np.isfinite(largest), largest, 0.0))
-    of_mode = (slot[:, None] == np.arange(modes.table.shape[1])[:, None]) * weights[:, None]
+    slots = np.arange(modes.table.shape[1])
+    is_of_mode = slot[:, None] == slots[:, None]
+    of_mode = is_of_mode * weights[:, None]
     total = of_mode.sum(axis=2)
     of_mode /= positive_scale(total)[:, :, None]
     with np.errstate(divide="ignore"):
@@ -241,7 +244,8 @@ def residuals_of(data: SpecimenData, emulation: Emulation, population: Normal) -
     """Return the residuals of an emulator's outputs."""
     readings, is_read = data.readings, data.readings.is_measured
     relative = np.where(is_read, readings.relative, 0.0)
-    error = np.where(is_read, np.sqrt(readings.error**2 + readings.step**2 / 12), np.inf)
+    variance = readings.error**2 + readings.step**2 / 12
+    error = np.where(is_read, np.sqrt(variance), np.inf)
     target = np.where(is_read, readings.values, 0.0)
     if emulation.offsets is not None:
         target = target - emulation.offsets
@@ -604,7 +608,9 @@ def agreeing_points(
         if 4 * count > most:
             raise _monte_carlo_error(data, 2 * count, max(difference[1:]), largest)
         # The error falls like 1 / count at best.
-        times = 2 ** int(np.log2(np.clip(difference[1] / largest, 2, most // (2 * count))))
+        ratio = difference[1] / largest
+        ratio = np.clip(ratio, 2, most // (2 * count))
+        times = 2 ** int(np.log2(ratio))
         count *= times
 
 

@@ -117,7 +117,8 @@ class Residuals:
         """
         scales = np.broadcast_to(scale, len(a))
         m = self.target.shape[1]
-        e, slopes = np.empty((len(a), m)), np.empty((len(a), m, a.shape[1]))
+        e = np.empty((len(a), m))
+        slopes = np.empty((*e.shape, a.shape[1]))
         for block in _blocks(len(a), m * self.known.shape[1]):
             i = specimen[block]
             e[block], slopes[block] = self.standardised(
@@ -262,7 +263,8 @@ def _minimised(
     e, slopes = residuals.errors(specimen, a, scale)
 
     def objective(a: Floats, e: Floats) -> Floats:
-        value = (e**2).sum(axis=1) / 2 + precision * (a**2).sum(axis=1) / 2
+        misfit = (e**2).sum(axis=1)
+        value = (misfit + precision * (a**2).sum(axis=1)) / 2
         return np.where(np.isnan(value), np.inf, value)
 
     value = objective(a, e)
@@ -567,7 +569,8 @@ class Proposals:
         a[first] = modes.a[lost]
         log_q[first] = self.log_det[lost] - log_unit
         z = np.zeros((n, count, residuals.known.shape[1]))
-        by_specimen, owner = np.full((n, count), np.inf), np.zeros((n, count), dtype=np.intp)
+        by_specimen = np.full((n, count), np.inf)
+        owner = np.zeros((n, count), dtype=np.intp)
         slot = _place_among_equals(specimen)
         z[specimen, slot] = residuals.coordinates(specimen, a)
         by_specimen[specimen, slot], owner[specimen, slot] = log_q, mode
