@@ -63,8 +63,10 @@ def audited_likelihood(
     """
     preparation, readings = prepared(likelihood), likelihood.readings
     emulation = preparation.emulation
-    # Spurious inputs form a narrow population only if readings determine the inputs.
-    is_open = preparation.proposals is None or preparation.proposals.is_open()
+    # Spurious inputs form a narrow population only if readings determine the inputs. An error of
+    # a vague prior may turn out small.
+    proposals, scale = preparation.proposals, preparation.points.scale
+    is_open = proposals is None or proposals.is_open(scale)
     if likelihood.calls_response or emulation.offsets is not None or is_open:
         return likelihood
     runs = likelihood.options.sampled
