@@ -119,6 +119,7 @@ def with_more_points(likelihood: SpecimenLikelihood, count: int = 256) -> Specim
         return likelihood
     data = specimen_data(likelihood)
     points = draw_points(data, preparation.proposals, count, data.seed + 1)
+    points = replace(points, scale=preparation.points.scale)
     result = replace(likelihood)
     result.cache["preparation"] = replace(preparation, points=points)
     return result
@@ -406,11 +407,16 @@ def _error_scales(likelihood: SpecimenLikelihood) -> Floats:
         errors = [r.error_sd(np.nan_to_num(r.values)) for r in sd]
         by_output = [v for v in m.unknown.values() if v.type.shape not in ((), (1,))]
         for k in range(width):
-            key = (*m.unknown.values(), k if by_output else 0) if m.unknown else ()
+            place = k if by_output else 0
+            key = (*m.unknown.values(), place) if m.unknown else ()
             columns.setdefault(key, []).append(first + k)
-            if errors:
-                low, middle, high = (error[:, k][errors[1][:, k] > 0] for error in errors)
-                ends.setdefault(key, []).extend([low / middle, high / middle])
+            if not errors:
+                continue
+            low, middle, high = (error[:, k] for error in errors)
+            usable = middle > 0
+            of_key = ends.setdefault(key, [])
+            of_key.append(low[usable] / middle[usable])
+            of_key.append(high[usable] / middle[usable])
         first += width
     joined = {key: np.concatenate(values) for key, values in ends.items()}
     ranges = {key: (values.min(), values.max()) for key, values in joined.items() if values.size}

@@ -81,6 +81,7 @@ class SpecimenPoints:
     # (N, K, B): changes of ``log_a`` in draws of the emulator of a random response. The likelihood
     # of all specimens is the mean over these draws, which they have in common; None for no draws.
     tilts: Floats | None = None
+    scale: int = 0  # row of the likely factors of unknown errors
 
     def rows(self, index: Indices) -> SpecimenPoints:
         """Return the points of selected specimens."""
@@ -124,6 +125,7 @@ def of_all_specimens(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenP
         mode=together("mode"),
         difference=float(np.hypot(first.difference, second.difference)),
         is_exact=first.is_exact and second.is_exact,
+        scale=first.scale,
     )
 
 
@@ -510,14 +512,13 @@ class Plausible:
         # allows them.
         if proposals.is_open(self.scale) and len(data.scales) == 1:
             proposals = replace(proposals, share=mixing_weights(modes, masses[0] + masses[1]))
-        proposals = replace(proposals, likely=self.scale)
         result, _ = agreeing_points(data, proposals, self.count, self.draws, self.scale)
         largest = np.zeros(len(data.known))
         np.maximum.at(largest, modes.specimen, masses[0])
         counts = masses[0] > 1e-3 * largest[modes.specimen]
         counts &= modes.scale == self.scale
         n_roots = np.bincount(modes.specimen[counts], minlength=len(data.known))
-        result = replace(result, n_roots=np.maximum(n_roots, 1))
+        result = replace(result, n_roots=np.maximum(n_roots, 1), scale=self.scale)
         if len(data.scales) > 1:
             return result, proposals
         # Exact readings determine the inputs of a mode, so that one point suffices.

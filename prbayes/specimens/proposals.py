@@ -383,7 +383,6 @@ class Proposals:
     heavy_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
     linear: LinearMaps | None = None  # maps that replace some of the others
-    likely: int | None = None  # row of the likely factors of the readings' errors, once it is known
 
     @classmethod
     @one_thread()
@@ -421,12 +420,11 @@ class Proposals:
 
         Along an open direction their precision is less than four times the population's. With a
         larger one the reference population has little influence. ``scale`` is a row of the factors
-        of errors: by default the likely one, and before it is known that nearest to one.
+        of errors, by default that nearest to one.
         """
         _, m, d = self.modes.slopes.shape
         if m < d:
             return True
-        scale = self.likely if scale is None else scale
         if scale is None:
             scale = int(np.abs(self.residuals.scales - 1).max(axis=1).argmin())
         rows = self.modes.scale == scale

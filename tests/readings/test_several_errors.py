@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import halfnorm, multivariate_normal
 
 import prbayes as prb
-from prbayes.model.specimen_audit import audited_likelihood
+from prbayes.model import specimen_audit
 from prbayes.model.specimen_likelihood import log_likelihoods, specimen_likelihoods
 from prbayes.model.specimen_preparation import error_findings, factor_design, prepared
 
@@ -87,12 +87,18 @@ def test_designs_of_factors_have_each_error_alone_at_its_ends(count: int, size: 
 
 
 @pytest.mark.long
-def test_a_vague_error_that_turns_out_small_leaves_no_input_open() -> None:
-    """The largest error of the prior is far above the scatter of the outputs."""
+def test_the_audit_takes_the_likely_error_of_a_vague_prior(monkeypatch: Any) -> None:
+    """Inputs are open under the 84 % quantile of the prior, but not under the likely error."""
     likelihood, _, _model = linear_model([[1.0], [2.0]], [20.0, 40.0], [0.01, 0.02], 12)
-    proposals = prepared(likelihood).proposals
+    proposals, audited = prepared(likelihood).proposals, []
     assert proposals is not None
-    assert proposals.is_open(0)
-    assert not proposals.is_open()
+    assert proposals.is_open()
+
+    def uncertainty(emulation: Any, z: Any) -> Any:
+        audited.append(len(z))
+        return np.zeros(len(z))
+
+    monkeypatch.setattr(specimen_audit, "_uncertainty", uncertainty)
     thetas = prepared(likelihood).thetas
-    assert audited_likelihood(likelihood, thetas, is_last=True) is likelihood
+    assert specimen_audit.audited_likelihood(likelihood, thetas, is_last=True) is likelihood
+    assert audited
