@@ -22,14 +22,13 @@ from prbayes.model.evaluator import specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.maximum_likelihood import specimen_pool, specimen_refits
-from prbayes.response.distributions import compiled_log_density
+from prbayes.response.distributions import compiled_log_density, normal_scores
 from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
     CheckOptions,
     check_conflict,
     check_population,
     influence,
-    score_function,
     scored_specimens,
     separate_modes,
 )
@@ -272,7 +271,7 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
     (points,), log_a = arrays(likelihood)
     data = [([points.get_value()], log_a.get_value())]
     inputs = likelihood.inputs
-    scores = [(score_function(inputs), compiled_log_density(inputs))]
+    scores = [(normal_scores(inputs), compiled_log_density(inputs))]
     ((z, weights),) = scored_specimens(evaluator, scores, optimum.theta, data)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     exact = (2 * np.log(problem.observed) - optimum.point["mu"]) / optimum.point["sigma"]

@@ -218,6 +218,7 @@ def _extended(
     unlike = [f"{n + i}" for i in rare_specimens(logs)]
     findings = []
     if unlike:
+        prepared(grown)  # Raises where only the emulator has inputs of the new readings.
         # The points were to suffice for the first specimens' populations, which may not be likely.
         joint = with_emulator(joint, grown)
         text = (
