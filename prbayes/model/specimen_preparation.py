@@ -442,21 +442,26 @@ def factor_design(ranges: Sequence[tuple[float, float]]) -> Floats:
     count = len(low)
 
     def ladder(k: int, step: float, most: int) -> Floats:
-        steps = int(np.ceil((high[k] - low[k]) / np.log(step)))
-        return np.linspace(0.0, 1.0, min(1 + steps, most))
+        width = high[k] - low[k]
+        steps = np.ceil(width / np.log(step))
+        size = min(1 + int(steps), most)
+        return np.linspace(0.0, 1.0, size)
 
     if count == 1:
         places = ladder(0, 3.0, 99)[:, None]
     elif count <= 3:
         ladders = [ladder(k, 16.0, 6 - count) for k in range(count)]
-        places = np.stack(np.meshgrid(*ladders, indexing="ij"), axis=-1).reshape(-1, count)
+        grids = np.meshgrid(*ladders, indexing="ij")
+        places = np.stack([grid.ravel() for grid in grids], axis=-1)
     else:
         widest = int(np.argmax(high - low))
         common = ladder(widest, 3.0, 99)[:, None] * np.ones(count)
-        alone = [step * np.eye(count) for step in (0.5, 1.0)]
-        places = np.concatenate([common, *alone])
+        alone = np.eye(count)
+        places = np.concatenate([common, 0.5 * alone, alone])
     logs = high + (low - high) * places
-    return np.asarray(np.exp(logs[np.argsort(-logs.sum(axis=1), kind="stable")]))
+    order = np.argsort(-logs.sum(axis=1), kind="stable")
+    rows = np.exp(logs[order])
+    return np.asarray(rows)
 
 
 def specimen_data(likelihood: SpecimenLikelihood) -> SpecimenData:

@@ -426,7 +426,8 @@ class Proposals:
         if m < d:
             return True
         if scale is None:
-            scale = int(np.abs(self.residuals.scales - 1).max(axis=1).argmin())
+            distance = np.abs(self.residuals.scales - 1)
+            scale = int(distance.max(axis=1).argmin())
         rows = self.modes.scale == scale
         least = np.linalg.svd(self.modes.slopes[rows], compute_uv=False)[:, -1] ** 2
         return bool(np.quantile(least, 0.1) < self.least_precision)

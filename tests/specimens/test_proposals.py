@@ -293,7 +293,7 @@ def test_small_terms_of_many_factors_are_one_percent_of_a_density_together() -> 
     weights = np.bincount(mode.ravel()).astype(float)
     # Without the proposals that drew the points no term is left out.
     exact = proposals.log_mixture(specimen, z.reshape(-1, 1), weights) - 0.5 * np.log(2 * np.pi)
-    np.testing.assert_allclose(log_q.ravel(), exact, atol=0.01)
+    np.testing.assert_allclose(log_q.ravel(), exact, atol=1e-3)
 
 
 def test_an_inaccurate_reading_at_a_turning_point() -> None:
