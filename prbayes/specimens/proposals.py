@@ -759,11 +759,13 @@ def with_covered_fibres(proposals: Proposals, starts: Floats, scale: int) -> Pro
     half = np.broadcast_to(0.5 * np.eye(d), (len(g), d, d))
     triangles = np.linalg.qr(np.concatenate([g, half], axis=1), mode="r")
     roots = np.linalg.inv(triangles).swapaxes(1, 2)
-    u = sobol(32 if residuals.has_errors else 8, d + 1, 1)
-    # At a fold the precision is far too small, so that points are at several distances.
-    away = ndtri(u[:, :d]) * 4.0 ** -u[:, d:]
+    away = ndtri(sobol(8, d, 1))
+    if residuals.has_errors:
+        # At a fold the precision is far too small, so that points are at several distances.
+        u = sobol(32, d + 1, 1)
+        away = ndtri(u[:, :d]) * 4.0 ** -u[:, d:]
     around = modes.a[:, None] + away @ roots
-    specimen = np.concatenate([specimen, np.repeat(modes.specimen, len(u))])
+    specimen = np.concatenate([specimen, np.repeat(modes.specimen, len(away))])
     a = np.concatenate([met, around.reshape(-1, d)])
     e, slopes = residuals.errors(specimen, a, scale)
     misfit = (e**2).sum(axis=1) / 2
