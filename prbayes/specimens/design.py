@@ -91,7 +91,8 @@ def _least_error(data: SpecimenData, z: Floats, surface: Surface) -> Floats:
     # Second differences at so small a distance have rounding errors alone.
     below = surface.values(z - step)
     above = surface.values(z + step)
-    change = below + above - 2 * surface.values(z)
+    # The surface of a table has no values beyond its ends.
+    change = np.nan_to_num(below + above - 2 * surface.values(z))
     rounding = np.sqrt(np.median(change**2, axis=0) / 6)
     return np.asarray(np.maximum(data.options.floor * data.readings.spread(), 1e3 * rounding))
 

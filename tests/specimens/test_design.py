@@ -336,3 +336,14 @@ def test_another_population_is_not_near(shift: float, width: float, is_near: boo
     nothing: Any = None
     earlier, later = (Plausible(d, nothing, nothing, 1.0, 1) for d in draws)
     assert later.is_near(earlier) is is_near
+
+
+def test_a_surface_without_values_beyond_its_runs_has_an_error() -> None:
+    class Bounded:
+        def values(self, z: Floats) -> Floats:
+            return np.where(abs(z) <= 1, z, np.nan)
+
+    z = np.linspace(-1, 1, 5)[:, None]
+    data = SpecimenData(Readings.exact(z), np.full((5, 1), np.nan), z, posterior)
+    least: Any = design._least_error(data, z, Bounded())  # type: ignore[arg-type]
+    assert least == pytest.approx(1e-5 * data.readings.spread(), rel=0.1)
