@@ -334,7 +334,7 @@ def test_another_population_is_not_near(shift: float, width: float, is_near: boo
     mean, sd = np.array([1.0, 2000.0]), np.array([0.1, 300.0])
     draws = draws_around(mean, sd, 50), draws_around(mean + shift * sd, width * sd, 50)
     nothing: Any = None
-    earlier, later = (Plausible(d, nothing, nothing, 1.0, 1) for d in draws)
+    earlier, later = (Plausible(d, nothing, nothing, 0, 1) for d in draws)
     assert later.is_near(earlier) is is_near
 
 
