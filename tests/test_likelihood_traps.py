@@ -594,7 +594,7 @@ def test_an_exact_reading_at_an_end_is_refused_or_reported_by_its_row(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("end", [0.0, 1e-6])
+@pytest.mark.parametrize("end", [0.0, 1e-6, 1e-4])
 def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: float) -> None:
     c = np.random.default_rng(2).normal(0, 0.5, 13)
     x = np.append(BESIDE, end)
@@ -604,7 +604,7 @@ def test_two_inputs_with_a_reading_at_an_end_do_not_blame_the_response(end: floa
             "y", lambda x, c: np.stack([x + 0 * c, c + 0.1 * x], -1), *inputs,
             observed=np.stack([x, c + 0.1 * x], -1),
         )  # fmt: skip
-    if end > 0:
+    if end > 1e-5:  # the least error of an emulator, as a share of the scatter
         populations = [(0.5, 1.0), (1.0, 1.0), (0.7, 0.7)]
         others = {"mu": 0.0, "s_log__": np.log(0.5)}
         errors = errors_at(model, populations, lambda a, b: beta.logpdf(x, a, b), **others)

@@ -382,6 +382,9 @@ class Proposals:
     # (R, free): directions of Student's t, along which populations differ or errors are not normal
     heavy_axes: Bools
     share: Floats  # (R,): mixing weight among the modes of the specimen
+    # (R, free): xi at the centers; zero but at modes far from the reference population, which would
+    # move the points of accurate readings towards it
+    center: Floats
     linear: LinearMaps | None = None  # maps that replace some of the others
 
     @classmethod
@@ -410,8 +413,13 @@ class Proposals:
         orientation = orientation * np.sign(np.linalg.det(rotation))
         back = rotation.swapaxes(1, 2)
         heavy = (np.arange(d) < is_open.sum(axis=1, keepdims=True)) | residuals.has_errors
+        inputs, readings = back @ inputs, back @ readings
+        center = np.einsum("rij,rj->ri", inputs, modes.a)
+        center -= np.einsum("rim,rm->ri", readings, modes.errors)
+        is_closed = np.arange(d) >= is_open.sum(axis=1, keepdims=True)
+        center = np.where(is_closed & (np.abs(center) > 1), center, 0.0)
         proposals = cls(
-            residuals, modes, back @ inputs, back @ readings, orientation, log_det, heavy, share
+            residuals, modes, inputs, readings, orientation, log_det, heavy, share, center
         )
         return with_linear_maps(proposals) if residuals.allows_linear else proposals
 
@@ -467,6 +475,7 @@ class Proposals:
         """Return xi and its Jacobian at points with standardised errors e and slopes G."""
         inputs, readings = self.inputs[mode], self.readings[mode]
         xi = np.einsum("kij,kj->ki", inputs, a) - np.einsum("kim,km->ki", readings, e)
+        xi -= self.center[mode]
         jacobian = inputs + readings @ slopes
         if self.linear is not None:
             rows = np.flatnonzero(self.linear.is_used[mode])

@@ -117,3 +117,17 @@ def test_inaccurate_readings_at_a_fold_have_inputs_on_both_sides(scale: float) -
     for mu, sigma in ((0.8, 0.6), (0.5, 0.4), (1.2, 0.3)):
         both = [logp({"mu": sign * mu, "sigma_log__": np.log(sigma)}) for sign in (1, -1)]
         assert abs(both[0] - both[1]) < 0.05
+
+
+def test_accurate_readings_have_points_around_modes_far_from_the_population() -> None:
+    """Mirrored populations that are narrow: points of the other side were at its lower edge."""
+    x = -1.5 + 0.066 * np.random.default_rng(9).standard_normal(24)
+    observed = x**2 + 0.041 * np.random.default_rng(10).standard_normal(24)
+    with pm.Model() as model:
+        inputs = pm.Normal.dist(pm.Normal("mu", -2.0, 2.2), pm.HalfNormal("sigma", 1.0))
+        metric = prb.LogLikelihood(error=0.041)
+        prb.Simulator("y", lambda x: x**2, inputs, observed=observed, metric=metric)
+    logp = model.compile_fn(model.observedlogp)
+    for mu, sigma in ((1.5, 0.066), (1.48, 0.05), (1.52, 0.09)):
+        both = [logp({"mu": sign * mu, "sigma_log__": np.log(sigma)}) for sign in (1, -1)]
+        assert abs(both[0] - both[1]) < 0.05
