@@ -45,7 +45,7 @@ def exact(
     step = x[1] - x[0]
     ends = [(prior[0] - 4.5 * prior[1], prior[0] + 4.5 * prior[1])]
     ends.append((np.log(1e-3 * scale), np.log(4.5 * scale)))
-    for size in (2001, 1001):
+    for size in (1501, 801):
         mu, log_sd = np.linspace(*ends[0], size), np.linspace(*ends[1], 61)
         density = np.empty((len(mu), len(log_sd)))
         for k, sd in enumerate(np.exp(log_sd)):
@@ -94,7 +94,7 @@ def row(cell: str, number: int) -> dict[str, Any]:
         draws = prb.sample(draws=2000, random_seed=number).posterior
     figures: dict[str, Any] = {"runs": runs[0], "cpu": round(time.process_time() - begun, 2)}
     half = 4.5 * prior[1] + 4 * scale
-    inputs = np.linspace(prior[0] - half, prior[0] + half, 4001)
+    inputs = np.linspace(prior[0] - half, prior[0] + half, 3001)
     likelihood = np.exp(-(((observed[:, None] - response(inputs)) / error) ** 2) / 2)
     names, biases, widths = ("mu", "sigma"), [], []
     for name, figure in zip(names, exact(inputs, likelihood, prior, scale), strict=True):

@@ -417,7 +417,9 @@ class Proposals:
         center = np.einsum("rij,rj->ri", inputs, modes.a)
         center -= np.einsum("rim,rm->ri", readings, modes.errors)
         is_closed = np.arange(d) >= is_open.sum(axis=1, keepdims=True)
-        center = np.where(is_closed & (np.abs(center) > 1), center, 0.0)
+        # Inputs that do not reproduce the readings have nothing that points could lie around.
+        is_met = (modes.misfit < 10.0 + m)[:, None]
+        center = np.where(is_closed & is_met & (np.abs(center) > 1), center, 0.0)
         proposals = cls(
             residuals, modes, inputs, readings, orientation, log_det, heavy, share, center
         )
