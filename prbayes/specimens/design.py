@@ -286,7 +286,7 @@ def sequential_design(
         if len(emulation.z) >= most:
             return at_most_runs(run, data, emulation, likely, population)
         count = data.options.sampled + 2
-        count = count if previous else max(count, batch_size(data, emulation))
+        count = count if previous is not None else max(count, batch_size(data, emulation))
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
