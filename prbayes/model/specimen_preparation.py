@@ -73,6 +73,7 @@ from prbayes.specimens.points import (
     likely_weights,
     normal_of,
     of_all_specimens,
+    reading_change,
     specimen_points,
     typical_specimens,
 )
@@ -253,11 +254,13 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if has_random_response(likelihood):
             return replace(first, findings=report(*runs.findings, *first.findings))
 
-        def posterior(share: PopulationShare | None) -> PopulationDraws:
+        def posterior(share: PopulationShare | None, emulation: Emulation) -> PopulationDraws:
             if share is not None:
                 _refuse_own_responses(likelihood, data, selection)
-            populations = SpecimenPopulations(likelihood)
-            return populations.posterior(points.z, points.log_a, share=share)
+            # Both have the same emulator. Otherwise populations at which only the earlier one
+            # reaches the readings, and the later one the limits, would be likely.
+            log_a = points.log_a + reading_change(data, points, first.emulation, emulation)
+            return SpecimenPopulations(likelihood).posterior(points.z, log_a, share=share)
 
         # Calls of a table's surface do not count as runs.
         run = OfTables.of(likelihood, Runs.__call__) if likelihood.has_table else runs

@@ -388,15 +388,9 @@ def reading_log_density(
     return of_outputs.log_density(outputs, error[data.columns])
 
 
-def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
-    """Return points of all specimens, ``count`` of each."""
-    emulation = proposals.residuals.response
-    z, log_proposal, mode = proposals.draw(count, seed)
+def outputs_at(data: SpecimenData, emulation: Emulation, z: Floats) -> Floats:
+    """Return the emulator's outputs at points of all specimens, (N, K, d) -> (N, K, m)."""
     n, k, d = z.shape
-    if data.coordinates is not None and data.coordinates.support is not None:
-        low, high = data.coordinates.support
-        is_beyond = (z < low) | (z > high)
-        log_proposal = np.where(is_beyond.any(axis=2), np.inf, log_proposal)
     parts = []
     for rows in np.array_split(np.arange(n), 1 + n * k // IN_CACHE):
         columns, offsets = None, emulation.offsets
@@ -410,7 +404,30 @@ def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int)
                 of_rows = np.take_along_axis(of_rows, data.columns[rows], axis=1)
             values = values + of_rows[:, None]
         parts.append(values)
-    outputs = np.concatenate(parts)
+    return np.concatenate(parts)
+
+
+def reading_change(
+    data: SpecimenData, points: SpecimenPoints, before: Emulation, after: Emulation
+) -> Floats:
+    """Return the change of the readings' log-density at points with a later emulator, (N, K)."""
+    if after.surface is before.surface:
+        return np.zeros(points.log_a.shape)
+    first = reading_log_density(data, data.readings, points.outputs, before.error)
+    outputs = outputs_at(data, after, points.z)
+    change = reading_log_density(data, data.readings, outputs, after.error) - first
+    return np.where(np.isnan(change), -np.inf, change)
+
+
+def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
+    """Return points of all specimens, ``count`` of each."""
+    emulation = proposals.residuals.response
+    z, log_proposal, mode = proposals.draw(count, seed)
+    if data.coordinates is not None and data.coordinates.support is not None:
+        low, high = data.coordinates.support
+        is_beyond = (z < low) | (z > high)
+        log_proposal = np.where(is_beyond.any(axis=2), np.inf, log_proposal)
+    outputs = outputs_at(data, emulation, z)
     log_a = reading_log_density(data, data.readings, outputs, emulation.error) - log_proposal
     log_a = np.where(np.isnan(log_a), -np.inf, log_a)
     n_roots = (proposals.modes.table >= 0).sum(axis=1) // len(data.scales)

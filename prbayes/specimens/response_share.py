@@ -65,7 +65,7 @@ def response_share(
     run: ArrayFunction,
     data: SpecimenData,
     emulation: Emulation,
-    posterior: Callable[[ResponseShare | None], Any],
+    posterior: Callable[[ResponseShare | None, Emulation], Any],
     selection: Selection | None = None,
     *,
     count: int = 4096,
@@ -74,8 +74,8 @@ def response_share(
     """Return the points of the share, and the emulation with runs at the failing region's boundary.
 
     None where the share changes the log-likelihood of no plausible population by more than the
-    error of the points of the specimens. ``posterior`` maps a share to draws of the
-    hyperparameters, with ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has
+    error of the points of the specimens. ``posterior`` maps a share and its emulation to draws of
+    the hyperparameters, with ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has
     ``count`` points at first, and there are at most ``batches`` batches of runs at the boundary.
     With a ``selection`` the share is that of the specimens that are measured.
 
@@ -85,7 +85,7 @@ def response_share(
         return emulation, None
     seed, name, options = data.seed, data.name, data.options
     largest = options.half_difference
-    draws = posterior(None)
+    draws = posterior(None, emulation)
 
     def draw(number: int, half: int) -> ResponseShare:
         samples = (data.prior, draws.specimens())
@@ -94,7 +94,7 @@ def response_share(
     share = draw(count, 0)
     if selection is None and np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
         return emulation, None
-    draws = posterior(share)
+    draws = posterior(share, emulation)
     _, other_metric = data.remedies()
     # Probabilities are smooth beside a boundary, so that fewer points suffice.
     count = count if selection is None else count // 2
@@ -122,7 +122,7 @@ def response_share(
             f"by {change:.2g} nats after {batches} batches of {batch} runs there, expected at most "
             f"{largest / 4}; {any_of('repair the response', 'narrow the priors', other_metric)}"
         )
-    draws = posterior(share)
+    draws = posterior(share, emulation)
     return emulation, _agreeing_share(data, draws, draw, count)
 
 

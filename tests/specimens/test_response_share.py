@@ -87,7 +87,7 @@ def shared(
     emulation = emulation_of(run, d)
     z = 0.5 * np.random.default_rng(3).standard_normal((1000, d))  # specimens of the prior
     data = SpecimenData(READINGS, np.full((20, d), np.nan), z, posterior=lambda *_: populations)
-    after, share = response_share(run, data, emulation, lambda _: populations, batches=batches)
+    after, share = response_share(run, data, emulation, lambda *_: populations, batches=batches)
     return emulation, after, share
 
 
