@@ -6,13 +6,13 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, ndtri
+from scipy.special import chdtri, logsumexp, ndtri
 
 from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import log_sum_exp
@@ -48,6 +48,7 @@ from prbayes.model.remedies import remedies_of
 from prbayes.model.run_coverage import coverage_findings
 from prbayes.model.stochastic_likelihood import points_of_random_response, random_cost
 from prbayes.model.table_likelihood import OfTables, points_of_tables
+from prbayes.numerics.mixtures import StudentMixture
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.budget import RunCost
@@ -921,11 +922,13 @@ class SpecimenPopulations:
         smoothing: Floats | None = None,
         share: PopulationShare | None = None,
         seed: int = 0,
+        several: bool = False,
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
-        Adaptive importance sampling. Weights are tempered until their effective sample size is ten
-        times the number of hyperparameters, so that a few draws do not decide the next proposal.
+        Adaptive importance sampling, by mixtures if there may be ``several`` modes. Weights are
+        tempered until their effective sample size is ten times the number of hyperparameters, so
+        that a few draws do not decide the next proposal.
         """
         names = self.hyperparameters
         d = names.size
@@ -950,9 +953,13 @@ class SpecimenPopulations:
             return _tempered(log_weights, 10 * d)
 
         thetas = names.prior_points(2048, seed)
-        log_weights = log_posterior(names, thetas, log_likelihood) - names.log_prior(thetas)
-        weights, _ = tempered(log_weights, thetas)
-        for attempt in range(12):
+        log_density = log_posterior(names, thetas, log_likelihood)
+        weights, _ = tempered(log_density - names.log_prior(thetas), thetas)
+        if several:
+            thetas, weights = self._several_modes(
+                thetas, log_density, log_likelihood, tempered, seed
+            )
+        for attempt in range(0 if several else 12):
             mean = weights @ thetas
             away = thetas - mean
             covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
@@ -968,6 +975,36 @@ class SpecimenPopulations:
                 break
         rng = np.random.default_rng([seed, 5])
         return PopulationDraws(self, thetas[rng.choice(len(thetas), 256, p=weights)])
+
+    def _several_modes(
+        self,
+        thetas: Floats,
+        log_density: Floats,
+        log_likelihood: ArrayFunction,
+        tempered: Callable[[Floats, Floats], tuple[Floats, float]],
+        seed: int,
+    ) -> tuple[Floats, Floats]:
+        """Return points of the posterior, (n, p), and weights, from points of the prior.
+
+        No point is dropped, so that no mode is lost from one proposal to the next.
+        """
+        names = self.hyperparameters
+        proposals: list[tuple[Callable[[Floats], Floats], int]] = [(names.log_prior, len(thetas))]
+        rng = np.random.default_rng([seed, 6])
+        for attempt in range(12):
+            terms = [density(thetas) + np.log(n / len(thetas)) for density, n in proposals]
+            log_ratio = log_density - logsumexp(terms, axis=0)
+            weights, temper = tempered(log_ratio, thetas)
+            if temper == 1.0 and attempt >= 3 and 1 / (weights**2).sum() > 200:
+                break
+            rows, counts = np.unique(rng.choice(len(thetas), 512, p=weights), return_counts=True)
+            mixture = StudentMixture.fitted(thetas[rows], counts / 512, 6, 5.0, rng)
+            new = mixture.draws(512, seed + 1 + attempt)
+            proposals.append((mixture.log_density, 512))
+            thetas = np.concatenate([thetas, new])
+            of_new = log_posterior(names, new, log_likelihood)
+            log_density = np.concatenate([log_density, of_new])
+        return thetas, weights
 
     def _refuse_unlikely(self, logs: Floats) -> None:
         """Raise for the specimen that the fewest populations reach, from log-likelihoods (S, N)."""

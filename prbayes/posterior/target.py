@@ -44,6 +44,7 @@ from prbayes.model.evaluator import (
     with_targets,
 )
 from prbayes.model.parameters import THETAS, log_posterior
+from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.modes import Laplace, LogDensity, far_apart, laplace, modes_each, of_one
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
@@ -100,7 +101,8 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
-    thetas = evaluator.hyperparameters.prior_points(1024, 0)
+    of_points = [prepared(likelihood).thetas for likelihood in evaluator.likelihoods]
+    thetas = np.concatenate([evaluator.hyperparameters.prior_points(1024, 0), *of_points])
     starts = specimen_starts(thetas, target.log_posterior(thetas), prior_sd)
     return replace(target, starts=starts)
 

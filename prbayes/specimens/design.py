@@ -23,8 +23,10 @@ from prbayes.specimens.points import (
     Plausible,
     SpecimenData,
     SpecimenPoints,
+    are_near,
     at_scale,
     draw_points,
+    draws_of,
     fit_proposals,
     likely_scale,
     likely_weights,
@@ -124,7 +126,7 @@ class Likely:
         if has_several.mean() > 0.1 and not proposals.is_open(scale):
             # If specimens have several roots, the prior decides which of them form a population,
             # so that the population follows from posterior draws.
-            draws = data.posterior(points.z, points.log_a, None)
+            draws = draws_of(data, proposals, points)
             population = normal_of(draws.specimens()[:, data.free])
             return cls(proposals, points, population, likely_weights(data, points, population))
         z = points.z[has_point][..., data.free]
@@ -244,6 +246,7 @@ def sequential_design(
     # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # number of batches since the bias was small
+    returns = 0  # number of populations that a surface through all runs has elsewhere
     plausible = None
     while True:
         likely = Likely.of(data, emulation, population, batches)
@@ -281,8 +284,14 @@ def sequential_design(
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
                 is_good = may_be_rough or len(emulation.z) >= most
-            if is_good:
+            elsewhere = None
+            if is_good and returns < 2 and len(emulation.z) < most:
+                elsewhere = population_elsewhere(data, emulation, likely, batches)
+            if is_good and elsewhere is None:
                 return emulation, plausible.of_emulation(data, emulation)
+            if elsewhere is not None:
+                emulation, likely = elsewhere
+                population, returns = likely.population, returns + 1
         if len(emulation.z) >= most:
             return at_most_runs(run, data, emulation, likely, population)
         count = data.options.sampled + 2
@@ -290,6 +299,33 @@ def sequential_design(
         further += int(emulation.bias <= data.options.bias)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def population_elsewhere(
+    data: SpecimenData, emulation: Emulation, likely: Likely, seed: int
+) -> tuple[Emulation, Likely] | None:
+    """Return a surface through all runs, and its likely inputs where these are others.
+
+    None if the surface leaves out no run, or both are near each other. Runs far from the likely
+    population are left out, so that the surface does not know whether another one is likelier.
+    """
+    z, y = emulation.z, emulation.y
+    is_used = _near_population(data, z, likely.population)
+    is_used[list(emulation.audited)] = True
+    if is_used.all():
+        return None
+    surface, *_ = fit_surface(z, y, data.readings, data.name, emulation.surface)
+    audited = tuple(range(len(z)))
+    through_all = replace(emulation, surface=surface, bias=np.inf, audited=audited)
+    other = Likely.of(data, through_all, normal_of(data.inner[:, data.free]), seed)
+    # Populations far from each other need more points than likely inputs do.
+    count = min(512, data.options.most_in_all // len(data.readings))
+    points = draw_points(data, other.proposals, count, seed)
+    points = at_scale(data, points, emulation.error, likely_scale(data, points, emulation.error))
+    draws = draws_of(data, other.proposals, points)
+    population = normal_of(draws.specimens()[:, data.free])
+    other = Likely(other.proposals, points, population, likely_weights(data, points, population))
+    return None if are_near(likely.population, other.population) else (through_all, other)
 
 
 def has_fewer_readings(data: SpecimenData) -> bool:

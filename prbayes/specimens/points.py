@@ -186,6 +186,16 @@ def normal_of(sample: Floats, inflation: float = 1.0) -> Normal:
     return Normal(mean, sd[:, None] * np.linalg.cholesky(correlation))
 
 
+def are_near(first: Normal, second: Normal) -> bool:
+    """Return whether two populations overlap for the most part."""
+    shift = np.linalg.solve(first.root, second.mean - first.mean)
+    change = np.linalg.solve(first.root, second.root)
+    sizes = np.linalg.svd(change, compute_uv=False)
+    if np.abs(shift).max() > 1.0:
+        return False
+    return bool(sizes.min() > 0.3 and sizes.max() < 3.0)
+
+
 @dataclass(frozen=True, eq=False)
 class SpecimenData:
     """Measured specimens, and what is known of them before any run."""
@@ -472,7 +482,7 @@ class Plausible:
         scale = likely_scale(data, points, emulation.error)
         if not proposals.is_open(scale):
             points = at_scale(data, points, emulation.error, scale)
-            draws = data.posterior(points.z, points.log_a, None)
+            draws = draws_of(data, proposals, points)
             return cls(draws, proposals, points, scale, count)
         affordable = min(options.cheap_in_all // len(data.readings), options.most_points)
         count = max(2 * count, min(64 * options.points, affordable), 32 * options.points)
@@ -493,13 +503,7 @@ class Plausible:
     def is_near(self, earlier: Plausible) -> bool:
         """Return whether specimens of the draws are those of earlier draws, nearly."""
         first = normal_of(earlier.draws.specimens())
-        second = normal_of(self.draws.specimens())
-        shift = np.linalg.solve(first.root, second.mean - first.mean)
-        change = np.linalg.solve(first.root, second.root)
-        sizes = np.linalg.svd(change, compute_uv=False)
-        if np.abs(shift).max() > 1.0:
-            return False
-        return bool(sizes.min() > 0.3 and sizes.max() < 3.0)
+        return are_near(first, normal_of(self.draws.specimens()))
 
     def of_emulation(
         self, data: SpecimenData, emulation: Emulation, earlier: Modes | None = None
@@ -676,6 +680,13 @@ def typical_specimens(modes: Modes, n: int) -> Bools:
     return typical
 
 
+def draws_of(data: SpecimenData, proposals: Proposals, points: SpecimenPoints) -> Draws:
+    """Return posterior draws given points; of several modes where specimens have several."""
+    has_several = np.bincount(proposals.modes.specimen) > 1
+    settings = {"several": True} if has_several.mean() > 0.1 else {}
+    return data.posterior(points.z, points.log_a, None, **settings)
+
+
 def reliable_draws(
     data: SpecimenData,
     proposals: Proposals,
@@ -694,7 +705,7 @@ def reliable_draws(
         halves = [draw_points(data, proposals, count // 2, seed + h) for h in (0, 1000)]
         points = at_scale(data, joined(*halves), proposals.residuals.response.error, scale)
         if not narrows:
-            draws = data.posterior(points.z, points.log_a, None)
+            draws = draws_of(data, proposals, points)
             difference, *_ = _half_difference(data, proposals, halves, draws, (scale,))
             limit = per_hyperparameter(draws)
             if difference <= limit:
