@@ -554,10 +554,7 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     z = proposals.residuals.coordinates(modes.specimen, modes.a)[:, data.free]
     low, high = np.quantile(data.prior[:, data.free], [0.1, 0.9], axis=0)
     is_central = ((z >= low) & (z <= high)).all(axis=1)
-    # Proposals between the modes, which cover the inside of a fold, are no further values.
-    pull = np.einsum("kmd,km->kd", modes.slopes, modes.errors)[:, 0]
-    is_mode = np.abs(pull) < 0.1 * np.sqrt(1 + (modes.slopes[:, :, 0] ** 2).sum(axis=1))
-    counts = np.bincount(modes.specimen, is_central & is_mode)
+    counts = np.bincount(modes.specimen, is_central & modes.is_stationary())
     share = (counts > 2).mean()
     if share < 0.1:
         return []

@@ -240,18 +240,17 @@ def sequential_design(
     else:
         emulation = replace(previous, bias=np.inf, offsets=None)
     population = normal_of(data.inner[:, data.free])
-    most = largest_design(data)
+    most, bias = largest_design(data), data.options.bias
     rng = np.random.default_rng([data.seed, 1])
     enough_batches = 1 if has_fewer_readings(data) else 2
     # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # number of batches since the bias was small
-    returns = 0  # number of populations that a surface through all runs has elsewhere
     plausible = None
     while True:
         likely = Likely.of(data, emulation, population, batches)
         is_complete = batches >= enough or len(emulation.z) >= most
-        is_unbiased = emulation.bias <= data.options.bias and is_complete
+        is_unbiased = emulation.bias <= bias and is_complete
         if is_unbiased and len(emulation.z) < most and not likely.has_runs(data, emulation.z):
             # The bias is that at another population. Far from runs an emulator is often wrong.
             emulation = with_likely_runs(run, data, emulation, likely, population)
@@ -271,7 +270,7 @@ def sequential_design(
             # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
-            is_good = emulation.bias <= 1.5 * data.options.bias
+            is_good = emulation.bias <= 1.5 * bias
             if not is_good and not likely.has_runs(data, before.z):
                 continue
             if is_good and emulation.surface is not before.surface:
@@ -284,19 +283,16 @@ def sequential_design(
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
                 is_good = may_be_rough or len(emulation.z) >= most
-            elsewhere = None
-            if is_good and returns < 2 and len(emulation.z) < most:
+            if is_good:
                 elsewhere = population_elsewhere(data, emulation, likely, batches)
-            if is_good and elsewhere is None:
-                return emulation, plausible.of_emulation(data, emulation)
-            if elsewhere is not None:
+                if elsewhere is None:
+                    return emulation, plausible.of_emulation(data, emulation)
                 emulation, likely = elsewhere
-                population, returns = likely.population, returns + 1
+                population = likely.population
         if len(emulation.z) >= most:
             return at_most_runs(run, data, emulation, likely, population)
-        count = data.options.sampled + 2
-        count = count if previous is not None else max(count, batch_size(data, emulation))
-        further += int(emulation.bias <= data.options.bias)
+        further += emulation.bias <= bias
+        count = batch_size(data, emulation, previous)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
 
@@ -312,20 +308,23 @@ def population_elsewhere(
     z, y = emulation.z, emulation.y
     is_used = _near_population(data, z, likely.population)
     is_used[list(emulation.audited)] = True
-    if is_used.all():
+    if is_used.all() or len(z) >= largest_design(data):
         return None
     surface, *_ = fit_surface(z, y, data.readings, data.name, emulation.surface)
     audited = tuple(range(len(z)))
     through_all = replace(emulation, surface=surface, bias=np.inf, audited=audited)
-    other = Likely.of(data, through_all, normal_of(data.inner[:, data.free]), seed)
+    first = normal_of(data.inner[:, data.free])
+    proposals = Likely.of(data, through_all, first, seed).proposals
     # Populations far from each other need more points than likely inputs do.
     count = min(512, data.options.most_in_all // len(data.readings))
-    points = draw_points(data, other.proposals, count, seed)
+    points = draw_points(data, proposals, count, seed)
     points = at_scale(data, points, emulation.error, likely_scale(data, points, emulation.error))
-    draws = draws_of(data, other.proposals, points)
+    draws = draws_of(data, proposals, points)
     population = normal_of(draws.specimens()[:, data.free])
-    other = Likely(other.proposals, points, population, likely_weights(data, points, population))
-    return None if are_near(likely.population, other.population) else (through_all, other)
+    weights = likely_weights(data, points, population)
+    if are_near(likely.population, population):
+        return None
+    return through_all, Likely(proposals, points, population, weights)
 
 
 def has_fewer_readings(data: SpecimenData) -> bool:
@@ -358,14 +357,17 @@ def at_most_runs(
     return emulation, Plausible.of(data, emulation, wider(population))
 
 
-def batch_size(data: SpecimenData, emulation: Emulation) -> int:
-    """Return the number of runs by which an emulation of no other data grows.
+def batch_size(data: SpecimenData, emulation: Emulation, previous: Emulation | None) -> int:
+    """Return the number of runs by which an emulation grows; few if one of other data exists.
 
     A batch has half as many runs as exist, a quarter if the bias is nearly small enough, and at
     most three times the first runs.
     """
+    least = data.options.sampled + 2
+    if previous is not None:
+        return least
     share = 2 if emulation.bias > 3 * data.options.bias else 4
-    return min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1]))
+    return max(least, min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1])))
 
 
 def wider(population: Normal) -> Normal:

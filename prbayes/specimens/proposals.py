@@ -194,6 +194,12 @@ class Modes:
         """The arrays of all fields."""
         return [getattr(self, f.name) for f in fields(self)]
 
+    def is_stationary(self, precision: float = 0.1) -> Bools:
+        """Return which rows, (R,), are modes; others cover the inside of a fold between them."""
+        pull = np.einsum("kmd,km->kd", self.slopes, self.errors) - precision * self.a
+        steepness = 1 + (self.slopes**2).sum(axis=(1, 2))
+        return np.asarray((pull**2).sum(axis=1) < 0.01 * steepness)
+
     @cached_property
     def table(self) -> Indices:
         """The modes of each specimen, (N, most), filled up with -1."""

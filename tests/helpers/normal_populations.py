@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -31,5 +32,7 @@ class NormalDraws:
         z = self.means + self.sds * rng.standard_normal((64, *self.means.shape))
         return z.reshape(-1, self.means.shape[1])
 
-    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+    def posterior(
+        self, z: Floats, log_a: Floats, smoothing: Floats | None, **_: Any
+    ) -> NormalDraws:
         return self

@@ -43,7 +43,7 @@ def draws_around(mean: Floats, sd: Floats, n: int) -> NormalDraws:
     return NormalDraws(mean + sd * scatter[:, 0], sd * np.exp(scatter[:, 1] / np.sqrt(2)))
 
 
-def posterior(z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+def posterior(z: Floats, log_a: Floats, smoothing: Floats | None, **_: Any) -> NormalDraws:
     """Return populations around the one that fits weighted points best."""
     rows = np.isfinite(log_a).any(axis=1)
     mean, root = fit_normal(z[rows], log_a[rows])
@@ -136,7 +136,7 @@ def test_smooth_responses_need_few_runs(function: Callable[[Floats], Floats], x:
 def test_fewer_readings_than_inputs_need_few_runs() -> None:
     x = population([0.1, 0.1], [0.1, 0.1], n=10)
     draws = draws_around(x.mean(axis=0), x.std(axis=0), len(x))
-    run, emulation, points = emulated(underdetermined, x, posterior=lambda *_: draws)
+    run, emulation, points = emulated(underdetermined, x, posterior=lambda *_, **__: draws)
     assert len(run.z) <= 60
     assert emulation.bias <= 0.15
     # Points are along the inputs that have the reading.

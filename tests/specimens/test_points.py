@@ -190,7 +190,9 @@ class PriorSample(NormalDraws):
 
     is_smoothed: list[bool] = field(default_factory=list)
 
-    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+    def posterior(
+        self, z: Floats, log_a: Floats, smoothing: Floats | None, **_: Any
+    ) -> NormalDraws:
         self.is_smoothed.append(smoothing is not None)
         total = np.empty(len(self.means))
         for s, (mean, sd) in enumerate(zip(self.means, self.sds, strict=True)):
