@@ -334,7 +334,7 @@ def study():
         k=[10, 50],
         model=model,
         quantity=quantity,
-        target={"quantity": spread / 2},
+        max_sd={"quantity": spread / 2},
     )
     found["plan"] = {"now": float(plan.now.sel(name="quantity")), "tests": {}}
     for name in plan.candidate.values:
