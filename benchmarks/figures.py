@@ -1,10 +1,13 @@
-"""Figures of the whole package on the present commit, for `docs/figures.md`.
+"""Figures of the whole package on the present commit, for the README and `docs/figures.md`.
 
-Structure of the code, time of the tests, coverage of intervals, accuracy beside the stored results
+Output of the README, structure of the code, time of the tests, coverage of intervals, accuracy beside the stored results
 of other programs, and speed. Each is computed anew by the program that the pages quote, with fewer
 data sets, into a folder of its own. It takes about an hour of one core:
 
     OMP_NUM_THREADS=1 uv run python -m benchmarks.figures [--steps structure tests]
+
+The step ``studies``, which is not among the default ones, runs all studies with all their data
+sets, which takes days.
 """
 
 from __future__ import annotations
@@ -29,6 +32,12 @@ FOLDER = record.RESULTS / "figures"
 # Problems with a reference whose data are drawn, and those of one data set.
 _DRAWN = ("linear", "folded", "frame")
 _SINGLE = ("crack growth", "thermal")
+# Modules that write one file of results with `--out`.
+STUDIES = [
+    path.parent.name if path.stem == "__main__" else path.stem
+    for path in [*Path(__file__).parent.glob("*.py"), *Path(__file__).parent.glob("*/__main__.py")]
+    if re.search(r"from benchmarks\.study import|\"--out\"", path.read_text(encoding="utf-8"))
+]
 _METRICS = ("prbayes PR", "prbayes KLD", "prbayes area")
 
 
@@ -39,6 +48,24 @@ def run(*arguments: str) -> str:
     if done.returncode:
         raise RuntimeError(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}")
     return done.stdout
+
+
+def readme() -> dict[str, Any]:
+    """Return what the scripts and the main example of the README print."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    first, second = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    preamble, _ = first.split("with pm.Model()")
+    with tempfile.TemporaryDirectory() as folder:
+        example = run("examples/crack_growth.py", "--out", folder)
+    runs = re.findall(r"^([\w -]+): (\d+) responses computed$", example, re.MULTILINE)
+    numbers = re.findall(r" (?:mu|sigma) +(\d\.\d{3})  (\d\.\d{3}) ", example)
+    cells = [" ± ".join(pair) for pair in numbers]
+    return {
+        "printed": [run("-c", first), run("-c", preamble + second)],
+        "runs": {name: int(count) for name, count in runs},
+        # optima, then posteriors, of the mean and the standard deviation
+        "table": {name: cells[4 * i : 4 * i + 4] for i, (name, _) in enumerate(runs)},
+    }
 
 
 def structure() -> dict[str, float]:
@@ -105,24 +132,43 @@ def scoreboard() -> dict[str, Any]:
         return scores(Path(folder))
 
 
+def studies() -> dict[str, Any]:
+    """Run all studies anew, with all their data sets, and return the seconds of each."""
+    seconds = {}
+    for path in sorted(record.RESULTS.glob("*.json")):
+        if path.stem not in STUDIES:
+            continue
+        start = time.monotonic()
+        with tempfile.TemporaryDirectory(dir=record.RESULTS) as folder:
+            new = Path(folder, path.name)
+            run("-m", f"benchmarks.{path.stem}", "--out", str(new))
+            new.replace(path)
+        seconds[path.stem] = round(time.monotonic() - start)
+    run("-m", "benchmarks.thermal_challenge")  # it also draws the picture of its page
+    return seconds
+
+
 def speed() -> dict[str, Any]:
     """Return CPU seconds, memory and import."""
     return {name: rows[0] for name, rows in study("speed")["rows"].items()}
 
 
 STEPS: dict[str, Callable[[], dict[str, Any]]] = {
+    "readme": readme,
     "structure": structure,
     "tests": tests,
     "coverage": coverage,
     "scoreboard": scoreboard,
     "speed": speed,
+    "studies": studies,
 }
 
 
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--steps", nargs="+", default=list(STEPS), choices=list(STEPS))
+    short = [name for name in STEPS if name != "studies"]
+    parser.add_argument("--steps", nargs="+", default=short, choices=list(STEPS))
     for name in parser.parse_args().steps:
         start = time.monotonic()
         record.save(FOLDER / f"{name}.json", STEPS[name]())

@@ -1,4 +1,6 @@
-"""Tables of the pages, written from benchmarks/results between `<!-- table: name -->` and `<!-- end -->`.
+"""Tables of the README and the pages, written from benchmarks/results.
+
+Their rows are between `<!-- table: name -->` and `<!-- end -->`.
 
 Run: uv run python -m benchmarks.pages
 """
@@ -25,6 +27,7 @@ from benchmarks.scoreboard.problems import PROBLEMS
 DOCS = Path(__file__).parents[1] / "docs"
 SCOREBOARD = DOCS / "appendix/scoreboard.csv"
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md"), DOCS.parent / "paper/paper.md"])
+README, CHANGELOG = DOCS.parent / "README.md", DOCS.parent / "CHANGELOG.md"
 Row = Iterable[str]
 
 
@@ -649,6 +652,50 @@ def all_scores() -> Iterator[Row]:
                 yield [problem, size, *columns, str(sets)]
 
 
+def readme_table() -> Iterator[Row]:
+    """Yield estimates of crack growth by each likelihood and metric."""
+    for name, cells in figures("readme")["table"].items():
+        yield [name, *cells]
+
+
+def fleets() -> Iterator[Row]:
+    """Yield runs, CPU seconds and coverage of fleets."""
+    labels = {
+        "one input, posteriors alone": "one input, posteriors alone",
+        "one input": "one input, with validity tests of ten specimens",
+        "two inputs, two outputs": "two inputs, two outputs, with validity tests",
+    }
+    for cell, row in single("fleet").items():
+        columns = [str(row["runs"]), f"{row['cpu_seconds']:.0f}"]
+        for part in ("mean_", "spread_"):
+            shares = (short(value, 3) for key, value in row.items() if key.startswith(part))
+            columns.append(", ".join(shares))
+        rejected = short(row["rejected"], 3) if "rejected" in row else ""
+        yield [labels[cell], *columns, rejected]
+
+
+def sheets_of_pairs() -> Iterator[Row]:
+    """Yield widths of intervals from data sheets of two outputs over those from specimens."""
+    for name, correlation in (("correlated", ".89"), ("weakly correlated", ".32")):
+        cell = summary("joint_data_sheets")[f"{name}, 20, mean sd"]
+        for way, label in (("together", "mapping"), ("separate", "two simulators")):
+            widths = (
+                ", ".join(short(cell[f"{way}, {value} {k}, sd ratio"]) for k in (1, 2))
+                for value in ("mu", "sigma")
+            )
+            yield [correlation, label, *widths]
+
+
+def basis_values() -> Iterator[Row]:
+    """Yield shares of data sets in which basis values and intervals hold."""
+    labels = {"sample": "`prb.sample`, wide priors", "optimum": "`prb.minimize`"}
+    yield ["right", "", *[".95"] * 2, *[".89"] * 3]
+    for cell, row in summary("population").items():
+        name, n = cell.split(", N = ")
+        shares = (row[key] for key in ("B-basis", "A-basis", "mean", "sd", "5% quantile"))
+        yield [n, labels.get(name, name), *(short(value, 3) for value in shares)]
+
+
 _SCORED = ("likelihood", "KLD", "PR", "area")
 
 
@@ -706,6 +753,10 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scoreboard, one output": lambda: _matrix(several=False),
     "scoreboard, several outputs": lambda: _matrix(several=True),
     "published data": published_data,
+    "README, crack growth": readme_table,
+    "fleets": fleets,
+    "data sheets of pairs": sheets_of_pairs,
+    "basis values": basis_values,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
@@ -722,11 +773,22 @@ def written(page: str) -> str:
     return _MARKED.sub(table, page)
 
 
+def rewritten(path: Path) -> str:
+    """Return the README, a page or the changelog with all figures from the results."""
+    from benchmarks.sentences import with_figures
+
+    text = with_figures(path, written(path.read_text(encoding="utf-8")))
+    if path == README:
+        printed = iter(figures("readme")["printed"])
+        block = re.compile(r"(?<=^```text\n).*?(?=^```)", re.MULTILINE | re.DOTALL)
+        text = block.sub(lambda _: next(printed), text)
+    return text
+
+
 def main() -> None:
     """Write all pages."""
-    for path in PAGES:
-        page = path.read_text(encoding="utf-8")
-        path.write_text(written(page), encoding="utf-8")
+    for path in (README, CHANGELOG, *PAGES):
+        path.write_text(rewritten(path), encoding="utf-8")
     SCOREBOARD.write_text(scoreboard_file(), encoding="utf-8")
 
 

@@ -334,7 +334,7 @@ def study():
         k=[10, 50],
         model=model,
         quantity=quantity,
-        target={"quantity": spread / 2},
+        max_sd={"quantity": spread / 2},
     )
     found["plan"] = {"now": float(plan.now.sel(name="quantity")), "tests": {}}
     for name in plan.candidate.values:
@@ -421,7 +421,7 @@ def picture(kept, path):
     left.plot(grid, center.mean(axis=0), color=blue)
     temperature = material["temperature_C"].astype(float)
     left.plot(temperature, material["k_W_per_mC"].astype(float), "o", color=red, ms=4)
-    left.set(xlabel="temperature, C", ylabel="conductivity, W/(m C)", title="30 coupons")
+    left.set(xlabel="temperature, °C", ylabel="conductivity, W/(m °C)", title="30 coupons")
 
     flat = predicted.values.reshape(-1, seconds.size)
     middle.fill_between(
@@ -429,7 +429,7 @@ def picture(kept, path):
     )
     middle.plot(seconds, flat.mean(axis=0), color=blue)
     middle.plot(seconds, slabs.T, "o", color=red, ms=3)
-    middle.set(xlabel="time, s", ylabel="heated face, C", title="ensemble, 1000 W/m2, 2.54 cm")
+    middle.set(xlabel="time, s", ylabel="heated face, °C", title="ensemble, 1000 W/m², 2.54 cm")
 
     populations = np.sort(values.values.reshape(-1, values.shape[-1]), axis=1)
     level = (np.arange(populations.shape[1]) + 0.5) / populations.shape[1]
@@ -439,9 +439,9 @@ def picture(kept, path):
     right.axvline(LIMIT, color="k", lw=1)
     right.axhline(ALLOWED, color="k", lw=1, ls=":")
     right.set(
-        xlabel="T, C",
+        xlabel="T, °C",
         ylabel="share of devices above T",
-        title="device, 3500 W/m2, 1.90 cm",
+        title="device, 3500 W/m², 1.90 cm",
         xlim=(650, 1100),
         ylim=(0.002, 1),
         yscale="log",

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typing_extensions import deprecated  # in Python 3.13 `warnings.deprecated`
 
 import prbayes
 
@@ -148,6 +149,58 @@ def test_what_is_experimental_is_in_the_documentation() -> None:
     names = [f"response.{name}" if name in prbayes.response.__all__ else name for name in names]
     assert len(names) == 6
     assert all(EXPERIMENTAL.match(name) for name in names)
+
+
+def calls(names: dict[str, Any], path: str = "") -> dict[str, str]:
+    """Return the signatures of functions, classes and methods by their dotted names."""
+    result: dict[str, str] = {}
+    for name, value in names.items():
+        where = f"{path}{name}"
+        result |= calls(value, f"{where}.") if isinstance(value, dict) else {where: value}
+    return {name: value for name, value in result.items() if value.startswith("(")}
+
+
+@pytest.mark.parametrize(
+    ("parameter", "owners"),
+    [
+        ("alpha", r"area_test|calibrate_each|validation\.|readings\.NegativeBinomial\.\(\)"),
+        (
+            "n",
+            r"(Fresh|Resimulated|Reweighted)\.\(\)|Surrogate\.fit|propose_runs"  # responses
+            r"|Summary\.\(\)|LogLikelihood\.of_frequencies|validation\.ExactModel"  # a sample
+            r"|readings\.Binomial\.\(\)",
+        ),
+        ("target", r"\w+\.(for_inputs|bind|check_simulator)$|propagation\."),
+    ],
+)
+def test_symbols_have_the_meanings_that_are_documented(parameter: str, owners: str) -> None:
+    taking = [
+        name
+        for name, signature in calls(public(prbayes)).items()
+        if re.search(rf"[( ]{parameter}[=,)]", signature)
+    ]
+    assert len(taking) > 3
+    assert not [name for name in taking if not re.match(owners, name)]
+
+
+def test_a_deprecated_name_warns_with_its_replacement_and_keeps_its_promise() -> None:
+    @deprecated("prb.old is removed in 2.0: use prb.new", category=FutureWarning)
+    def old(x: float, *, scale: float = 1.0) -> float:
+        return scale * x
+
+    class Old:
+        # Decorating the class itself would hide its signature.
+        @deprecated("prb.Old is removed in 2.0: use prb.New", category=FutureWarning)
+        def __init__(self, x: float) -> None:
+            self.x = x
+
+    with pytest.warns(FutureWarning, match="use prb.new") as caught:
+        assert old(2.0, scale=3.0) == 6.0
+    assert caught[0].filename == __file__  # the line of the user
+    with pytest.warns(FutureWarning, match="use prb.New"):
+        assert Old(2.0).x == 2.0
+    assert signature(old) == "(x, *, scale=1.0)"
+    assert signature(Old) == "(x)"
 
 
 def test_public_names_and_signatures_are_those_that_are_promised() -> None:

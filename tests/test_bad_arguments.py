@@ -459,7 +459,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "bootstrap": Row({"draws": 10}, draws=(1,)),
     "simulation_based_calibration": Row(
-        n=(1,), draws=(5,), adjustment=(3, "affine"), own="adjustment"
+        n_data_sets=(1,), draws=(5,), adjustment=(3, "affine"), own="adjustment"
     ),
     "compare": Row(
         results=({}, {"a": "b"}, {"a": None}),
@@ -485,7 +485,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         candidates=({}, {"a": 3}, {3: prb.decision.Condition(line)}),
         k=([], [0], "ab"),
         quantity=(prb.decision.Mean,),
-        target=({}, {"tau": 1.0}, {"mu": 0.0}),
+        max_sd=({}, {"tau": 1.0}, {"mu": 0.0}),
     ),
     "population": Row(
         inputs=("nothing", [], ["x", "nothing"]),

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,19 @@ def test_the_licence_of_a_requirement_is_that_of_the_installed_package(name: str
     licences = re.findall(r"[A-Z][\w.]+(?:-[\w.]+)*", LICENCES[name])
     names = [families.get(licence, licence.partition("-")[0]) for licence in licences]
     assert any(re.search(rf"\b{family}\b", text) for family in names)
+
+
+def test_data_of_the_repository_alone_are_not_in_the_source_distribution() -> None:
+    excluded = PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["exclude"]
+    for row, licence in LICENCES.items():
+        for name in re.findall(r"`([^`]+)`", row):
+            path = ROOT / name
+            files = path.glob("*.csv") if path.is_dir() else [path] * (path.suffix == ".csv")
+            for file in files:
+                place = f"/{file.relative_to(ROOT).as_posix()}"
+                is_left_out = any(fnmatch(place, pattern) for pattern in excluded)
+                assert is_left_out == ("only in the repository" in licence), place
+    assert any("LGPL" in licence for licence in LICENCES.values())
 
 
 def test_all_data_in_the_repository_have_a_licence() -> None:

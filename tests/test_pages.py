@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import prbayes
-from benchmarks import pages
+from benchmarks import pages, record
+from benchmarks.figures import STUDIES
+from benchmarks.sentences import with_figures
 
 PACKAGE = Path(prbayes.__file__).parent
 ROOT = Path(__file__).parents[1]
@@ -27,11 +29,30 @@ UNSEEN = re.compile(r"\A:tags: \[.*remove-(?:cell|input)")
 README_AND_PAGES = [ROOT / "README.md", *pages.PAGES]
 
 
-def test_tables_are_those_of_the_benchmarks() -> None:
-    texts = {path.stem: path.read_text(encoding="utf-8") for path in pages.PAGES}
-    outdated = [name for name, text in texts.items() if pages.written(text) != text]
+def test_figures_are_those_of_the_benchmarks() -> None:
+    files = [pages.CHANGELOG, *README_AND_PAGES]
+    outdated = [
+        path.stem for path in files if pages.rewritten(path) != path.read_text(encoding="utf-8")
+    ]
     assert not outdated, "run python -m benchmarks.pages"
     assert pages.SCOREBOARD.read_text(encoding="utf-8") == pages.scoreboard_file()
+
+
+def test_a_wrong_figure_in_a_sentence_is_found() -> None:
+    path = ROOT / "docs" / "peers.md"
+    page = path.read_text(encoding="utf-8")
+    wrong = re.sub(r"prbayes takes \d+", "prbayes takes 1", page)
+    assert wrong != page == with_figures(path, wrong)
+    with pytest.raises(ValueError, match="got 0 places"):
+        with_figures(path, page.replace("prbayes takes", "It takes"))
+
+
+def test_all_studies_with_results_are_run_by_the_command() -> None:
+    results = {path.stem for path in record.RESULTS.glob("*.json")}
+    # Of the scoreboard other programs have environments of their own.
+    assert results - {*STUDIES} == {
+        "reach_before", "reach_references", "scoreboard", "thermal_challenge"
+    }  # fmt: skip
 
 
 def test_files_that_pages_name_exist() -> None:
@@ -87,7 +108,7 @@ def test_fractions_in_formulas_have_braces() -> None:
 
 
 def test_every_table_is_on_a_page() -> None:
-    told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES)
+    told = "".join(path.read_text(encoding="utf-8") for path in README_AND_PAGES)
     assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)
 
 

@@ -251,6 +251,7 @@ def picture_validity(path, fresh, predicted, test, exact):
     )
     density(left, grid, predicted, COLORS["PR"], "predicted, 89% band")
     left.set(xlabel="crest factor at 0.95 g", ylabel="density", title="(a) responses")
+    left.set_ylim(0, 1.3 * left.get_ylim()[1])  # room for the legend above the bars
     left.legend(frameon=False, fontsize=9)
     u = np.sort(test.u_values)
     x = np.repeat(np.r_[0, u, 1], 2)[1:-1]

@@ -93,7 +93,7 @@ def plan(
     k: int | Sequence[int] = (5, 10, 20, 50),
     model: pm.Model | None = None,
     quantity: Quantity | None = None,
-    target: Mapping[str, float] | None = None,
+    max_sd: Mapping[str, float] | None = None,
     executor: Executor | None = None,
     store: StrPath | None = None,
     version: str | None = None,
@@ -121,9 +121,9 @@ def plan(
         That of the optimum, or the one on the context, by default.
     quantity : Quantity, optional
         A decision quantity whose standard deviation is predicted as well.
-    target : mapping of str to float, optional
-        Standard deviations to reach, by names of the table, in the unit of each; that of the
-        quantity by ``"quantity"``.
+    max_sd : mapping of str to float, optional
+        Largest acceptable standard deviations, by names of the table, in the unit of each; that of
+        the quantity by ``"quantity"``.
     executor : concurrent.futures.Executor, optional
         Where the response is computed.
     store : path-like, optional
@@ -137,8 +137,8 @@ def plan(
         Dimensions ``candidate``, ``k`` and ``name``: hyperparameters and deterministics, and
         ``"quantity"``. Variables ``sd``, the expected standard deviation in the user's units, inf
         where the quantity is infinite in some populations; ``now``, the present one; and with
-        ``target``, ``specimens``: the smallest number that reaches it, inf if a million do not, NaN
-        without a target. Attributes: ``responses`` (number computed), ``findings`` (as JSON),
+        ``max_sd``, ``specimens``: the smallest number that suffices, inf if a million do not, NaN
+        of other names. Attributes: ``responses`` (number computed), ``findings`` (as JSON),
         ``identity``, and with a quantity ``value_error``, the standard error of its value from
         points and emulator, which more specimens do not reduce. It prints as sentences; a notebook
         shows a table.
@@ -201,7 +201,7 @@ def plan(
     draws = [Draws.of(thetas, unit) for thetas in modes]
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
     now = forecast.sd([np.zeros((unit.size, unit.size))] * len(modes))
-    _refuse_target(target, list(now))
+    _refuse_max_sd(max_sd, list(now))
     is_single = len(modes) == 1
     centers = [populations.center if is_single else np.median(thetas, axis=0) for thetas in modes]
     samples = {
@@ -218,13 +218,13 @@ def plan(
         rows = [forecast.sd([number * a for a in information]) for number in numbers]
         sd.append([[row[element] for element in now] for row in rows])
         specimens.append(
-            [forecast.needed(information, element, (target or {}).get(element)) for element in now]
+            [forecast.needed(information, element, (max_sd or {}).get(element)) for element in now]
         )
     variables: dict[str, Any] = {
         "sd": (["candidate", "k", "name"], sd),
         "now": ("name", list(now.values())),
     }
-    if target is not None:
+    if max_sd is not None:
         variables["specimens"] = (["candidate", "name"], specimens)
     count = sum(sample.responses.count for sample in samples.values())
     count += 0 if quantity_sample is None else quantity_sample.responses.count
@@ -284,7 +284,7 @@ class PlanTable(Table):
                     cells.append("" if np.isnan(needed) else f"{needed:.0f}")
                 rows.append([str(name), str(candidate), *cells])
         header = ["", "condition", "now", *(f"{k} more" for k in self["k"].values)]
-        header += ["needed for the target"] if "specimens" in self else []
+        header += ["needed for max_sd"] if "specimens" in self else []
         sentences = sentences_of(self.attrs)
         if "quantity" in self.attrs:
             sentences.append(f"quantity: {self.attrs['quantity']}.")
@@ -359,16 +359,16 @@ class _Forecast:
         assert self.sample is not None
         return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
-    def needed(self, information: Sequence[Floats], name: str, target: float | None) -> float:
-        """Return the smallest number of specimens for a target: inf if none, NaN without one."""
-        if target is None:
+    def needed(self, information: Sequence[Floats], name: str, max_sd: float | None) -> float:
+        """Return the smallest sufficient number of specimens: inf if none, NaN without a limit."""
+        if max_sd is None:
             return np.nan
 
         def exceeds(n: int) -> bool:
             increase = [n * a for a in information]
             if name == "quantity":
-                return self._quantity_sd(self._thetas(increase)) > target
-            return replace(self, quantity=None).sd(increase)[name] > target
+                return self._quantity_sd(self._thetas(increase)) > max_sd
+            return replace(self, quantity=None).sd(increase)[name] > max_sd
 
         if not exceeds(0):
             return 0.0
@@ -622,16 +622,16 @@ def _refuse_candidates(candidates: object) -> None:
             )
 
 
-def _refuse_target(target: object, names: list[str]) -> None:
-    """Raise if a target is no standard deviation by name."""
-    if target is None:
+def _refuse_max_sd(max_sd: object, names: list[str]) -> None:
+    """Raise if a limit is no standard deviation by name."""
+    if max_sd is None:
         return
-    if not isinstance(target, Mapping) or not target:
+    if not isinstance(max_sd, Mapping) or not max_sd:
         raise TypeError(
-            f"prb.plan: target: got {called(target)}, expected a mapping of names to standard "
+            f"prb.plan: max_sd: got {called(max_sd)}, expected a mapping of names to standard "
             f"deviations, of {names}"
         )
-    for name, value in target.items():
+    for name, value in max_sd.items():
         if name not in names:
-            raise KeyError(f"prb.plan: target: got {name!r}, expected one of {names}")
-        positive_number(value, f"target: {name}")
+            raise KeyError(f"prb.plan: max_sd: got {name!r}, expected one of {names}")
+        positive_number(value, f"max_sd: {name}")

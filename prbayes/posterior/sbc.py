@@ -46,7 +46,7 @@ _CHUNK = 10
 
 @locked
 def simulation_based_calibration(
-    n: int = 200,
+    n_data_sets: int = 200,
     *,
     model: pm.Model | None = None,
     draws: int = 500,
@@ -64,7 +64,7 @@ def simulation_based_calibration(
 
     Parameters
     ----------
-    n : int
+    n_data_sets : int
         Number of data sets.
     model : pymc.Model, optional
         The one on the context by default. Its observed values matter only by their number, weights
@@ -117,7 +117,7 @@ def simulation_based_calibration(
     (1, 2)
     """
     model = model_on_context(model, "prb.simulation_based_calibration")
-    positive_integer(n, "n", minimum=2)
+    positive_integer(n_data_sets, "n_data_sets", minimum=2)
     positive_integer(draws, "draws", minimum=10)
     require_adjustment(adjustment)
     executes(executor)
@@ -139,8 +139,8 @@ def simulation_based_calibration(
             "calibrate data of your own simulations with prb.sample_smc"
         )
     settings = SamplingSettings(draws=draws, adjustment=adjustment, random_seed=seed)
-    jobs = [range(n)[start : start + _CHUNK] for start in range(0, n, _CHUNK)]
-    with shown(progressbar), progress("data sets", n) as advance:
+    jobs = [range(n_data_sets)[start : start + _CHUNK] for start in range(0, n_data_sets, _CHUNK)]
+    with shown(progressbar), progress("data sets", n_data_sets) as advance:
         if executor is None:
             parts = [_analyse(evaluator, job, settings, lambda: advance(1, "")) for job in jobs]
         else:
@@ -155,11 +155,12 @@ def simulation_based_calibration(
     rows = [result for result in results if isinstance(result, dict)]
     errors = [result for result in results if isinstance(result, str)]
     if errors:
-        text = f"{len(errors)} of {n} data sets could not be analysed; the first: {errors[0]}"
+        failed = f"{len(errors)} of {n_data_sets} data sets could not be analysed"
+        text = f"{failed}; the first: {errors[0]}"
         report(Finding("data-sets-not-analysed", text))
-    if len(errors) > n / 2:
+    if len(errors) > n_data_sets / 2:
         raise RuntimeError(
-            f"simulation_based_calibration: {len(errors)} of {n} data sets failed; "
+            f"simulation_based_calibration: {len(errors)} of {n_data_sets} data sets failed; "
             f"first: {errors[0]}"
         )
     groups = {}

@@ -45,8 +45,8 @@ def test_the_number_that_reaches_a_target() -> None:
     _, x = normal()
     condition = {"same": prb.decision.Condition(same, x)}
     with pytest.raises(KeyError, match=r"got 'quantity', expected one of \['mu', 'sigma'\]"):
-        prb.plan(optimum(), condition, k=5, target={"quantity": 1.0})
-    table = prb.plan(optimum(), condition, k=5, target={"mu": 0.03, "sigma": 9.0})
+        prb.plan(optimum(), condition, k=5, max_sd={"quantity": 1.0})
+    table = prb.plan(optimum(), condition, k=5, max_sd={"mu": 0.03, "sigma": 9.0})
     needed = table.specimens.sel(candidate="same")
     now = float(table.now.sel(name="mu"))
     assert float(needed.sel(name="mu")) == pytest.approx(N * ((now / 0.03) ** 2 - 1), rel=0.1)
@@ -197,7 +197,7 @@ def test_modes_keep_their_masses(share: float) -> None:
     mu = sign * rng.normal(2.0, 0.1, (1, 2000))
     result = posterior_of(mu=mu, sigma=0.3 * np.exp(rng.normal(0, 0.1, (1, 2000))))
     same = {"same": prb.decision.Condition(np.square, x)}
-    table = prb.plan(result, same, k=[30, 3000], model=model, target={"mu": 0.5})
+    table = prb.plan(result, same, k=[30, 3000], model=model, max_sd={"mu": 0.5})
     sd = table.sd.sel(candidate="same")
     np.testing.assert_allclose(sd.sel(name="mu"), 4 * np.sqrt(share * (1 - share)), rtol=0.01)
     # Within a mode the squares have all information about the inputs.
