@@ -332,7 +332,7 @@ class SpecimenLikelihood:
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference by the model, because weak references have no pickle."""
-        derived = ("hyperparameters", "reading density", "updated", "products")
+        derived = ("hyperparameters", "reading density", "updated", "products", "populations")
         cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
         return {**vars(self), "model": model, "cache": cache}

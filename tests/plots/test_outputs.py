@@ -12,6 +12,7 @@ from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
+from prbayes.model.emulated import EmulatedResponse
 from prbayes.plots.outputs import _shown_outputs
 from prbayes.response.outputs import Outputs
 
@@ -135,3 +136,34 @@ def test_a_model_of_single_outputs_is_refused(optimum: prb.Optimum) -> None:
     match = r"got simulators \['y'\] of one .* prb.plots.plot_responses"
     with pytest.raises(ValueError, match=match):
         prb.plots.plot_outputs(optimum)
+
+
+@pytest.mark.long
+def test_pictures_of_one_posterior_emulate_its_populations_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = np.random.default_rng(4).normal(size=(20, 2))
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        b = pm.Normal.dist(pm.Normal("nu", 0, 1), 1.0)
+        prb.Simulator("y", lambda a, b: np.stack([a, a + b], axis=-1), a, b, observed=data)
+    means = np.linspace(-0.2, 0.2, 40)[None]
+    posterior = posterior_of(mu=means, nu=-means)
+    sizes = []
+    emulated = EmulatedResponse.__call__
+
+    def counted(self: EmulatedResponse, inputs: Any) -> Any:
+        sizes.append(len(inputs[0]))
+        return emulated(self, inputs)
+
+    monkeypatch.setattr(EmulatedResponse, "__call__", counted)
+    options: dict[str, Any] = {"model": model, "before": False}
+    first = prb.plots.plot_outputs(posterior, **options)
+    prb.plots.plot_responses(posterior, **options)
+    again = prb.plots.plot_outputs(posterior, **options)
+    assert sizes == [40 * 1024]
+    name = first.axes[0].get_label()
+    lines = [read.xy(figure, "after_50", name) for figure in (first, again)]
+    np.testing.assert_array_equal(*lines)
+    prb.plots.plot_outputs(posterior.isel(draw=slice(20)), **options)
+    assert sizes == [40 * 1024, 20 * 1024]
