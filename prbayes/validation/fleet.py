@@ -352,7 +352,10 @@ class Fleet:
 
     def _tested(self, name: str, drawn: Drawn) -> Calibration:
         """Return the posterior of a product with its validity test."""
-        result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
+        is_wide = name not in self.sheets and len(self.observed[name]) < 8
+        tails = _heavy_tails(drawn.values) if is_wide else ""
+        finding = " ".join(filter(None, [drawn.finding, tails]))
+        result = Calibration(drawn.values, drawn.pareto_k, finding=finding)
         if name not in self.further or drawn.predicted is None:
             return result
         null = PosteriorNull(999)
@@ -534,6 +537,26 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
 
     fleet: Fleet = cloudpickle.loads(pickled)
     return fleet.calibrated(names)
+
+
+def _heavy_tails(values: NamedArrays) -> str:
+    """Return a sentence if a standard deviation of draws, (draws, *shape), is not well known.
+
+    Its relative standard error depends on the kurtosis of the draws.
+    """
+    errors = {"": 0.0}
+    for name, draws in values.items():
+        squares = (draws - draws.mean(axis=0)) ** 2
+        with np.errstate(invalid="ignore"):  # because a constant has none
+            kurtosis = (squares**2).mean(axis=0) / squares.mean(axis=0) ** 2
+        errors[name] = float(np.nanmax(np.sqrt((kurtosis - 1) / (4 * len(draws))), initial=0.0))
+    name = max(errors, key=lambda key: errors[key])
+    if errors[name] <= 2 / np.sqrt(2 * len(draws)):  # twice that of a normal posterior
+        return ""
+    return (
+        f"The posterior of {name} has heavy tails: the standard deviation of its draws has a "
+        f"standard error of {errors[name]:.0%}. Pass more draws, or report quantiles."
+    )
 
 
 def _misfits(

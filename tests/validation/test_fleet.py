@@ -233,3 +233,24 @@ def test_posteriors_of_three_specimens_are_as_wide_as_the_exact_ones() -> None:
 
 def curved(a: Any, b: Any) -> Any:
     return np.stack([1e6 * np.exp(a), a * b + b], axis=-1)
+
+
+@pytest.mark.parametrize("n_inputs", [1, 2])
+def test_heavy_tails_of_few_specimens_are_reported(n_inputs: int) -> None:
+    """The standard deviation of 1000 draws is then known to a tenth or a fifth."""
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        inputs = [
+            pm.Normal.dist(pm.Normal(f"m{k}", 0, 10), pm.HalfNormal(f"s{k}", 3))
+            for k in range(n_inputs)
+        ]
+        prb.Simulator(
+            "y",
+            lambda *x: np.stack(x, axis=-1),
+            *inputs,
+            observed=rng.normal(0, 0.3, (4, n_inputs)),
+        )
+    data = {f"p{n}": rng.normal(0, 0.3, (n, n_inputs)) for n in (3, 4, 12)}
+    *few, many = prb.calibrate_each(data, model=model, **QUIET)["products"]["finding"].values
+    assert all("heavy tails" in text for text in few)
+    assert not many
