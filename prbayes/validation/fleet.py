@@ -45,12 +45,14 @@ from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
 from prbayes.model.random_variable import shared_epsilon
+from prbayes.model.specimen_audit import audited_likelihood
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.posterior.batch import ProductPosteriors
 from prbayes.posterior.sample import draw_posterior, importance_chains, mode_findings
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import modes_of, specimen_target
+from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
@@ -458,6 +460,17 @@ class SpecimenFleet(Fleet):
         result, preparation = self.likelihood.of_rows(rows), prepared(self.likelihood)
         result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
         return result
+
+    def _tested(self, name: str, drawn: Drawn) -> Calibration:
+        """Return the posterior of a product with its validity test; audit its emulator."""
+        if name not in self.sheets:
+            free = [drawn.values[str(rv.name)] for rv in self.evaluator.model.free_RVs]
+            thetas = self.evaluator.hyperparameters.thetas_of(free)
+            try:  # No runs can be added, because products share the emulator.
+                audited_likelihood(self._likelihood([name]), thetas, is_last=True)
+            except DesignError as error:
+                drawn = replace(drawn, finding=f"{drawn.finding} {error}.".strip())
+        return super()._tested(name, drawn)
 
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
