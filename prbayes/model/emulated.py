@@ -471,14 +471,14 @@ class EmulatedSample:
 
     def values_of(self, responses: Responses) -> Floats:
         """Return a response of the specimens, (n,) or (n, m)."""
-        return self._emulator(responses)(self.points_of(responses.inputs))
+        return _emulator(self, responses)(self.points_of(responses.inputs))
 
     def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
         """Return a response at any points, (n,) or (n, m), and with two errors of it.
 
         The errors are that at left-out runs, and that beyond the range of the runs.
         """
-        emulator = self._emulator(responses)
+        emulator = _emulator(self, responses)
         inputs = values_of_inputs(points, self.inputs, responses.inputs, self.replaced)
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
@@ -487,13 +487,6 @@ class EmulatedSample:
     def n_runs(self) -> int:
         """Number of runs of the emulator of any response."""
         return len(self.simulator.emulated.z)
-
-    def _emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return the emulator of a response; the first call for the response fits the emulator."""
-        if responses not in self._emulators:
-            specimens = self.points_of(responses.inputs)
-            self._emulators[responses] = emulator_of(self.simulator, responses, specimens)
-        return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
@@ -526,7 +519,15 @@ def _squared_scores(inputs: Inputs, scores: Sequence[Floats]) -> Floats:
     return np.asarray(total)
 
 
+def _emulator(sample: EmulatedSample, responses: Responses) -> EmulatedResponse:
+    """Return the emulator of a response; the first call for the response fits the emulator."""
+    if responses not in sample._emulators:
+        specimens = sample.points_of(responses.inputs)
+        sample._emulators[responses] = emulator_of(sample.simulator, responses, specimens)
+    return sample._emulators[responses]
+
+
 def emulator_error(sample: EmulatedSample, responses: Responses) -> Floats:
     """Return the cross-validation error of the emulator of a response, () or (m,)."""
-    emulator = sample._emulator(responses)
+    emulator = _emulator(sample, responses)
     return emulator.error.reshape(emulator.event)
