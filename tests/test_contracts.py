@@ -48,6 +48,7 @@ from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.rewriting.utils import rewrite_graph
 from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
+from pytensor.scalar.basic import Composite, add
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.basic import UniformRV
@@ -540,3 +541,10 @@ def test_constants_have_subclasses_that_are_evaluated() -> None:
     assert times.name == "times"
     assert (2 * times).eval(mode=Mode(linker="py", optimizer=None)).tolist() == [2.0, 4.0]
     assert times.data.tolist() == times.eval(mode=Mode(linker="py", optimizer=None)).tolist()
+
+
+def test_composite_operations_have_a_graph() -> None:
+    x, y = (pt.dscalar().type.to_scalar_type()() for _ in range(2))
+    graph = Composite([x, y], [add(x, y)]).fgraph
+    assert [node.op for node in graph.toposort()] == [add]
+    assert len(graph.inputs) == 2

@@ -439,8 +439,9 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     at, side = np.nextafter(value, -np.inf), "beyond it"
     is_beyond = quantity.of_specimen(sample.values, at)
     if not np.isin(is_beyond, (0.0, 1.0)).all():
-        findings += _beyond_runs(sample, quantity)
-        return findings, _jackknife_error(sample, quantity)
+        error = _jackknife_error(sample, quantity)
+        findings += _beyond_runs(sample, quantity) + _inaccurate(sample, quantity, error)
+        return findings, error
     share = float(sample.mean_weights @ is_beyond)
     is_upper = share <= 0.5
     if not is_upper:  # because the rarer side decides how well the quantity is known
@@ -476,7 +477,30 @@ def checked_quantity(sample: ResponseSample, quantity: Quantity) -> tuple[Findin
     error = float(np.abs(ends - value).max())
     if not sample.design.has_runs:
         error = float(np.hypot(error, _range_effect(sample, quantity, center)[0]))
-    return findings, error
+    return findings + _inaccurate(sample, quantity, error), error
+
+
+def _inaccurate(sample: ResponseSample, quantity: Quantity, error: float) -> Findings:
+    """Report an error of the computation that is not small beside the scatter of populations."""
+    spread = standard_deviation(sample.evaluate(quantity.of, sample.populations.thinned()))
+    share = getattr(quantity, "probability", 0.5)
+    if isinstance(sample.design, EmulatedSample) and not sample.design.has_tails:
+        text = (
+            f"{quantity!r}: an input depends on others, or PyMC has no (inverse) distribution "
+            "function of it, so that few points are in the tails of wide populations: ends of "
+            "intervals may be .6 standard deviations off. Pass the result of prb.predict with "
+            "n_samples=8192 to prb.population."
+        )
+        if min(share, 1 - share) < 0.05:
+            return report(Finding("rough-probability", text))
+    if not error > 0.5 * spread > 0:
+        return ()
+    text = (
+        f"{quantity!r}: the computation has an error of {error / spread:.0%} of the standard "
+        "deviation over the populations; compute it from prb.predict with stored=False and "
+        "n_samples=8192."
+    )
+    return report(Finding("rough-probability", text))
 
 
 def _jackknife_error(sample: ResponseSample, quantity: Quantity) -> float:
@@ -752,7 +776,8 @@ def evaluate(
         sampler.
     quantity : Quantity
         Such as ``prb.decision.Quantile(response, x, probability=0.99)``. A response other than a
-        simulator's is computed once for each run of the design, unless `predict` has computed it.
+        simulator's is computed once for each run of the design, unless `predict` has computed it;
+        under the log-likelihood by specimen also at 16 to 64 specimens of the populations.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     prob : float

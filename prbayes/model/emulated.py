@@ -17,9 +17,9 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtr
 
-from prbayes._validate import AT_ONCE, ArrayFunction, Floats, Indices, Shape
+from prbayes._validate import AT_ONCE, ArrayFunction, Bools, Floats, Indices, Shape
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -55,6 +55,11 @@ class EmulatedPopulationSizes:
     populations: int = 64
     points: int = 8192
     blocks: int = 8  # number of batches of the sample, whose scatter gives the Monte Carlo error
+    # Runs of another response in a round at specimens, the largest number of rounds, and the
+    # error relative to the spread that ends them.
+    checked: int = 16
+    rounds: int = 4
+    tolerance: float = 0.02
 
 
 _SIZES = EmulatedPopulationSizes()
@@ -263,11 +268,14 @@ def _at_conditions(
     return at_conditions(inputs, specimens, rows)
 
 
-def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedResponse:
+def emulator_of(
+    simulator: EmulatedSimulator, responses: Responses, specimens: Sequence[Floats]
+) -> EmulatedResponse:
     """Return a response of a simulator's inputs as a function of them.
 
     The simulator's own response costs no run. Another one is computed at the points of the
-    emulator's runs. Raises a DesignError if fewer than eight of these have a finite response.
+    emulator's runs, and at some of the specimens, (n, *event) by input, until it is accurate there.
+    Raises a DesignError if fewer than eight of the runs have a finite response.
     """
     likelihood = simulator.likelihood
     preparation = prepared(likelihood)
@@ -297,12 +305,47 @@ def emulator_of(simulator: EmulatedSimulator, responses: Responses) -> EmulatedR
     is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
     if is_near.sum() < 16:
         is_near = np.ones(len(run_z), dtype=bool)
+    event = values.shape[1:]
+    emulated = _fitted(coordinates, z, y, is_near, event)
+    step = max(1, len(specimens[0]) // _SIZES.points)
+    specimens = [x[::step] for x in specimens]
+    for round_ in range(_SIZES.rounds):
+        predicted = emulated(specimens).reshape(len(specimens[0]), -1)
+        rows = _stratified(predicted, round_)
+        points = [x[rows] for x in specimens]
+        at_points = responses(points, []).reshape(len(rows), -1)
+        y = np.concatenate([y, at_points])
+        new_z = coordinates.of(points, 1)
+        is_near = np.append(is_near, ((new_z >= low) & (new_z <= high)).all(axis=1))
+        z = np.concatenate([z, new_z])
+        emulated = _fitted(coordinates, z, y, is_near, event)
+        with np.errstate(invalid="ignore"):  # because a failed specimen is infinite
+            spread = np.ptp(np.nanquantile(predicted, ndtr([-1.0, 1.0]), axis=0), axis=0) / 2
+            misfit = np.nan_to_num(at_points - predicted[rows], posinf=0.0, neginf=0.0)
+            if (np.abs(misfit).max(axis=0) <= _SIZES.tolerance * spread).all():
+                break
+    return emulated
+
+
+def _stratified(values: Floats, round_: int) -> Indices:
+    """Return indices of specimens at normal scores of -3.3 to 3.3 of their responses, (n, m)."""
+    n = _SIZES.checked
+    scores = np.linspace(-3.3, 3.3, n * _SIZES.rounds)[round_ :: _SIZES.rounds]
+    ranks = (ndtr(scores) * (len(values) - 1)).round().astype(int)
+    columns = np.arange(n) * 7 % values.shape[1]
+    return np.unique(np.argsort(values, axis=0)[ranks, columns])
+
+
+def _fitted(
+    coordinates: Coordinates, z: Floats, y: Floats, is_near: Bools, event: Shape
+) -> EmulatedResponse:
+    """Return the emulator of the finite ones of the runs y at z; errors are those of near runs."""
+    is_finite = np.isfinite(y).all(axis=1)
     distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
     rows = np.flatnonzero(is_finite)[distinct]
     near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
     surface = fit_emulator(z[rows], y[rows], near)
     error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
-    event = values.shape[1:]
     return EmulatedResponse(coordinates, z, y, surface.values, slice(None), event, error)
 
 
@@ -384,6 +427,8 @@ class EmulatedSample:
     # inputs of the simulator that are those of another population here
     replaced: Mapping[Variable[Any, Any], Variable[Any, Any]]
     density: PopulationDensity
+    # Whether the points are spread evenly over the tails, by inverse distribution functions.
+    has_tails: bool
     _emulators: dict[Responses, EmulatedResponse] = field(default_factory=dict)
 
     max_lost: ClassVar[float] = MAX_LOST  # largest accepted share of a population without response
@@ -426,7 +471,10 @@ class EmulatedSample:
         # Points that were rounded beyond the end of a support have no weight.
         log_mixture[np.isneginf(log_mixture)] = np.inf
         blocks = order * _SIZES.blocks // n
-        return cls(simulator, shuffled, log_mixture, blocks, inputs, n, replaced, density)
+        has_tails = spread > 1
+        return cls(
+            simulator, shuffled, log_mixture, blocks, inputs, n, replaced, density, has_tails
+        )
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
@@ -434,14 +482,14 @@ class EmulatedSample:
 
     def values_of(self, responses: Responses) -> Floats:
         """Return a response of the specimens, (n,) or (n, m)."""
-        return self._emulator(responses)(self.points_of(responses.inputs))
+        return _emulator(self, responses)(self.points_of(responses.inputs))
 
     def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
         """Return a response at any points, (n,) or (n, m), and with two errors of it.
 
         The errors are that at left-out runs, and that beyond the range of the runs.
         """
-        emulator = self._emulator(responses)
+        emulator = _emulator(self, responses)
         inputs = values_of_inputs(points, self.inputs, responses.inputs, self.replaced)
         values = emulator(inputs)
         return [values, values + emulator.error.reshape(emulator.event), emulator.steepened(inputs)]
@@ -450,12 +498,6 @@ class EmulatedSample:
     def n_runs(self) -> int:
         """Number of runs of the emulator of any response."""
         return len(self.simulator.emulated.z)
-
-    def _emulator(self, responses: Responses) -> EmulatedResponse:
-        """Return the emulator of a response; the first call for the response fits the emulator."""
-        if responses not in self._emulators:
-            self._emulators[responses] = emulator_of(self.simulator, responses)
-        return self._emulators[responses]
 
     def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
@@ -488,7 +530,15 @@ def _squared_scores(inputs: Inputs, scores: Sequence[Floats]) -> Floats:
     return np.asarray(total)
 
 
+def _emulator(sample: EmulatedSample, responses: Responses) -> EmulatedResponse:
+    """Return the emulator of a response; the first call for the response fits the emulator."""
+    if responses not in sample._emulators:
+        specimens = sample.points_of(responses.inputs)
+        sample._emulators[responses] = emulator_of(sample.simulator, responses, specimens)
+    return sample._emulators[responses]
+
+
 def emulator_error(sample: EmulatedSample, responses: Responses) -> Floats:
     """Return the cross-validation error of the emulator of a response, () or (m,)."""
-    emulator = sample._emulator(responses)
+    emulator = _emulator(sample, responses)
     return emulator.error.reshape(emulator.event)

@@ -28,6 +28,7 @@ from pytensor.graph.replace import (
 )
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
+from pytensor.scalar.basic import Composite
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.op import RandomVariable
@@ -43,6 +44,13 @@ def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
     if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers in Python
         (x,) = terms
         return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
+    if isinstance(op.scalar_op, Composite):  # PyTensor would loop over numbers in Python
+        graph = op.scalar_op.fgraph
+        values: dict[Any, Any] = dict(zip(graph.inputs, terms, strict=True))
+        for inner in graph.toposort():
+            arguments = [values[x] if x in values else pt.constant(x.data) for x in inner.inputs]
+            values[inner.outputs[0]] = Elemwise(inner.op)(*arguments)
+        return [values[x] for x in graph.outputs]
     most = 30  # NumPy takes at most 32 operands, the result included
     if len(terms) <= most or not op.scalar_op.associative:
         return False

@@ -545,8 +545,8 @@ def _predicted(
             values = responses(specimens, epistemic)
             results.append(_Predicted(values, specimens, "new specimens"))
             continue
-        emulated = emulated or emulator_of(simulator, responses)
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
+        emulated = emulated or emulator_of(simulator, responses, flat)
         values = emulated(flat)
         beyond = emulated.share_beyond(flat, values)
         values = values.reshape(len(parents[0]), n, *emulated.event)

@@ -249,8 +249,7 @@ def sequential_design(
     plausible = None
     while True:
         likely = Likely.of(data, emulation, population, batches)
-        is_complete = batches >= enough or len(emulation.z) >= most
-        is_unbiased = emulation.bias <= bias and is_complete
+        is_unbiased = emulation.bias <= bias and (batches >= enough or len(emulation.z) >= most)
         if is_unbiased and len(emulation.z) < most and not likely.has_runs(data, emulation.z):
             # The bias is that at another population. Far from runs an emulator is often wrong.
             emulation = with_likely_runs(run, data, emulation, likely, population)
@@ -314,7 +313,7 @@ def population_elsewhere(
     audited = tuple(range(len(z)))
     through_all = replace(emulation, surface=surface, bias=np.inf, audited=audited)
     first = normal_of(data.inner[:, data.free])
-    proposals = Likely.of(data, through_all, first, seed).proposals
+    proposals = fit_proposals(data, through_all, wider(first))
     # Populations far from each other need more points than likely inputs do.
     count = min(512, data.options.most_in_all // len(data.readings))
     points = draw_points(data, proposals, count, seed)

@@ -45,12 +45,14 @@ from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import element_name
 from prbayes.model.random_variable import shared_epsilon
+from prbayes.model.specimen_audit import audited_likelihood
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.posterior.batch import ProductPosteriors
 from prbayes.posterior.sample import draw_posterior, importance_chains, mode_findings
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import modes_of, specimen_target
+from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 from prbayes.response.outputs import Outputs
@@ -352,7 +354,10 @@ class Fleet:
 
     def _tested(self, name: str, drawn: Drawn) -> Calibration:
         """Return the posterior of a product with its validity test."""
-        result = Calibration(drawn.values, drawn.pareto_k, finding=drawn.finding)
+        is_wide = name not in self.sheets and len(self.observed[name]) < 8
+        tails = _heavy_tails(drawn.values) if is_wide else ""
+        finding = " ".join(filter(None, [drawn.finding, tails]))
+        result = Calibration(drawn.values, drawn.pareto_k, finding=finding)
         if name not in self.further or drawn.predicted is None:
             return result
         null = PosteriorNull(999)
@@ -456,6 +461,17 @@ class SpecimenFleet(Fleet):
         result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
         return result
 
+    def _tested(self, name: str, drawn: Drawn) -> Calibration:
+        """Return the posterior of a product with its validity test; audit its emulator."""
+        if name not in self.sheets:
+            free = [drawn.values[str(rv.name)] for rv in self.evaluator.model.free_RVs]
+            thetas = self.evaluator.hyperparameters.thetas_of(free)
+            try:  # No runs can be added, because products share the emulator.
+                audited_likelihood(self._likelihood([name]), thetas, is_last=True)
+            except DesignError as error:
+                drawn = replace(drawn, finding=f"{drawn.finding} {error}.".strip())
+        return super()._tested(name, drawn)
+
     def _in_batch(self, names: Sequence[str]) -> dict[str, Drawn]:
         """Return the posteriors of the products that are easily sampled together."""
         names = [name for name in names if name not in self.sheets]
@@ -534,6 +550,26 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
 
     fleet: Fleet = cloudpickle.loads(pickled)
     return fleet.calibrated(names)
+
+
+def _heavy_tails(values: NamedArrays) -> str:
+    """Return a sentence if a standard deviation of draws, (draws, *shape), is not well known.
+
+    Its relative standard error depends on the kurtosis of the draws.
+    """
+    errors = {"": 0.0}
+    for name, draws in values.items():
+        squares = (draws - draws.mean(axis=0)) ** 2
+        with np.errstate(invalid="ignore"):  # because a constant has none
+            kurtosis = (squares**2).mean(axis=0) / squares.mean(axis=0) ** 2
+        errors[name] = float(np.nanmax(np.sqrt((kurtosis - 1) / (4 * len(draws))), initial=0.0))
+    name = max(errors, key=lambda key: errors[key])
+    if errors[name] <= 2 / np.sqrt(2 * len(draws)):  # twice that of a normal posterior
+        return ""
+    return (
+        f"The posterior of {name} has heavy tails: the standard deviation of its draws has a "
+        f"standard error of {errors[name]:.0%}. Pass more draws, or report quantiles."
+    )
 
 
 def _misfits(

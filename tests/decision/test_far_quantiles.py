@@ -9,6 +9,7 @@ from one_input import posterior_of
 from scipy import stats
 
 import prbayes as prb
+from prbayes._finding import from_json
 
 DRAWS = 2000
 
@@ -99,3 +100,57 @@ def test_population_tables_and_plans_have_far_quantiles() -> None:
     quantity = prb.decision.Quantile(total, *inputs, probability=0.99)
     plan = prb.plan(posterior, {"same": condition}, k=5, model=model, quantity=quantity)
     assert float(plan.now.sel(name="quantity")) == pytest.approx(exact.std(), rel=0.05)
+
+
+def ratio(*inputs: Any) -> Any:
+    return inputs[0] / (np.abs(inputs[-1]) + 0.2)
+
+
+def growth(*inputs: Any) -> Any:
+    return np.exp(sum(inputs))
+
+
+def wave(*inputs: Any) -> Any:
+    return np.sin(3 * inputs[0]) + inputs[-1] * np.cos(2 * inputs[-1])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("response", [ratio, growth, wave])
+@pytest.mark.parametrize("n_inputs", [1, 2])
+def test_another_response_has_runs_in_the_tails(response: Any, n_inputs: int) -> None:
+    """Runs for one response lack those that the far quantiles of another one need."""
+    model, inputs, posterior, *_ = problem(25, n_inputs, is_log=False, known=False)
+    posterior = posterior.isel(draw=slice(None, None, 10))
+    draws = {name: x.values.ravel() for name, x in posterior["posterior"].data_vars.items()}
+    z = stats.norm.ppf(np.random.default_rng(5).random((2, 100_000)))
+    exact = []
+    for i in range(DRAWS // 10):
+        names = "ab"[:n_inputs]
+        values = [
+            draws[f"mean {k}"][i] + draws[f"sd {k}"][i] * x for k, x in zip(names, z, strict=False)
+        ]
+        exact.append(np.quantile(response(*values), 0.99))
+    quantile = prb.decision.Quantile(response, *inputs, probability=0.99)
+    assert_close(prb.decision.evaluate(posterior, quantile, model=model), np.array(exact))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "family",
+    [
+        lambda mu, sd: pm.SkewNormal.dist(mu=mu, sigma=sd, alpha=3.0),
+        lambda mu, sd: pm.ExGaussian.dist(mu=mu, sigma=sd, nu=0.5),
+        lambda mu, sd: pm.AsymmetricLaplace.dist(kappa=1.0, mu=mu, b=sd),
+    ],
+)
+def test_far_quantiles_without_an_inverse_distribution_function_are_reported(family: Any) -> None:
+    with pm.Model() as model:
+        x = family(pm.Normal("mu", 0.0, 3.0), pm.HalfNormal("sd", 2.0))
+        prb.Simulator("y", total, x, observed=np.random.default_rng(1).normal(2.0, 0.5, 25))
+    mean, sd = reference_draws(np.random.default_rng(2), np.linspace(1.0, 3.0, 25))
+    posterior = posterior_of(mu=mean[None, ::20], sd=sd[None, ::20])
+    for probability, is_reported in ((0.99, True), (0.5, False)):
+        quantity = prb.decision.Quantile(total, x, probability=probability)
+        table = prb.decision.evaluate(posterior, quantity, model=model)
+        codes = {finding.code for finding in from_json(table.attrs["findings"])}
+        assert ("rough-probability" in codes) == is_reported

@@ -304,3 +304,14 @@ def test_an_element_of_one_row_is_that_of_all(one: str) -> None:
     each = np.broadcast_arrays(values[:, 0], places)
     expected = np.broadcast_to(values, (3, 4))[np.arange(3), each[1]]
     np.testing.assert_array_equal(function(values, places), [expected])
+
+
+def test_powers_take_whole_arrays() -> None:
+    """PyTensor rewrites x^6 as a composite operation, a loop over numbers in Python."""
+    x = pt.dvector("x")
+    function = compiled([x], [x**6 + 2 * x**3, pt.log1p(x**8)])
+    names = [str(node.op) for node in function.maker.fgraph.toposort()]
+    assert not any("Composite" in name for name in names)
+    at = np.linspace(-2.0, 2.0, 9)
+    np.testing.assert_allclose(function(at)[0], at**6 + 2 * at**3, rtol=1e-14)
+    np.testing.assert_allclose(function(at)[1], np.log1p(at**8), rtol=1e-14)

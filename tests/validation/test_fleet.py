@@ -233,3 +233,35 @@ def test_posteriors_of_three_specimens_are_as_wide_as_the_exact_ones() -> None:
 
 def curved(a: Any, b: Any) -> Any:
     return np.stack([1e6 * np.exp(a), a * b + b], axis=-1)
+
+
+@pytest.mark.parametrize("n_inputs", [1, 2])
+def test_heavy_tails_of_few_specimens_are_reported(n_inputs: int) -> None:
+    """The standard deviation of 1000 draws is then known to a tenth or a fifth."""
+    rng = np.random.default_rng(0)
+    with pm.Model() as model:
+        inputs = [
+            pm.Normal.dist(pm.Normal(f"m{k}", 0, 10), pm.HalfNormal(f"s{k}", 3))
+            for k in range(n_inputs)
+        ]
+        prb.Simulator(
+            "y",
+            lambda *x: np.stack(x, axis=-1),
+            *inputs,
+            observed=rng.normal(0, 0.3, (4, n_inputs)),
+        )
+    data = {f"p{n}": rng.normal(0, 0.3, (n, n_inputs)) for n in (3, 4, 12)}
+    *few, many = prb.calibrate_each(data, model=model, **QUIET)["products"]["finding"].values
+    assert all("heavy tails" in text for text in few)
+    assert not many
+
+
+def test_an_emulator_beside_a_pole_is_reported() -> None:
+    """One specimen at twice the inputs of the others seems to have an input beyond the pole."""
+    x = np.array([60.0, *np.random.default_rng(3).normal(28, 3, 14)[1:]])
+    with pm.Model() as model:
+        k = pm.Normal.dist(pm.Normal("mu", 20, 8), pm.HalfNormal("sigma", 4))
+        prb.Simulator("y", lambda x: 100 / x, k, observed=100 / x)
+    data = {"p0": 100 / x, "p1": 100 / x[1:]}
+    for text in prb.calibrate_each(data, model=model, **QUIET)["products"]["finding"].values:
+        assert "not smooth enough" in text
