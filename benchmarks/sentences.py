@@ -158,7 +158,7 @@ SENTENCES: list[tuple[str, str, Callable[[], Iterable[str]]]] = [
     ("docs/limits.md", "Of {} made-up problems in all capabilities (`python -m benchmarks.made_up`) {} agree", made_up),
     ("docs/limits.md", "after {} to {} runs.\n", many_inputs),
     ("docs/limits.md", "has widths of {} to {} (`python -m benchmarks.reach`)", second_branch),
-    ("docs/limits.md", "in one of {} data sets (`python -m benchmarks.inaccurate`", partial(data_sets, "inaccurate")),
+    ("docs/limits.md", "of {} data sets (`python -m benchmarks.inaccurate`)", partial(data_sets, "inaccurate")),
     ("docs/limits.md", "Of {} data sets of a frame none lacked", partial(data_sets, "modes_of_metrics")),
     ("docs/limits.md", "100 000 specimens of one input take {} CPU seconds and {} GiB", large_specimens),
     ("docs/limits.md", "contain them in {} and {} of data sets of 50 specimens, silent in part; under `prb.families.SinhArcsinh` in {} and {} (", gamma_tails),

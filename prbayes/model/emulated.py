@@ -301,12 +301,14 @@ def emulator_of(
     # Cross-validation errors count at runs within the range of the specimens' likely inputs, or at
     # all runs if this range contains few runs.
     roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    of_roots = likelihood.coordinates.inputs_of_runs(roots)
+    likely = coordinates.of(values_of_inputs(of_roots, likelihood.inputs, responses.inputs), 1)
+    low, high = np.quantile(likely, [0.01, 0.99], axis=0)
+    is_near = ((z >= low) & (z <= high)).all(axis=1)
     if is_near.sum() < 16:
-        is_near = np.ones(len(run_z), dtype=bool)
+        is_near = np.ones(len(z), dtype=bool)
     event = values.shape[1:]
-    emulated = _fitted(coordinates, z, y, is_near, event)
+    emulated = _emulator_through(coordinates, z, y, is_near, event)
     step = max(1, len(specimens[0]) // _SIZES.points)
     specimens = [x[::step] for x in specimens]
     for round_ in range(_SIZES.rounds):
@@ -316,13 +318,17 @@ def emulator_of(
         at_points = responses(points, []).reshape(len(rows), -1)
         y = np.concatenate([y, at_points])
         new_z = coordinates.of(points, 1)
-        is_near = np.append(is_near, ((new_z >= low) & (new_z <= high)).all(axis=1))
+        of_new = ((new_z >= low) & (new_z <= high)).all(axis=1)
+        is_near = np.append(is_near, of_new)
         z = np.concatenate([z, new_z])
-        emulated = _fitted(coordinates, z, y, is_near, event)
+        emulated = _emulator_through(coordinates, z, y, is_near, event)
         with np.errstate(invalid="ignore"):  # because a failed specimen is infinite
-            spread = np.ptp(np.nanquantile(predicted, ndtr([-1.0, 1.0]), axis=0), axis=0) / 2
-            misfit = np.nan_to_num(at_points - predicted[rows], posinf=0.0, neginf=0.0)
-            if (np.abs(misfit).max(axis=0) <= _SIZES.tolerance * spread).all():
+            low_value, high_value = np.nanquantile(predicted, ndtr([-1.0, 1.0]), axis=0)
+            spread = (high_value - low_value) / 2
+            misfit = at_points - predicted[rows]
+            misfit = np.nan_to_num(misfit, posinf=0.0, neginf=0.0)
+            largest = np.abs(misfit).max(axis=0)
+            if (largest <= _SIZES.tolerance * spread).all():
                 break
     return emulated
 
@@ -336,16 +342,19 @@ def _stratified(values: Floats, round_: int) -> Indices:
     return np.unique(np.argsort(values, axis=0)[ranks, columns])
 
 
-def _fitted(
+def _emulator_through(
     coordinates: Coordinates, z: Floats, y: Floats, is_near: Bools, event: Shape
 ) -> EmulatedResponse:
     """Return the emulator of the finite ones of the runs y at z; errors are those of near runs."""
     is_finite = np.isfinite(y).all(axis=1)
-    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
+    _, distinct = np.unique(z[is_finite], axis=0, return_index=True)
     rows = np.flatnonzero(is_finite)[distinct]
-    near = is_near[rows] if is_near[rows].any() else np.ones(len(rows), dtype=bool)
+    near = is_near[rows]
+    if not near.any():
+        near = np.ones(len(rows), dtype=bool)
     surface = fit_emulator(z[rows], y[rows], near)
-    error = np.sqrt((surface.left_out[near] ** 2).mean(axis=0))
+    squares = surface.left_out[near] ** 2
+    error = np.sqrt(squares.mean(axis=0))
     return EmulatedResponse(coordinates, z, y, surface.values, slice(None), event, error)
 
 

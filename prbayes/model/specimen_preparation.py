@@ -989,12 +989,14 @@ class SpecimenPopulations:
         proposals: list[tuple[Callable[[Floats], Floats], int]] = [(names.log_prior, len(thetas))]
         rng = np.random.default_rng([seed, 6])
         for attempt in range(12):
-            terms = [density(thetas) + np.log(n / len(thetas)) for density, n in proposals]
-            log_ratio = log_density - logsumexp(terms, axis=0)
+            terms = [np.log(n / len(thetas)) + density(thetas) for density, n in proposals]
+            log_proposal = logsumexp(terms, axis=0)
+            log_ratio = log_density - log_proposal
             weights, temper = tempered(log_ratio, thetas)
             if temper == 1.0 and attempt >= 3 and 1 / (weights**2).sum() > 200:
                 break
-            rows, counts = np.unique(rng.choice(len(thetas), 512, p=weights), return_counts=True)
+            drawn = rng.choice(len(thetas), 512, p=weights)
+            rows, counts = np.unique(drawn, return_counts=True)
             mixture = StudentMixture.fitted(thetas[rows], counts / 512, 6, 5.0, rng)
             new = mixture.draws(512, seed + 1 + attempt)
             proposals.append((mixture.log_density, 512))

@@ -101,10 +101,12 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
-    of_points = [prepared(likelihood).thetas for likelihood in evaluator.likelihoods]
-    thetas = np.concatenate([evaluator.hyperparameters.prior_points(1024, 0), *of_points])
-    starts = specimen_starts(thetas, target.log_posterior(thetas), prior_sd)
-    return replace(target, starts=starts)
+    thetas = evaluator.hyperparameters.prior_points(1024, 0)
+    starts = [specimen_starts(thetas, target.log_posterior(thetas), prior_sd)]
+    # Points of the prior may miss the modes of narrow populations.
+    for likelihood in evaluator.likelihoods:
+        starts.append(far_apart(prepared(likelihood).thetas, 4, prior_sd))
+    return replace(target, starts=np.concatenate(starts))
 
 
 def specimen_starts(thetas: Floats, log_p: Floats, unit: Floats) -> Floats:

@@ -317,9 +317,10 @@ def population_elsewhere(
     # Populations far from each other need more points than likely inputs do.
     count = min(512, data.options.most_in_all // len(data.readings))
     points = draw_points(data, proposals, count, seed)
-    points = at_scale(data, points, emulation.error, likely_scale(data, points, emulation.error))
-    draws = draws_of(data, proposals, points)
-    population = normal_of(draws.specimens()[:, data.free])
+    scale = likely_scale(data, points, emulation.error)
+    points = at_scale(data, points, emulation.error, scale)
+    specimens = draws_of(data, proposals, points).specimens()
+    population = normal_of(specimens[:, data.free])
     weights = likely_weights(data, points, population)
     if are_near(likely.population, population):
         return None
@@ -366,7 +367,8 @@ def batch_size(data: SpecimenData, emulation: Emulation, previous: Emulation | N
     if previous is not None:
         return least
     share = 2 if emulation.bias > 3 * data.options.bias else 4
-    return max(least, min(len(emulation.z) // share, 3 * first_runs(data.known.shape[1])))
+    most = 3 * first_runs(data.known.shape[1])
+    return max(least, min(len(emulation.z) // share, most))
 
 
 def wider(population: Normal) -> Normal:

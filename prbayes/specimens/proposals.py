@@ -196,9 +196,11 @@ class Modes:
 
     def is_stationary(self, precision: float = 0.1) -> Bools:
         """Return which rows, (R,), are modes; others cover the inside of a fold between them."""
-        pull = np.einsum("kmd,km->kd", self.slopes, self.errors) - precision * self.a
+        of_readings = np.einsum("kmd,km->kd", self.slopes, self.errors)
+        gradient = precision * self.a - of_readings
         steepness = 1 + (self.slopes**2).sum(axis=(1, 2))
-        return np.asarray((pull**2).sum(axis=1) < 0.01 * steepness)
+        squares = (gradient**2).sum(axis=1)
+        return np.asarray(squares < 0.01 * steepness)
 
     @cached_property
     def table(self) -> Indices:
