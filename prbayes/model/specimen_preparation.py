@@ -78,7 +78,7 @@ from prbayes.specimens.points import (
     specimen_points,
     typical_specimens,
 )
-from prbayes.specimens.proposals import Normal, Proposals
+from prbayes.specimens.proposals import Normal, Proposals, mode_coordinates
 from prbayes.specimens.response_share import ResponseShare, renewed_share, response_share
 from prbayes.specimens.selection import Selection
 from prbayes.specimens.shared_points import PointMass, PopulationShare
@@ -551,7 +551,7 @@ def _root_findings(data: SpecimenData, proposals: Proposals) -> list[Finding]:
     if len(data.free) > 1 or len(data.scales) > 1 or proposals.is_open():
         return []
     modes = proposals.modes
-    z = proposals.residuals.coordinates(modes.specimen, modes.a)[:, data.free]
+    z = mode_coordinates(proposals)[:, data.free]
     low, high = np.quantile(data.prior[:, data.free], [0.1, 0.9], axis=0)
     is_central = ((z >= low) & (z <= high)).all(axis=1)
     counts = np.bincount(modes.specimen, is_central & modes.is_stationary())
@@ -988,16 +988,21 @@ class SpecimenPopulations:
         names = self.hyperparameters
         proposals: list[tuple[Callable[[Floats], Floats], int]] = [(names.log_prior, len(thetas))]
         rng = np.random.default_rng([seed, 6])
-        for attempt in range(12):
+        for attempt in range(13):
             terms = [np.log(n / len(thetas)) + density(thetas) for density, n in proposals]
             log_proposal = logsumexp(terms, axis=0)
             log_ratio = log_density - log_proposal
             weights, temper = tempered(log_ratio, thetas)
-            if temper == 1.0 and attempt >= 3 and 1 / (weights**2).sum() > 200:
+            is_enough = temper == 1.0 and attempt >= 5 and 1 / (weights**2).sum() > 200
+            if is_enough or attempt == 12:
                 break
             drawn = rng.choice(len(thetas), 512, p=weights)
-            rows, counts = np.unique(drawn, return_counts=True)
-            mixture = StudentMixture.fitted(thetas[rows], counts / 512, 6, 5.0, rng)
+            # Equal points would have no covariance.
+            noise = 1e-6 * names.prior_sd * rng.standard_normal((512, len(names.prior_sd)))
+            even = np.full(512, 1 / 512)
+            mixture = StudentMixture.fitted(thetas[drawn] + noise, even, 6, 5.0, rng)
+            # A mode that few points have found needs as many new ones as others.
+            mixture = replace(mixture, shares=(mixture.shares + 1 / 6) / 2)
             new = mixture.draws(512, seed + 1 + attempt)
             proposals.append((mixture.log_density, 512))
             thetas = np.concatenate([thetas, new])

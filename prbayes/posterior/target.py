@@ -98,6 +98,8 @@ class Target:
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     """Return the posterior of a model whose simulators have a log-likelihood by specimen."""
     prior_sd = evaluator.hyperparameters.prior_sd
+    from scipy.spatial import cKDTree
+
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
@@ -105,7 +107,12 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     starts = [specimen_starts(thetas, target.log_posterior(thetas), prior_sd)]
     # Points of the prior may miss the modes of narrow populations.
     for likelihood in evaluator.likelihoods:
-        starts.append(far_apart(prepared(likelihood).thetas, 4, prior_sd))
+        draws = prepared(likelihood).thetas
+        # In units of the distances within modes, which are far less than those between them.
+        _, near = cKDTree(draws / prior_sd).query(draws / prior_sd, min(16, len(draws)))
+        within = np.abs(draws[near[:, 1:]] - draws[:, None])
+        unit = np.median(within, axis=(0, 1)) + 1e-3 * prior_sd
+        starts.append(far_apart(draws, 8, unit))
     return replace(target, starts=np.concatenate(starts))
 
 

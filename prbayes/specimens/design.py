@@ -34,7 +34,7 @@ from prbayes.specimens.points import (
     residuals_of,
     typical_specimens,
 )
-from prbayes.specimens.proposals import Normal, Proposals, best_rows
+from prbayes.specimens.proposals import Normal, Proposals, best_rows, mode_coordinates
 from prbayes.specimens.weighted_points import fit_normal
 
 
@@ -301,24 +301,34 @@ def population_elsewhere(
 ) -> tuple[Emulation, Likely] | None:
     """Return a surface through all runs, and its likely inputs where these are others.
 
-    None if the surface leaves out no run, or both are near each other. Runs far from the likely
-    population are left out, so that the surface does not know whether another one is likelier.
+    None if the surface leaves out no run, or has the same modes, or both are near each other. Runs
+    far from the likely population are left out, so that the surface does not know whether another
+    one is likelier.
     """
+    from scipy.spatial import cKDTree
+
     z, y = emulation.z, emulation.y
     is_used = _near_population(data, z, likely.population)
     is_used[list(emulation.audited)] = True
-    if is_used.all() or len(z) >= largest_design(data):
+    was_elsewhere = len(emulation.audited) > len(z) // 2
+    if was_elsewhere or is_used.all() or len(z) >= largest_design(data):
         return None
     surface, *_ = fit_surface(z, y, data.readings, data.name, emulation.surface)
     audited = tuple(range(len(z)))
     through_all = replace(emulation, surface=surface, bias=np.inf, audited=audited)
     first = normal_of(data.inner[:, data.free])
     proposals = fit_proposals(data, through_all, wider(first))
+    earlier = mode_coordinates(likely.proposals)
+    modes = mode_coordinates(proposals)[proposals.modes.is_stationary()]
+    scale = likely.scale(data)
+    distance, _ = cKDTree(earlier / scale).query(modes / scale)
+    if not (distance > 1).any():
+        return None
     # Populations far from each other need more points than likely inputs do.
     count = min(512, data.options.most_in_all // len(data.readings))
     points = draw_points(data, proposals, count, seed)
-    scale = likely_scale(data, points, emulation.error)
-    points = at_scale(data, points, emulation.error, scale)
+    row = likely_scale(data, points, emulation.error)
+    points = at_scale(data, points, emulation.error, row)
     specimens = draws_of(data, proposals, points).specimens()
     population = normal_of(specimens[:, data.free])
     weights = likely_weights(data, points, population)
@@ -747,7 +757,7 @@ def without_spurious_modes(
     likeliest, before = likely.best(), emulation
     for _ in range(8):
         modes = proposals.modes
-        z = data.within(proposals.residuals.coordinates(modes.specimen, modes.a))
+        z = data.within(mode_coordinates(proposals))
         deviation = np.sqrt(emulation.surface.variance(z))
         # Farther from the runs than the population is wide, the deviation may be far too small.
         is_far = squared_distances(emulation.z, z, scale) > z.shape[1]

@@ -666,6 +666,12 @@ def with_linear_maps(proposals: Proposals, points: int = 8, largest: float = 2.0
     return replace(proposals, linear=linear, heavy_axes=heavy_axes)
 
 
+def mode_coordinates(proposals: Proposals) -> Floats:
+    """Return the coordinates of the modes, (R, d)."""
+    modes = proposals.modes
+    return proposals.residuals.coordinates(modes.specimen, modes.a)
+
+
 def mixing_weights(modes: Modes, mass: Floats) -> Floats:
     """Return mixing weights by the mass of each mode, (R,).
 
