@@ -97,9 +97,9 @@ class Target:
 
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     """Return the posterior of a model whose simulators have a log-likelihood by specimen."""
-    prior_sd = evaluator.hyperparameters.prior_sd
     from scipy.spatial import cKDTree
 
+    prior_sd = evaluator.hyperparameters.prior_sd
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)

@@ -426,7 +426,7 @@ def reading_change(
     first = reading_log_density(data, data.readings, points.outputs, before.error)
     outputs = outputs_at(data, after, points.z)
     change = reading_log_density(data, data.readings, outputs, after.error) - first
-    return np.where(np.isnan(change), -np.inf, change)
+    return np.where(np.isfinite(change), change, -np.inf)
 
 
 def draw_points(data: SpecimenData, proposals: Proposals, count: int, seed: int) -> SpecimenPoints:
