@@ -683,7 +683,9 @@ def typical_specimens(modes: Modes, n: int) -> Bools:
 def draws_of(data: SpecimenData, proposals: Proposals, points: SpecimenPoints) -> Draws:
     """Return posterior draws given points; of several modes where specimens have several."""
     has_several = np.bincount(proposals.modes.specimen, proposals.modes.is_stationary()) > 1
-    settings = {"several": True} if has_several.mean() > 0.1 else {}
+    # Outliers, which gross errors explain, leave small modes that only the emulator has.
+    is_sought = has_several.mean() > 0.1 and not data.gross_errors
+    settings = {"several": True} if is_sought else {}
     return data.posterior(points.z, points.log_a, None, **settings)
 
 
