@@ -22,6 +22,7 @@ from prbayes.specimens.points import (
     SpecimenPoints,
     joined,
     normal_of,
+    reading_change,
     specimen_points,
 )
 
@@ -153,6 +154,23 @@ def test_the_log_proposal_serves_another_error() -> None:
         error = draws.log_likelihoods(points.z, log_a) - exact_log_likelihoods(a, other, draws)
         assert error.sum(axis=1).std() <= 0.2
         assert abs(error.mean()) < 5 * 0.02
+
+
+def test_a_later_emulator_changes_the_density_of_the_readings() -> None:
+    draws = draws_of(1)
+    _, response = linear_response(1, 1)
+    readings = with_error(response(specimens_of(draws)), 0.1)
+    prior = 0.4 * np.random.default_rng(1).standard_normal((2048, 1))
+    data = SpecimenData(readings, np.full((N, 1), np.nan), prior, draws.posterior)
+    before, after = (
+        Emulation(prior, f(prior), DifferencedResponse(f), np.full(1, 1e-5), 0.0)
+        for f in (response, lambda z: response(z) + 0.05)
+    )
+    points, _, _ = specimen_points(data, before, normal_of(data.inner))
+    first, second = ((readings.values - points.outputs[..., 0] - k) / 0.1 for k in (0.0, 0.05))
+    change = reading_change(data, points, before, after)
+    np.testing.assert_allclose(change, (first**2 - second**2) / 2, atol=1e-5)
+    assert not reading_change(data, points, before, before).any()
 
 
 def test_points_are_doubled_until_both_halves_agree() -> None:
