@@ -89,9 +89,10 @@ def exact(case: Case, y: Floats) -> tuple[Floats, Floats]:
     def log_posterior(theta: Floats) -> Floats:
         mean, log_sd = theta[:, :d], theta[:, d:]
         sd = np.exp(log_sd)
-        density = cell * np.ones((len(theta), len(x)))
-        for k in range(d):
-            density *= stats.norm.pdf(x[:, k], mean[:, k, None], sd[:, k, None])
+        density = cell * np.ones((len(theta), 1))
+        for k, values in enumerate(axis):  # the last input varies fastest
+            of_input = stats.norm.pdf(values, mean[:, k, None], sd[:, k, None])
+            density = (density[:, :, None] * of_input[:, None]).reshape(len(theta), -1)
         with np.errstate(divide="ignore"):
             logs = np.log(density @ likelihoods).sum(axis=1)
         prior = stats.norm.logpdf(mean, case.means, 1.0) + stats.halfnorm.logpdf(sd) + log_sd
