@@ -131,7 +131,7 @@ def with_kept_runs(evaluator: Evaluator) -> Evaluator:
     changed = []
     for node in evaluator.nodes:
         if node.bound.random:
-            stored = Reweighted(max(node.propagation.n, 1024), emulator=None)
+            stored = Reweighted(max(node.bound.n_per_theta, 1024), emulator=None)
             try:
                 stored.check_simulator(node.name, node.inputs, node.target)
             except TypeError as error:
