@@ -178,12 +178,17 @@ class Populations:
             ]
             responses = self._responses(response, arguments)
         if simulator is None:
+            advice = "prb.exceedance takes all with n_points=1000, prb.predict also model variables"
+            if any(node.group for node in self.evaluator.nodes):
+                advice += (
+                    "; a metric has no specimens of a single group: leave metric= out of the "
+                    "simulator, for the log-likelihood by specimen"
+                )
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
                 "simulator of the model, expected the .dist() objects of one with "
                 "prb.Reweighted() or prb.LogLikelihood(), for the latter also others of the same "
-                "names, and constants; prb.exceedance takes all with n_points=1000, prb.predict "
-                "also model variables"
+                f"names, and constants; {advice}"
             )
         k = self.evaluator.simulators.index(simulator)
         key = (k, *replaced.values())

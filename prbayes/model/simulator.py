@@ -655,11 +655,7 @@ def _add_by_metric(
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
     if repeats_of(arguments.response) > 1:
-        raise TypeError(
-            f"{name}: metric: got {called(metric)} for a random response "
-            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass "
-            "the function itself with prb.AreaMetric() and propagation=prb.Fresh()"
-        )
+        arguments = replace(arguments, propagation=_of_random_runs(name, arguments.propagation))
     if inputs.covariates:
         text = (
             f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "
@@ -698,6 +694,21 @@ def _add_by_metric(
         variables.append(_add_specification(model, specification, place, values, data.dims))
     share_bandwidths(model)
     return tuple(variables) if inputs.groups is not None else variables[0]
+
+
+def _of_random_runs(name: str, propagation: Propagation) -> Propagation:
+    """Return the propagation of a random response, whose runs are a sample of its distribution."""
+    # An emulator would interpolate between runs whose differences are noise.
+    if propagation.is_random:
+        return propagation
+    emulator = getattr(propagation, "emulator", propagation)
+    if emulator is None or isinstance(emulator, str):
+        return replace(cast(Reweighted, propagation), emulator=None)
+    raise TypeError(
+        f"{name}: propagation: got {called(propagation)} for a random response "
+        "(prb.response.Stochastic) and a metric, expected prb.Reweighted(n) without an emulator, "
+        "whose runs are kept, or prb.Fresh(n)"
+    )
 
 
 def _add_specification(

@@ -127,8 +127,8 @@ class Search:
         if random and method.gradient and isinstance(method.method, str):
             raise TypeError(
                 f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-                f"{method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
-                "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
+                f"{method.method} has no gradient to follow; call "
+                "prb.sample_smc(adjustment=None), use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]

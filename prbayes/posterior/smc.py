@@ -53,7 +53,7 @@ from prbayes.optimize.maximum_likelihood import determined_modes, is_known_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
-from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
+from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon, with_kept_runs
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.mode_masses import bridged_modes, modes_finding
 from prbayes.posterior.results import (
@@ -498,7 +498,8 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
     if not unset:
         return optimum
     if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
+        search = Minimisation(refine=settings.refine)
+        optimum = require_finished(find_optimum(with_kept_runs(evaluator), search))
     require_sampling(optimum, "sample_smc")
     calibrated = calibrate_epsilon(optimum)
     for node in unset:

@@ -186,16 +186,16 @@ def require_density(evaluator: Evaluator) -> None:
     for node in evaluator.nodes:
         if node.bound.random:
             reason = "its discrepancy is random"
-            expected, scale = "prb.Reweighted() or prb.Resimulated()", " and epsilon="
+            expected = "prb.Reweighted() or prb.Resimulated()"
         elif obstacle is not None and not node.bound.stored:
             reason = obstacle
-            expected, scale = "prb.Reweighted(), whose stored responses can be refitted", ""
+            expected = "prb.Reweighted(), whose stored responses can be refitted"
         else:
             continue
         raise ValueError(
             f"{node.name}: propagation: got {type(node.propagation).__name__}, with which the "
             f"distribution of the estimate is not known ({reason}); expected {expected}, or "
-            f"prb.sample_smc with adjustment=None{scale}, whose draws are as wide as epsilon "
+            "prb.sample_smc with adjustment=None, whose draws are as wide as epsilon "
             "makes them"
         )
 

@@ -26,7 +26,8 @@ class Stochastic:
 
     the density :math:`p(y \mid x)` is that of an emulator of the mean, of the spread, and of the
     density of the residuals, which may be skewed, and correlated between outputs. The error of the
-    emulator by finitely many runs widens the posterior.
+    emulator by finitely many runs widens the posterior. A metric of distributions compares the
+    readings with the runs themselves, under `Reweighted` or `Fresh`, and needs no repeats.
 
     Parameters
     ----------
