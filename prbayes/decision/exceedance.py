@@ -214,7 +214,7 @@ def exceedance(
     # A probability is rough if two standard errors are about a factor of two, or would decide the
     # requirement.
     rough = [estimate for estimate in bounds if estimate.error > 0.3 * estimate.mean]
-    decision: dict[str, Any] = {}
+    decision = {}
     if requirement is not None:
         decision = {
             "requirement": requirement,

@@ -161,7 +161,7 @@ def p_box(
         return f"{low:.4g} and {high:.4g}"
 
     findings += answers_by_family(samples[0], "the 1% and 99% quantiles are", tails)
-    data: dict[str, Any] = {
+    data = {
         "lower": (["band", "y"], lowest),
         "upper": (["band", "y"], highest),
         "mean": ("y", np.min(means, axis=0)),

@@ -220,7 +220,7 @@ def plan(
         specimens.append(
             [forecast.needed(information, element, (max_sd or {}).get(element)) for element in now]
         )
-    variables: dict[str, Any] = {
+    variables = {
         "sd": (["candidate", "k", "name"], sd),
         "now": ("name", list(now.values())),
     }

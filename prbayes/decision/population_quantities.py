@@ -74,7 +74,7 @@ class PopulationReader:
             requested = [requested]
         if not requested:
             raise TypeError(f"{caller}: inputs: got {called(requested)}, expected one at least")
-        elements: list[Element] = []
+        elements = []
         for x in requested:
             if isinstance(x, xr.DataArray):
                 elements += self._predicted(x)
@@ -131,7 +131,7 @@ class PopulationReader:
         outputs = sample.responses.outputs or SINGLE_OUTPUT
         labels = outputs.names or tuple(map(str, range(sample.outputs.shape[-1] if several else 1)))
         response = condition.response
-        moments: list[Quantity] = [Mean(response), StandardDeviation(response)]
+        moments = [Mean(response), StandardDeviation(response)]
         by_level = [Quantile(response, probability=p) for p in self.levels.values()]
         elements = []
         for column, label in enumerate(labels):

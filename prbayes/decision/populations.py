@@ -39,7 +39,6 @@ from prbayes.inference.asymptotics import oriented
 from prbayes.model.emulated import (
     EmulatedSample,
     EmulatedSimulator,
-    PopulationSimulator,
     emulator_error,
     replaced_inputs,
 )
@@ -168,7 +167,7 @@ class Populations:
         """
         responses = self.responses(response, inputs)
         population = responses.inputs
-        simulator: PopulationSimulator | None = serving(self.evaluator.simulators, responses)
+        simulator = serving(self.evaluator.simulators, responses)
         replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
         if simulator is None:
             simulator, replaced = replaced_inputs(self.evaluator.emulated, responses)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class Emulator:
 
         With ``columns``, (k, c), they are those of the outputs listed in the row of each point.
         """
-        place: Any = slice(None) if columns is None else columns
+        place = slice(None) if columns is None else columns
         if columns is not None and self.components is None:
             values = np.empty(columns.shape)
             jacobian = np.empty((*columns.shape, z.shape[1]))
@@ -154,7 +153,7 @@ def fit_emulator(
             components = (sizes / np.sqrt(n))[:, None] * directions
     if start is not None and (start.components is None) != (components is None):
         start = None
-    surfaces: list[FittedSurface] = []
+    surfaces = []
     left_out, rest = np.zeros_like(y), scaled
     for k, output in enumerate(scores):
         earlier = start.surfaces[k] if start is not None and k < len(start.surfaces) else None

@@ -181,9 +181,9 @@ def read_ranges(
         )
     if isinstance(inputs, Mapping) and not all(isinstance(key, str) for key in inputs):
         raise TypeError(f"{name}: inputs: got {list(inputs)} as names, expected texts")
-    entries: dict[Any, Any] = dict(inputs if isinstance(inputs, Mapping) else enumerate(inputs, 1))
+    entries = dict(inputs if isinstance(inputs, Mapping) else enumerate(inputs, 1))
     random = {key: x for key, x in entries.items() if isinstance(x, Variable)}
-    draws: dict[Any, Floats] = {}
+    draws = {}
     if random:
         samples = predictive_inputs(name, list(random.values()), random_seed)
         draws = dict(zip(random, samples, strict=True))

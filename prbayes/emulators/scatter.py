@@ -93,7 +93,7 @@ class Scatter:
             first = rows[0]
             columns = np.flatnonzero(~np.isnan(values[first]))
             measured = values[np.ix_(rows, columns)]
-            at: Indices | slice = slice(None) if is_common else rows
+            at = slice(None) if is_common else rows
             result[rows] = self._of_kind(
                 mean[at][..., columns],
                 sd[at][..., columns],

@@ -496,7 +496,7 @@ class BatchObjective:
     def _values(self, thetas: Floats, rows: Any) -> Floats:
         """Return the objectives of the data sets in ``rows``, each at its own thetas."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
-        total: Any = 0.0
+        total = 0.0
         for i, k in enumerate(self.simulators):
             _, weights = self.evaluator.populations(stacked, k)
             weights = weights.reshape(*thetas.shape[:-1], -1)

@@ -366,8 +366,8 @@ def one_set(evaluator: Evaluator, sets: DataSets, i: int) -> tuple[NamedArrays, 
 
     Specimens of equal weights are repeated if a value occurs several times.
     """
-    data: NamedArrays = {}
-    data_weights: NamedArrays = {}
+    data = {}
+    data_weights = {}
     for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
         unit = node.target.weights
         rows = np.flatnonzero(weights[i])

@@ -327,7 +327,7 @@ class PartSum:
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the components times their shares, shape (..., K)."""
         size = len(features) // len(self.parts)
-        total: Any = 0.0
+        total = 0.0
         for k, part in enumerate(self.parts):
             value = part.target.outer(*features[k * size : (k + 1) * size], xp=xp)
             total = total + shares[..., k] * value

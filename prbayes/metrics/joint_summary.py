@@ -207,8 +207,8 @@ class JointSummaryDiscrepancy(Discrepancy):
         """Return minus the log-likelihood over n."""
         (sums,) = features
         sizes, counts = self._sizes
-        log_l: Any = 0.0
-        scores: list[Any] = []
+        log_l = 0.0
+        scores = []
         start = 0
         for member, size in zip(self.members, sizes, strict=True):
             of_member = sums[..., start : start + size]

@@ -112,7 +112,7 @@ class LogLikelihood(Metric):
 
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
-        limits: Any = self.censored
+        limits = self.censored
         parts = [self.error, self.bias, self.rounded]
         parts += limits if isinstance(limits, tuple | list) else ()
         labelled = tuple(x for x in parts if hasattr(x, "iloc") or hasattr(x, "indexes"))

@@ -325,8 +325,8 @@ class Joint(Metric):
     ) -> Discrepancy:
         """Return the mean discrepancy over projections, for each set of measured outputs."""
         caps = failure_caps(observed)
-        parts: list[Part] = []
-        components: list[Components] = []
+        parts = []
+        components = []
         for outputs, share in patterns(observed, weights):
             sample = observed[:, outputs]
             (center, axes), principal = self._white(

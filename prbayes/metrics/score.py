@@ -197,7 +197,7 @@ def tabulated_scores(
         tables.append((part, CubicSpline(nodes, scores), failed[0]))
 
     def function(responses: Floats) -> Floats:
-        scores: Any = 0.0
+        scores = 0.0
         for part, spline, failed in tables:
             values = np.asarray(part.of(responses))
             first, last = spline.x[[0, -1]]

@@ -434,9 +434,9 @@ def data_findings(
     labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
     largest_step = options.step_at_turning_point if several_roots else options.step
     counted = _counted_once(y, rows)
-    findings: list[Finding] = []
+    findings = []
     # Label, step, and step in standard deviations.
-    rounded_outputs: list[tuple[str, float, float]] = []
+    rounded_outputs = []
     steps = np.zeros(m)
     exact = y.copy()  # NaN at a censoring limit, where specimens may be equal without being copies
     for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):

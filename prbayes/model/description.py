@@ -253,7 +253,7 @@ def arviz_attributes() -> dict[str, str]:
 def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
     """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
     model = evaluator.model
-    coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
+    coords = {name: np.arange(size) for name, size in leading.items()}
     variables = {}
     for name, value in values.items():
         array = np.asarray(value)

@@ -389,7 +389,7 @@ def _replaced(
         names = aleatory_names(inputs, responses.function)
         pairs = zip(names, inputs.aleatory, strict=True)
         return {by_name[name]: x for name, x in pairs if name in by_name}
-    replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+    replaced = {}
     for x, y in zip(model_inputs.sources, inputs.sources, strict=True):
         if isinstance(x, Variable) and isinstance(y, Variable):
             replaced[x] = y
@@ -406,7 +406,7 @@ def emulated_simulators(model: pm.Model) -> list[EmulatedSimulator]:
     result = []
     likelihoods = specimen_likelihoods(model)
     for rv, measurement in measurements_of(model).items():
-        places: list[int | None] = [None]
+        places = [None]
         if measurement.groups is not None:
             places = np.unique(measurement.groups).tolist()
         result += [EmulatedSimulator(likelihoods[rv], measurement, place) for place in places]

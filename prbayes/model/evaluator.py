@@ -485,8 +485,8 @@ def is_current(evaluator: Evaluator) -> bool:
     """Return whether the model still has the evaluator's data; `pymc.set_data` changes them."""
     model = evaluator.model
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
-    now: list[object] = [*nodes(model).values(), *likelihoods]
-    previous: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
+    now = [*nodes(model).values(), *likelihoods]
+    previous = [*evaluator.nodes, *evaluator.likelihoods]
     return now == previous
 
 

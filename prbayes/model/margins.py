@@ -80,7 +80,7 @@ def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> lis
             f"inputs: got {called(inputs)}, expected a list of names or .dist() objects, such as "
             f"{names[:2]}"
         )
-    selected: list[Margin] = []
+    selected = []
     for x in inputs:
         if isinstance(x, str):
             matches = [m for m in available if x in (m.name, variable_of(m.name))]

@@ -144,7 +144,7 @@ def selection_of(measurements: Sequence[Measurement]) -> Selection | None:
     """Return the limits within which specimens were measured; None without limits."""
     if all(m.metric.selected is None for m in measurements):
         return None
-    parts: list[list[Floats]] = []
+    parts = []
     for m in measurements:
         ends = m.metric.selected or (None, None)
         defaults = zip(ends, (-np.inf, np.inf), strict=True)
@@ -489,7 +489,7 @@ def own_columns(likelihood: SpecimenLikelihood) -> Indices | None:
 
 def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:
     """Return the group, and the specimens, of each combination of group and covariates."""
-    contexts: list[tuple[int | None, Indices]] = []
+    contexts = []
     for group, rows in likelihood.by_group:
         covariates = likelihood.stacked.covariates[:, rows]
         _, number = np.unique(covariates, axis=1, return_inverse=True)

@@ -66,8 +66,8 @@ class Hyperparameters:
         shapes = value_shapes(self)
         values = [np.ravel(self.point[name]) for name in shapes]
         initial = np.concatenate([np.empty(0), *values])
-        names: list[str] = []
-        readable_names: list[str] = []
+        names = []
+        readable_names = []
         for v in self.model.value_vars:
             variable = str(self.model.values_to_rvs[v].name)
             labels = coordinates(self.model, variable)
@@ -134,7 +134,7 @@ class Hyperparameters:
         with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
         terms = [values_of(term) for term in terms]
-        jacobian: Any = np.float64(0.0)
+        jacobian = np.float64(0.0)
         for rv in model.free_RVs:
             transform = model.rvs_to_transforms[rv]
             if transform is not None:
@@ -378,7 +378,7 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
     """
     if len(labels) != len(shape):
         labels = [None] * len(shape)
-    axes: list[Sequence[object]] = []
+    axes = []
     for size, coordinate in zip(shape, labels, strict=True):
         texts = [] if coordinate is None else list(map(str, np.asarray(coordinate).tolist()))
         axes.append(texts if len(set(texts)) == len(texts) == size else range(size))

@@ -288,7 +288,7 @@ class _Arguments:
 
     def responses(self, name: str, inputs: Inputs, scatter: float | None) -> Responses:
         """Return the response of inputs, and how the propagation calls it."""
-        calls: dict[str, Any] = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
+        calls = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
         calls |= {"outputs": self.data.outputs, "caller": self.name, "scatter": scatter}
         calls["times"] = self.times
         return Responses(name, self.response, inputs, **calls)
@@ -545,7 +545,7 @@ def _measurement_variables(
 
     Simulators with the same specimens use the same share of gross errors.
     """
-    extras: dict[str, TensorVariable] = {}
+    extras = {}
     for role, value in (metric.roles | {"gross_errors": metric.gross_errors}).items():
         if role == "gross_errors" and value is True:
             value = partners[0].measurements[0].extras.get(role) if partners else None

@@ -632,7 +632,7 @@ def _log_density_of_vector(
         v: p if is_known(v) else p[(0,) * (p.ndim - v.type.ndim)]
         for v, p in zip(variables, params, strict=False)
     }
-    measurements: Sequence[Measurement] = op.measurements
+    measurements = op.measurements
     data = []
     for param, m in zip(params[len(variables) :], measurements[:-1], strict=True):
         first = param[(0,) * (param.ndim - m.observed.ndim)]

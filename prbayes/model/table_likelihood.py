@@ -8,7 +8,6 @@ cross-validated error at the runs nearest to the roots of the specimens.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
@@ -206,7 +205,7 @@ def _table(measurement: Measurement) -> Runs:
 def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
     """Return the name of each aleatory number in the table."""
     m = likelihood.measurements[0]
-    names: list[str] = []
+    names = []
     table = _table(m)
     for a in range(len(m.inputs.aleatory)):
         r = table.surrogate.domain.inputs[m.responses.inputs.arguments.index(a)]
@@ -216,5 +215,5 @@ def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 def _as_inputs(coordinates: Coordinates, z: Floats) -> Floats:
     """Return the inputs at coordinates z, as columns (k, d)."""
-    parts: Sequence[Floats] = coordinates.inputs(z)
+    parts = coordinates.inputs(z)
     return np.concatenate([x.reshape(len(z), -1) for x in parts], axis=1)

@@ -107,7 +107,7 @@ class StudentMixture:
         # Begin with centers that are far from each other (k-means++).
         standard = np.linalg.solve(root, deviations.T)
         squares = (standard**2).sum(axis=0)
-        first: list[int] = []
+        first = []
         for _ in range(m):
             chances = weights * squares
             first.append(int(rng.choice(len(points), p=chances / chances.sum())))

@@ -482,7 +482,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     n_starts = settings.starts
     if n_starts is None:
         n_starts = _starts_by_cost(problem.search, fit)
-    optima: list[LocalOptimum] = []
+    optima = []
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
             return fit, []
@@ -648,7 +648,7 @@ def optimum_findings(
     design_error: float,
 ) -> Findings:
     """Report few specimens, the design's error, other optima, and identification."""
-    findings: list[Finding] = []
+    findings = []
     for node in evaluator.nodes:
         findings += few_for_whitening(node.name, node.target)
     findings += design_error_findings(evaluator, design_error)

@@ -224,7 +224,7 @@ def refuse_labels(
     if not labels:
         return
     names = list(dict.fromkeys(shown))
-    inputs: set[str] = set()
+    inputs = set()
     allowed = {*names, *map(variable_of, names), *STATISTIC_LABELS, *METRIC_LABELS}
     if evaluator is not None:
         allowed |= set(map(str, evaluator.model.named_vars))

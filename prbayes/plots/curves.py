@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from importlib import import_module
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -71,7 +70,7 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
     """Return ArviZ's kernel density of draws, (n,), on a grid; NaN if all draws are equal."""
     if not np.ptp(draws) > 0:
         return np.full(grid.shape, np.nan)
-    stats: Any = import_module("arviz_stats")  # heavy, and only needed for pictures
+    stats = import_module("arviz_stats")  # heavy, and only needed for pictures
     x, density, _ = stats.base.array_stats.kde(draws)
     return np.asarray(np.interp(grid, x, density, left=0.0, right=0.0))
 

@@ -126,7 +126,7 @@ def plot_population(
 def _coordinates(evaluator: Evaluator, margin: Margin) -> dict[str, Any]:
     """Return the coordinates of a margin: its group, and its index in a multivariate input."""
     variable = variable_of(margin.name)
-    places: dict[str, Any] = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
+    places = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
     groups = evaluator.simulators[margin.node].inputs.groups
     if groups is not None and margin.group:
         places[groups.dim] = groups.labels[groups.names.index(margin.group)]
@@ -184,7 +184,7 @@ def margin_densities(
         ranges[margin.axis] = min(low, first), max(high, last)
 
     # Specimens of all populations, by simulator. They are drawn for kernel densities alone.
-    many: dict[int, Any] = {}
+    many = {}
     densities = {}
     for margin in shown:
         k = margin.node
@@ -223,7 +223,7 @@ def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) 
         return None
     symbols = inputs.placeholders()
     dists, *_ = inputs.rebuilt(symbols)
-    dist: Any = dists[margin.position]
+    dist = dists[margin.position]
     x = pt.lvector("x") if margin.discrete else pt.dvector("x")
     if isinstance(dist.owner.op, MVNORMAL):
         mean, covariance = dist.owner.op.dist_params(dist.owner)

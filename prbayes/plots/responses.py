@@ -409,7 +409,7 @@ def panels_of(
     alone = len(nodes) == 1
     by_node = {node.name: displayed_outputs(node, alone=alone) for node in nodes}
     available = {x.name: x for outputs in by_node.values() for x in outputs}
-    shown: dict[str, Output] = {}
+    shown = {}
     names = select(output_elements(available.values()), var_names, filter_vars, coords)
     for name in names:
         output = available[name]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -216,7 +215,7 @@ def _by_coverage(information: Information) -> float | None:
     # the posteriors of all data sets.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
-    distances: Any = 0  # (n_sets, M): discrepancies of the data sets at the thetas
+    distances = 0  # (n_sets, M): discrepancies of the data sets at the thetas
     for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]

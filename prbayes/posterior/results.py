@@ -252,7 +252,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
     thetas = chains.thetas[:, thinned]
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)
-    coords: dict[str, Any] = {"chain": np.arange(n_chains), "draw": thinned}
+    coords = {"chain": np.arange(n_chains), "draw": thinned}
     variables = {}
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name

@@ -557,10 +557,10 @@ def _chains_on_designs(
     """Return chains that the designs support, after refinements, or raise."""
     starts = None if settings.start is None else _starts(evaluator, settings)
     checkpoint = None
-    entropy: int | None = settings.random_seed
+    entropy = settings.random_seed
     if settings.checkpoint is not None:
         names = ("draws", "chains", "threshold", "adjustment", "refine")
-        stored: dict[str, Any] = {name: getattr(settings, name) for name in names}
+        stored = {name: getattr(settings, name) for name in names}
         stored["entropy"] = None if entropy is None else str(entropy)
         if starts is not None:
             content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
@@ -569,7 +569,7 @@ def _chains_on_designs(
         # A run without a seed has the seed of the run that it continues.
         entropy = int(checkpoint.settings["entropy"])
     seeds = np.random.SeedSequence(entropy)
-    refinements: list[Floats] = []
+    refinements = []
     for round_ in range(MAX_ROUNDS + 1):
         children = seeds.spawn(settings.chains)
         if checkpoint is not None and round_ < checkpoint.note.get("round", 0):

@@ -164,7 +164,7 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    blocks: list[LogDensity] = []
+    blocks = []
     if isinstance(likelihood, RefitLikelihood) and likelihood.counts:
         blocks = [likelihood.without_block(block, 8).log_likelihood for block in range(8)]
     return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale, blocks)

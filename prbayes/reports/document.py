@@ -265,7 +265,7 @@ class Report:
             If a file cannot be written.
         """
         folder = folder_path(folder, "folder")
-        files: list[str | None] = []
+        files = []
         for i, section in enumerate(self.sections, 1):
             slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:40] or "picture"
             has_picture = section.picture is not None

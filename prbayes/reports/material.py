@@ -232,7 +232,7 @@ def gather(
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
-    diagnoses: dict[str, Diagnosis | None] = {}
+    diagnoses = {}
     for label, result in (results | live_optima).items():
         can_diagnose, own_model = _model_of_diagnosis(result, model)
         diagnoses[label] = diagnose(result, model=own_model) if can_diagnose else None
@@ -357,7 +357,7 @@ def _require_tested(
     validation: Mapping[str, Validation], tests: Mapping[str, ValidityTest]
 ) -> None:
     """Raise if there are tests, and validation data are not those of a test."""
-    tested: list[Floats] = []
+    tested = []
     for test in tests.values():
         tested.append(test.u_values)
         tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]

@@ -68,7 +68,7 @@ from prbayes.validation.pit import DIRECTION, u_values
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
     """Return the sections for which there are results, with or without pictures."""
     drawn = pictures_of(m) if pictures else {}
-    sections: list[Section] = []
+    sections = []
     for title, parts in _CHAPTERS.items():
         chapter: list[Section] = []
         for part in parts:
@@ -406,7 +406,7 @@ def comparison(m: Material) -> list[Section]:
 
 def support(m: Material) -> list[Section]:
     """Return the support of the results by stored responses, and the statistics of samplers."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     for label, diagnosis in m.diagnoses.items():
         table = None if diagnosis is None else diagnosis.support
         if table is None or "weight_ess" not in table:

@@ -80,7 +80,7 @@ class BySpecimen:
     @property
     def __signature__(self) -> inspect.Signature:
         """The signature of the first function, without its record."""
-        function: Any = unwrapped(self.functions[0])
+        function = unwrapped(self.functions[0])
         if not isinstance(function, _Recorded):
             return inspect.signature(function)
         signature = inspect.signature(function.function)
@@ -89,7 +89,7 @@ class BySpecimen:
     @property
     def __name__(self) -> str:
         """The name of the first function."""
-        inner: Any = unwrapped(self.functions[0])
+        inner = unwrapped(self.functions[0])
         inner = getattr(inner, "function", inner)
         return str(getattr(inner, "__name__", type(inner).__name__))
 
@@ -189,7 +189,7 @@ class _Recorded:
 
 def of_specimens(function: Any) -> BySpecimen | None:
     """Return the functions by specimen of a response, which may be in `scalar`; None without."""
-    inner: Any = unwrapped(function)
+    inner = unwrapped(function)
     return inner if isinstance(inner, BySpecimen) else None
 
 

@@ -81,7 +81,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         A function that returns a mapping or labels gives a mapping of arrays.
         """
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
-        outputs: Outputs | None = None
+        outputs = None
         values = []
         for specimen in zip(*(array.ravel() for array in arrays), strict=True):
             try:
@@ -508,7 +508,7 @@ def _respond(
     event = () if settings.outputs is None else settings.outputs.event
     values = np.full((len(points), *event), np.nan)
     missing = np.arange(len(points))
-    failed: dict[int, str] = {}
+    failed = {}
     raised: dict[int, str] = {}
     if settings.store is not None:
         keys = points.keys()
@@ -559,7 +559,7 @@ def _verify_store(settings: CallSettings, store: Store, points: Points, tally: T
     if settings.retry_failed:  # a stored NaN is computed again in any case
         is_comparable &= ~is_missing(values)
     usable = np.flatnonzero(is_comparable)
-    reasons: dict[int, str] = {}
+    reasons = {}
 
     def compute(selected: Indices) -> Floats:
         again, raised = computed_again(settings, stored_points.at(usable[selected]), tally)

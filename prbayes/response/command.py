@@ -156,7 +156,7 @@ def _read_templates(write: object) -> dict[str, str]:
         raise TypeError(
             f"command: write: got {called(write)}, expected templates by the name of their file"
         )
-    texts: dict[str, str] = {}
+    texts = {}
     for name, template in write.items():
         path = Path(name) if isinstance(name, str) else Path()
         if not path.parts or path.is_absolute() or ".." in path.parts:

@@ -169,7 +169,7 @@ def fmu(
 
 def _names(argument: str, value: object) -> dict[str, str]:
     """Return variables of the unit by the user's names, which in a list are the same."""
-    pairs: list[tuple[Any, Any]] = []
+    pairs = []
     expected = 'a list of the unit\'s variables, each once, such as ["stiffness", "damping"]'
     if isinstance(value, Mapping) and argument == "outputs":
         pairs = list(value.items())

@@ -190,7 +190,7 @@ def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
             return None
         dim = str(result.dims[axis]) if hasattr(result, "dims") else "output"
         return Outputs(labels, dim, _keys_of(labels))
-    keys: list[tuple[str, int | None]] = []
+    keys = []
     for key, column in result.items():
         array = np.asarray(column)
         keys.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
@@ -312,7 +312,7 @@ def refuse_other_order(values: Any, observed: Any, name: str) -> None:
     """Raise a ValueError if a labelled array has specimens or outputs in another order."""
     is_table = np.ndim(values) > 1
     labels = labels_along(values, 1 if is_table else 0)
-    outputs: tuple[Any, ...] = ()
+    outputs = ()
     if isinstance(observed, Mapping) or hasattr(observed, "columns"):
         outputs = tuple(observed)
     elif np.ndim(observed) > 1 and hasattr(observed, "coords"):

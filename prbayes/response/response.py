@@ -76,7 +76,7 @@ def refuse_misfit(
     name: str, function: Any, sizes: Sequence[int], outputs: Outputs | None = None
 ) -> None:
     """Raise if a function takes other arguments than inputs of these sizes, or other outputs."""
-    inner: Any = unwrapped(function)
+    inner = unwrapped(function)
     try:
         # The signature of a decorated function is that of its wrapper, which is what is called.
         signature = inspect.signature(inner, follow_wrapped=False)

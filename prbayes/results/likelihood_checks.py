@@ -344,7 +344,7 @@ def influence(result: xr.DataTree) -> Findings:
     """Report specimens on which the posterior depends, by Pareto k of leave-one-out."""
     if "log_likelihood" not in result.children:
         return ()
-    stats: Any = import_module("arviz_stats")
+    stats = import_module("arviz_stats")
     findings = []
     for name, values in result["log_likelihood"].to_dataset().data_vars.items():
         if values.ndim != 3 or values.shape[-1] < 2:

@@ -36,7 +36,6 @@ from prbayes.emulators.runs import Runs
 from prbayes.model.conditions import at_conditions, stacked_values
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
-    EmulatedResponse,
     PopulationSimulator,
     emulator_of,
     population_simulators,
@@ -529,8 +528,8 @@ def _predicted(
     Specimens of a data set have known conditions, (n, C).
     """
     inputs = responses.inputs
-    results: list[_Predicted] = []
-    emulated: EmulatedResponse | None = None
+    results = []
+    emulated = None
     for group_points in points_by_group(inputs, points):
         if isinstance(simulator, Node):
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
@@ -798,7 +797,7 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
 
     The data are those of the result if it has them, and else those of the model.
     """
-    stored: Any = {}
+    stored = {}
     if isinstance(result, xr.DataTree) and "observed_data" in result:
         stored = one_posterior(result, "prb.predict")["observed_data"]
     is_optimum = isinstance(result, Optimum)

@@ -102,7 +102,7 @@ def residuals(
     result, model, likelihoods = individuals_of(result, model, "prb.residuals")
     points, _ = populations_of(result, model, n_draws, "prb.residuals", copies=n_draws)
     rng = np.random.default_rng(None if random_seed is None else seed_number(random_seed))
-    datasets: dict[str, xr.Dataset] = {}
+    datasets = {}
     for likelihood in likelihoods:
         linear = _Linearisation.of(likelihood, points, rng)
         parts = [
@@ -219,7 +219,7 @@ class _Linearisation:
             width = 2 * steps[:, j : j + 1]
             columns.append((above - below) / width)
         labels = aleatory_names(likelihood.inputs, likelihood.measurements[0].responses.function)
-        names: list[str] = []
+        names = []
         for k in unknown:
             indices = list(np.ndindex(*shapes[k]))
             names += [

@@ -77,7 +77,7 @@ def judge_by_replicates(
 
     .. math:: p = (1 + \#\{A_r \ge A\}) / (1 + r)
     """
-    enveloped: Floats | None = None
+    enveloped = None
     blocks = []
     with progress("replicates") as report:
         for u in replicates:
@@ -397,7 +397,7 @@ class JointNull(Null):
         )
         require_refits(self.optimum, "JointNull", advice)
         if self.responses is not None:
-            tested: list[Any] = [self.responses]
+            tested = [self.responses]
             if isinstance(self.responses, Mapping):
                 tested = list(self.responses.values())
             if not tested or not all(isinstance(t, tuple) and t and callable(t[0]) for t in tested):
@@ -570,7 +570,7 @@ def _numbers_in_calibration(
     node_numbers, total = number_specimens(nodes)
     # Points of simulators that share specimens are drawn together, as a group.
     group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}
-    number_and_group: dict[str, tuple[int, int]] = {}
+    number_and_group = {}
     for k, node in enumerate(nodes):
         if node.specimens is not None:
             for label, number in zip(specimen_names(node.specimens), node_numbers[k], strict=True):

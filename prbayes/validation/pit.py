@@ -169,13 +169,13 @@ def read_case(
     flag(folded, "folded")
     flag(randomize, "randomize")
     numbers: dict[object, int] = {}
-    conditions: list[TestedCondition] = []
+    conditions = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
         has_own_conditions = _SPECIMEN in getattr(simulated, "dims", ())
         if has_own_conditions:
             simulated = simulated.rename({_SPECIMEN: "sample"})
         y = _measured(name, measured, simulated)
-        names: tuple[str, ...] | None = None
+        names = None
         if labels is not None:
             labels = in_order_of(labels, measured, f"{name}: specimens")
             names = tuple(specimen_names(sample_labels(labels, len(y), f"{name}: specimens")))
@@ -446,7 +446,7 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     At most eight outputs are returned, since these fill three rows of panels. Raises TypeError or
     ValueError if conditions or outputs differ.
     """
-    pairs: list[Comparable] = []
+    pairs = []
     for name, y, prediction, _ in _by_condition(observed, predicted, None):
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
