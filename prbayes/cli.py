@@ -12,6 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from prbayes._validate import Record
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -134,13 +136,13 @@ def _refuse_to_replace(options: argparse.Namespace, html: Path | None) -> None:
         )
 
 
-def _results(files: Sequence[Path]) -> dict[str, Any]:
+def _results(files: Sequence[Path]) -> Record:
     """Return the contents of files as keywords of a report."""
     from prbayes.reports.material import kind_of_decision
 
     paths = list(dict.fromkeys(files))
     stems = [path.stem for path in paths]
-    results: dict[str, dict[str, Any]] = {}
+    results: dict[str, Record] = {}
     for path in paths:
         tree = _opened(path)
         dataset = tree.to_dataset()

@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import Floats, Function, StrPath, positive_integer, share
+from prbayes._validate import ArrayPair, Floats, Function, StrPath, positive_integer, share
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
@@ -210,7 +210,7 @@ def _place(function: Floats, y: Floats, probability: float) -> float:
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 
-def outermost(lower: Sequence[Floats], upper: Sequence[Floats]) -> tuple[Floats, Floats]:
+def outermost(lower: Sequence[Floats], upper: Sequence[Floats]) -> ArrayPair:
     """Return the outermost of bands, (band, y): a bound of a distribution function holds beyond."""
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     flipped = np.minimum.accumulate(np.flip(upper, -1), axis=-1)

@@ -26,6 +26,8 @@ from prbayes._validate import (
     Floats,
     Function,
     Indices,
+    NamedValues,
+    Record,
     StrPath,
     positive_integer,
     share,
@@ -90,7 +92,7 @@ class Populations:
     caller: str  # name of the caller, for messages
     are_draws: bool  # whether thetas are random draws, and not Sobol points
     # settings of responses that are not the model's own: executor, store and version
-    calling: Mapping[str, Any] = field(default_factory=dict)
+    calling: NamedValues = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -113,7 +115,7 @@ class Populations:
         center = np.median(thetas, axis=0)
         return cls(result, evaluator, thetas, center, caller, True, calling)
 
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> Record:
         """Return the attributes of a table: the problem's fingerprint, and versions."""
         return provenance(self.result, self.evaluator.model)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import ArrayPair, Bools, Floats, Indices
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
@@ -41,7 +41,7 @@ class Emulator:
     components: Floats | None
     surfaces: tuple[FittedSurface, ...]  # surface of each output, or of each principal component
 
-    def __call__(self, z: Floats, columns: Indices | None = None) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats, columns: Indices | None = None) -> ArrayPair:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
 
         With ``columns``, (k, c), they are those of the outputs listed in the row of each point.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import FORMAT, Floats, StrPath, require_format
+from prbayes._validate import FORMAT, Floats, Record, StrPath, require_format
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.ranges import Range, Ranges
@@ -27,7 +27,7 @@ _SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
 class SavedSurrogate:
     """The contents of a file."""
 
-    fields: dict[str, Any]  # fields of the `Surrogate`
+    fields: Record  # fields of the `Surrogate`
     outputs: Outputs | None  # names of the outputs, if they have names
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
@@ -110,7 +110,7 @@ def read_surrogate(path: StrPath) -> SavedSurrogate:
         ) from error
 
 
-def _ranges(inputs: list[dict[str, Any]], low: Floats, high: Floats) -> Ranges:
+def _ranges(inputs: list[Record], low: Floats, high: Floats) -> Ranges:
     """Return ranges from their lower and upper ends in columns."""
     ranges = []
     start = 0

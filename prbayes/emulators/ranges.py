@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pytensor.graph.basic import Variable
 
-from prbayes._validate import Bools, Floats, Shape, real_array
+from prbayes._validate import Bools, Floats, Names, Shape, real_array
 from prbayes.numerics.points import sobol
 from prbayes.response.call import column_names
 from prbayes.response.compile import compile_batched
@@ -76,7 +76,7 @@ class Ranges:
         return tuple(r.name for r in self.inputs)
 
     @property
-    def column_names(self) -> tuple[str, ...]:
+    def column_names(self) -> Names:
         """Name of each column."""
         return column_names(self.names, self.sizes)
 

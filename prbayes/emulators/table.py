@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._finding import counted
-from prbayes._validate import Floats, NamedArrays, StrPath, file_path, plain_text, real_array
+from prbayes._validate import Floats, NamedArrays, Names, StrPath, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
@@ -40,7 +40,7 @@ class RunTable(RunRecord):
 
     # Names of the outputs: "response" for a single unnamed output, "response[0]" for the first of
     # several.
-    outputs: tuple[str, ...]
+    outputs: Names
 
     @property
     def labels(self) -> Outputs | None:

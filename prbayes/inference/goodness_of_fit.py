@@ -15,7 +15,7 @@ from scipy.special import bdtrc
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function, positive_scale
-from prbayes._validate import Bools, Floats
+from prbayes._validate import ArrayPair, Bools, Floats
 from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
@@ -317,7 +317,7 @@ class _Outputs:
         observed = self.values[is_measured, j], self.weights[:, is_measured]
         return _fit_distances(self.simulated[:, j], self.masses, *observed)
 
-    def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
+    def correlations(self, i: int, j: int) -> ArrayPair:
         """Return the correlations of two outputs in data sets and in populations, (S,) each."""
         pair = [i, j]
         is_measured = ~np.isnan(self.values[:, pair]).any(axis=1)

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._validate import AT_ONCE, Bools, Floats, Indices, called
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices, Names, called
 from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Metric, Minimum
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import (
@@ -91,7 +91,7 @@ class JointSummaryLikelihood(Metric):
         correlation of outputs that are functions of each other: sheets have two or three digits.
     """
 
-    names: tuple[str, ...]
+    names: Names
     sheets: tuple[Summary, ...]
     rounding: float = 1e-3
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC

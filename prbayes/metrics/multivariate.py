@@ -14,6 +14,7 @@ from prbayes._validate import (
     Bools,
     Floats,
     Indices,
+    Names,
     called,
     positive_integer,
     real_array,
@@ -51,7 +52,7 @@ class CompositeDiscrepancy(Discrepancy):
     shares: Floats
     # Principal components of each set of outputs that is compared by them.
     components: tuple[Components, ...] = ()
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
+    _by_data_set: ClassVar[Names] = ("weights", "shares")
 
     @property
     def parts(self) -> tuple[Part, ...]:

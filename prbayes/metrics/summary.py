@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
-from prbayes._validate import Floats, called, number, positive_integer, positive_number
+from prbayes._validate import (
+    ArrayPair,
+    Floats,
+    Record,
+    called,
+    number,
+    positive_integer,
+    positive_number,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +73,7 @@ class Summary:
     quantiles: Mapping[float, float] | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {"n": positive_integer(self.n, "Summary: n", minimum=2)}
+        checked: Record = {"n": positive_integer(self.n, "Summary: n", minimum=2)}
         for name in ("mean", "sd", "minimum", "maximum"):
             value = getattr(self, name)
             if value is not None:
@@ -180,7 +187,7 @@ class Summary:
                 "quantiles out"
             )
 
-    def _limits(self) -> tuple[Floats, Floats]:
+    def _limits(self) -> ArrayPair:
         """Return the smallest and the largest value of each specimen, sorted, both (n,).
 
         A quantile between two specimens has a rank that depends on its definition: n p + p or

@@ -19,7 +19,7 @@ from scipy.special import bdtrc
 
 from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import ArrayPair, Bools, Floats, Indices
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import (
     Readings,
@@ -613,7 +613,7 @@ def refuse_unused_inputs(name: str, z: Floats, outputs: Floats, inputs: Mapping[
         raise _undetermined(name, m, directions, list(inputs.values()))
 
 
-def _singular_vectors(jacobian: Floats) -> tuple[Floats, Floats]:
+def _singular_vectors(jacobian: Floats) -> ArrayPair:
     """Return singular values (k, d) and right singular vectors (k, d, d) of finite Jacobians."""
     finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     if finite.shape[1] < finite.shape[2]:

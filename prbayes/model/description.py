@@ -18,7 +18,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes._validate import FORMAT
+from prbayes._validate import FORMAT, NamedValues, Record
 from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
@@ -90,7 +90,7 @@ def _simulator(
     propagation: str,
     n_points: int,
     runs: str,
-) -> dict[str, Any]:
+) -> Record:
     """Return the description of a simulator."""
     # [name, unit, distribution or value] of each input; an unnamed input is a text alone.
     inputs = []
@@ -147,14 +147,14 @@ def as_attribute(model: pm.Model) -> dict[str, str]:
     return json_attribute("model", describe(model))
 
 
-def json_attribute(name: str, content: Mapping[str, Any]) -> dict[str, str]:
+def json_attribute(name: str, content: NamedValues) -> dict[str, str]:
     """Return JSON as an attribute of an HDF5 file; none where it is too long, near 64 KiB."""
     # JSON escapes letters beyond ASCII, so that its length in characters is the length in bytes.
     text = json.dumps(content)
     return {name: text} if len(text) <= 60_000 else {}
 
 
-def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
+def from_attributes(attrs: Mapping[Any, Any]) -> Record | None:
     """Return the description that a file has; None where there is none, or it is damaged."""
     try:
         stored = json.loads(attrs["model"])
@@ -166,7 +166,7 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         return None
 
 
-def _stored_simulator(stored: Mapping[str, Any]) -> dict[str, Any]:
+def _stored_simulator(stored: NamedValues) -> Record:
     texts = {key: str(stored[key]) for key in _SIMULATOR}
     rows = [[str(name), str(unit), str(text)] for name, unit, text in stored["inputs"]]
     return {**texts, "inputs": rows}
@@ -305,7 +305,7 @@ def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
 
 
 def labelled_responses(
-    evaluator: Evaluator, values: dict[str, Any], leading: Sequence[int] = ()
+    evaluator: Evaluator, values: Record, leading: Sequence[int] = ()
 ) -> xr.Dataset:
     """Return responses of simulators by their names, shapes (*leading, N) or (*leading, N, m).
 

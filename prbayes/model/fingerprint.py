@@ -22,7 +22,7 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Shape, require_format
+from prbayes._validate import Floats, Names, Record, Shape, require_format
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
@@ -80,7 +80,7 @@ class SimulatorIdentity:
     points: tuple[tuple[float, ...], ...] = ()
     # Digests of data, weights and labels as a metric of distributions would have them; only for a
     # log-likelihood by specimen.
-    with_metric: tuple[str, ...] = ()
+    with_metric: Names = ()
     # Digests of the response's code and of variables that it reads; empty in older results.
     code: dict[str, str] = field(default_factory=dict)
 
@@ -91,7 +91,7 @@ class Identity:
 
     shapes: dict[str, Shape]  # shapes of value variables by name, such as 'sigma_log__'
     priors: dict[str, str]  # distributions of free variables, as PyMC prints them
-    terms: tuple[str, ...]  # other observed variables, and names of potentials
+    terms: Names  # other observed variables, and names of potentials
     simulators: tuple[SimulatorIdentity, ...]
     # Whether the prior was minimised; None if nothing was minimised.
     prior_minimised: bool | None = None
@@ -107,7 +107,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
 
     That of a model is without densities and discrepancies, which an evaluator compiles.
     """
-    numbers: dict[str, Any] = {}
+    numbers: Record = {}
     if isinstance(problem, Evaluator):
         model, hyperparameters = problem.model, problem.hyperparameters
         shapes = value_shapes(hyperparameters)
@@ -159,7 +159,7 @@ def _simulator_identity(
 ) -> SimulatorIdentity:
     observed, weights, labels = simulator.observed, simulator.weights, simulator.specimens
     of_specimens: tuple[Any, ...] = ()
-    fields: dict[str, Any] = {}
+    fields: Record = {}
     if isinstance(simulator, Node):
         bound = simulator.bound
         batches = 1

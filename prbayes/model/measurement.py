@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, Indices, Shape
+from prbayes._validate import Floats, Indices, NamedValues, Record, Shape
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
@@ -328,16 +328,16 @@ class SpecimenLikelihood:
     shared_emulation: Emulation | None = None  # emulator that was fitted for other data
     options: SpecimenOptions = field(default_factory=SpecimenOptions)
     # Cache of values that are computed at their first use, such as the points of the specimens.
-    cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    cache: Record = field(default_factory=dict, init=False, repr=False)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         """Replace the weak reference by the model, because weak references have no pickle."""
         derived = ("hyperparameters", "reading density", "updated", "products", "populations")
         cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
         return {**vars(self), "model": model, "cache": cache}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Record) -> None:
         """Restore the weak reference."""
         model = state["model"]
         vars(self).update({**state, "model": None if model is None else weakref.ref(model)})
@@ -435,7 +435,7 @@ class SpecimenLikelihood:
         vars(result).update(density=self.density, coordinates=self.coordinates)
         return result
 
-    def observing(self, data: Mapping[str, Any], model: Any = None) -> SpecimenLikelihood:
+    def observing(self, data: NamedValues, model: Any = None) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.
 
         ``model`` is a copy of the model. The likelihood is the same object if the values are the

@@ -16,7 +16,17 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
+from prbayes._validate import (
+    Floats,
+    Indices,
+    NamedArrays,
+    Names,
+    Record,
+    Shape,
+    called,
+    real_array,
+    sample_labels,
+)
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
 from prbayes.model.random_variable import known_value
@@ -48,7 +58,7 @@ class ObservedData:
     # (N,): observed row of each specimen if the weights are frequencies, else None
     rows: Indices | None
     n_rows: int  # number of observed rows
-    dims: tuple[str, ...] | None  # names of the observed dimensions
+    dims: Names | None  # names of the observed dimensions
     # (N,): labels in the index or the coordinate of the specimens; None if these only count them
     index: list[str] | None = None
 
@@ -162,7 +172,7 @@ def _report_whole_weights(name: str, weights: Any) -> None:
     report(Finding("whole-weights", text))
 
 
-def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> tuple[str, ...]:
+def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> Names:
     """Return names of the observed dimensions; raise if their lengths in the model differ."""
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
@@ -354,7 +364,7 @@ def _refuse_times_beside_functions(name: str, inputs: Sequence[Any]) -> None:
 
 def _labels_by_specimen(
     name: str, observed: Any, places: Indices, used: Sequence[Indices]
-) -> tuple[str, dict[str, Any]]:
+) -> tuple[str, Record]:
     """Return the dimension of the specimens, and coordinates of specimens and readings."""
     index = specimen_index(observed)
     first = observed.dims[0] if hasattr(observed, "dims") else f"{name}_specimen"

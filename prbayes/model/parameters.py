@@ -25,6 +25,8 @@ from prbayes._validate import (
     Floats,
     Indices,
     NamedArrays,
+    NamedValues,
+    Record,
     Shape,
     called,
     real_array,
@@ -53,7 +55,7 @@ class Hyperparameters:
     """The free variables of a model as vectors theta of numbers, and their prior."""
 
     model: pm.Model
-    point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
+    point: Record  # PyMC's initial point: values of the value variables by name
     initial: Floats = field(init=False)  # the initial point as theta, (d,)
     size: int = field(init=False)  # length d of theta
     # Names of the elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'.
@@ -241,7 +243,7 @@ def in_support(hyperparameters: Hyperparameters, thetas: Floats) -> Any:
     return np.isfinite(hyperparameters.log_prior(thetas))
 
 
-def unconstrained(hyperparameters: Hyperparameters, point: Mapping[str, Any]) -> Floats:
+def unconstrained(hyperparameters: Hyperparameters, point: NamedValues) -> Floats:
     """Return theta, shape (d,), of a point given in the user's own units.
 
     Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a

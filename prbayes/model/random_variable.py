@@ -38,7 +38,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, Record, called
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
@@ -395,11 +395,11 @@ class ObservedRV(RandomVariable):
         """Show the name and the signature, without the simulator."""
         return f'prbayes_Simulator_rv{{"{self.signature}"}}'
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         """Replace the weak reference by the record, since weak references have no pickle."""
         return {**self.__dict__, "reference": self.record}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Record) -> None:
         """Restore the weak reference; the application keeps the record alive."""
         self.__dict__.update(state)
         self.reference = weakref.ref(state["reference"])
@@ -419,7 +419,7 @@ class SimulatorRV(ObservedRV):
     owner: weakref.ref[Any] | None = None
     _warned = False
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         """Leave out the owner, because a copy that is unpickled belongs to another model."""
         return {**super().__getstate__(), "owner": None}
 

@@ -21,6 +21,7 @@ from prbayes._validate import (
     Floats,
     Function,
     Labels,
+    Names,
     called,
     flag,
     observed_sample,
@@ -705,7 +706,7 @@ def _add_specification(
     specification: Specification,
     place: int,
     observed: Any,
-    dims: tuple[str, ...] | None,
+    dims: Names | None,
 ) -> TensorVariable:
     """Add an observed variable with a metric of distributions; ``place`` is its group's index."""
     name, target, labels = specification.name, specification.target, specification.specimens

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._stats import reached
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.numerics.points import sobol
 
 
@@ -23,7 +23,7 @@ def effective_sample_size(weights: Floats) -> Floats:
     return 1 / (weights**2).sum(axis=-1)
 
 
-def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
+def pareto_smoothed(log_w: Floats) -> ArrayPair:
     """Return log weights (P, n) so that rows are smooth and sum to one, and tail shapes k, (P,).
 
     The largest weights are replaced by quantiles of a generalised Pareto distribution [1]_, which

@@ -15,7 +15,7 @@ import numpy as np
 from pytensor.gradient import NullTypeGradError
 
 from prbayes._progress import progress
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
@@ -496,9 +496,7 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     return np.asarray(thetas[np.argmin(values)])
 
 
-def overlapping_populations(
-    evaluator: Evaluator, thetas: Floats
-) -> tuple[list[tuple[Floats, Floats]], Floats]:
+def overlapping_populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[ArrayPair], Floats]:
     """Return responses and weights by simulator, and their overlaps with the data, (K, P)."""
     populations = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
     pairs = zip(evaluator.nodes, populations, strict=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
@@ -70,7 +70,7 @@ class Reference:
             values = values + self.ridge(stacked, self.local.prior_sd)
         return values.reshape(thetas.shape[:-1])
 
-    def descend(self, shifts: Floats, curvature: Floats) -> tuple[Floats, Floats]:
+    def descend(self, shifts: Floats, curvature: Floats) -> ArrayPair:
         """Return the minima that descents from shifts, (n, d), reach, and their values.
 
         Shifts and curvature, (d, d), are in units of the prior's spread.
@@ -85,7 +85,7 @@ class Reference:
         )
         return ends, values
 
-    def polish(self, thetas: Floats) -> tuple[Floats, Floats]:
+    def polish(self, thetas: Floats) -> ArrayPair:
         """Return the minima near thetas, (n, d), and values, by the Hessian of the reference."""
         local = self.local
         covariance = local.identified @ local.covariance @ local.identified.T

@@ -19,7 +19,7 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._stats import positive_scale
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices, NamedArrays
+from prbayes._validate import IN_CACHE, ArrayPair, Bools, Floats, Indices, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -799,7 +799,7 @@ class SpecimenRefits:
         root = self._root
         function = self._function(same_specimens=not data)
 
-        def problem(u: Floats, rows: Indices) -> tuple[Floats, Floats]:
+        def problem(u: Floats, rows: Indices) -> ArrayPair:
             arguments = [array[rows] for array in (*weights, *data)]
             with np.errstate(over="ignore", invalid="ignore"):  # far from the data
                 values, gradients = function(self.theta + u @ root.T, *arguments)

@@ -20,6 +20,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
     Function,
+    Names,
     Seed,
     flag,
     positive_integer,
@@ -554,8 +555,8 @@ def _report(
     """
     search = problem.search
     evaluator = search.evaluator
-    at_edge: tuple[str, ...] = ()
-    at_jump: tuple[str, ...] = ()
+    at_edge: Names = ()
+    at_jump: Names = ()
     if fit.sampling is not None and not stopped:
         at_edge = elements_at_edge(
             evaluator,
@@ -615,7 +616,7 @@ def _report(
     )
 
 
-def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
+def _details(search: Search, fit: Fit, at_edge: Names) -> list[str]:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
     sentences = [f"{', '.join(at_edge)} reached the edge of the support."] if at_edge else []

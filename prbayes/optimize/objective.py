@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, NamedValues, Record
 from prbayes.model.evaluator import Evaluator, epsilons, has_other_terms
 
 # function of theta, (d,), that returns value, gradient (d,) or None, and number of evaluations
@@ -157,7 +157,7 @@ class Method:
 
     method: str | Callable[..., Any] = "BFGS"
     # options that replace those of `settings`
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: NamedValues = field(default_factory=dict)
     gradient: bool = field(init=False)  # whether the method uses gradients
 
     def __post_init__(self) -> None:
@@ -205,7 +205,7 @@ class Method:
                     f"scipy says: {warning.message}"
                 )
 
-    def settings(self, tolerance: float, size: int) -> dict[str, Any]:
+    def settings(self, tolerance: float, size: int) -> Record:
         """Return scipy's options for a standardised problem of ``size`` parameters.
 
         The objective limits evaluations, so iterations are unlimited.
@@ -216,7 +216,7 @@ class Method:
         # The first step of methods without gradient is larger than most standard errors, and within
         # the prior.
         step = 0.2
-        defaults: dict[str, dict[str, Any]] = {
+        defaults: dict[str, Record] = {
             "bfgs": {"gtol": tolerance},
             "cg": {"gtol": tolerance},
             "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most},
@@ -247,7 +247,7 @@ class Method:
 class Minimisation:
     """Settings of `minimize`."""
 
-    start: dict[str, Any] | None = None
+    start: Record | None = None
     method: Method = field(default_factory=Method)
     prior: bool = False
     tolerance: float = 1e-6

@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Findings, as_json
-from prbayes._validate import Floats, NamedArrays
+from prbayes._validate import Floats, NamedArrays, Names, Record
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
 from prbayes.inference.checks.population import failing_share
@@ -116,8 +116,8 @@ class SearchRecord:
     seconds: float = 0.0
     trace: NamedArrays = field(default_factory=dict)
     stopped: str = ""
-    at_edge: tuple[str, ...] = ()
-    at_jump: tuple[str, ...] = ()
+    at_edge: Names = ()
+    at_jump: Names = ()
     support: dict[str, dict[str, float]] = field(default_factory=dict)
     identity: Identity | None = None
 
@@ -202,8 +202,8 @@ def _html(optimum: Optimum) -> str:
 class PointEstimate:
     """An estimate of the hyperparameters of a model, with standard errors."""
 
-    point: dict[str, Any]
-    stderr: dict[str, Any]
+    point: Record
+    stderr: Record
     theta: Floats
     covariance: Floats
     evaluator: Evaluator
@@ -290,7 +290,7 @@ class Optimum(PointEstimate):
     n_responses: int
     search: SearchRecord
     design_error: float = np.nan
-    local_optima: tuple[dict[str, Any], ...] = ()
+    local_optima: tuple[Record, ...] = ()
     findings: Findings = ()
 
     __repr__ = _text
@@ -465,9 +465,7 @@ def point_text(evaluator: Evaluator, theta: Floats) -> str:
     return ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
 
 
-def local_optimum(
-    evaluator: Evaluator, theta: Floats, value: float, *, comparable: bool
-) -> dict[str, Any]:
+def local_optimum(evaluator: Evaluator, theta: Floats, value: float, *, comparable: bool) -> Record:
     """Return the record of a local optimum in `Optimum.local_optima`."""
     values = evaluator.hyperparameters.constrained(theta[None])
     point = {name: _number(value[0]) for name, value in values.items()}
@@ -476,7 +474,7 @@ def local_optimum(
 
 def point_and_stderr(
     evaluator: Evaluator, theta: Floats, covariance: Floats, functions: Local | None = None
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Record, Record]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     hyperparameters = evaluator.hyperparameters
     step = 1e-4 * hyperparameters.prior_sd  # any small step will do, because transforms are smooth
@@ -600,7 +598,7 @@ def optima_of(optimum: Optimum, evaluator: Evaluator, *, comparable: bool = True
 # -- storage ---------------------------------------------------------------------------------------
 
 
-def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
+def simulator_records(evaluator: Evaluator) -> list[Record]:
     """Return name, settings and runs of each simulator, log-likelihoods by specimen last."""
     records = [
         {
@@ -625,7 +623,7 @@ def simulator_records(evaluator: Evaluator) -> list[dict[str, Any]]:
     return records
 
 
-def by_simulator(records: list[dict[str, Any]]) -> xr.Dataset:
+def by_simulator(records: list[Record]) -> xr.Dataset:
     """Return records as variables of one dimension, NaN where a simulator has no number."""
     keys = dict.fromkeys(key for record in records for key in record)
     return xr.Dataset(
@@ -658,7 +656,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     return figures.assign(variables)
 
 
-def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
+def compared_in(calibration: xr.Dataset) -> Names:
     """Return how simulators compare several outputs together."""
     if "compared" not in calibration:
         return ()

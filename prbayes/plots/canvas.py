@@ -6,13 +6,13 @@ Plotting libraries are imported when a figure is made.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from prbayes._validate import Floats, Labels, called, positive_integer, texts
+from prbayes._validate import Floats, Labels, NamedValues, Record, called, positive_integer, texts
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
@@ -33,7 +33,7 @@ GREY, PALE = "#707070", "#949494"
 Limits = tuple[float, float]
 
 
-def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: bool = False) -> None:
+def check_options(labels: object, pc_kwargs: NamedValues, *, by_arviz: bool = False) -> None:
     """Raise if labels are not texts by name, or an option of the figure is wrong."""
     if labels is not None:
         texts(labels, "labels")
@@ -57,9 +57,7 @@ def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: boo
         )
 
 
-def layout(
-    n: int, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
-) -> tuple[int, dict[str, Any]]:
+def layout(n: int, size: tuple[float, float], pc_kwargs: NamedValues) -> tuple[int, Record]:
     """Return the number of columns of n panels of a size, and the options of their figure."""
     # A row has three panels, but four panels make a square.
     columns = min(n, pc_kwargs.get("col_wrap", 2 if n == 4 else 3))
@@ -70,7 +68,7 @@ def layout(
 
 
 def panels(
-    names: Sequence[str], *, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
+    names: Sequence[str], *, size: tuple[float, float], pc_kwargs: NamedValues
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure of pyplot, and its panels by name; a panel has the name as its label."""
     from matplotlib import pyplot as plt  # heavy, and only needed for pictures
@@ -122,7 +120,7 @@ def fill(
 
 def finish(figure: Figure) -> Figure:
     """Draw one legend below all panels, with as many columns as fit and rows of equal length."""
-    handles: dict[str, Any] = {}
+    handles: Record = {}
     for axis in figure.axes:
         for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Labels, wrong_type
+from prbayes._validate import Labels, Record, wrong_type
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
@@ -209,7 +209,7 @@ def plot_stages(
         rows = statistics[name].values
         chains = [str(chain) for chain in statistics[name].chain.values.tolist()]
         for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
-            look: dict[str, Any] = {"color": CYCLE[c % len(CYCLE)], "gid": f"chain_{chain}"}
+            look: Record = {"color": CYCLE[c % len(CYCLE)], "gid": f"chain_{chain}"}
             at = np.flatnonzero(np.isfinite(row))
             if is_once[name]:
                 axis.scatter([c + 1.0], row[at][-1:], 45, **look)

@@ -9,14 +9,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from prbayes._stats import cumulated, positive_scale, quantile
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.metrics.density import GaussianKDE, silverman
 
 # number of points of a curve; a step is one or two pixels of a panel
 GRID_POINTS = 257
 
 
-def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
+def _finite_samples(values: Floats, weights: Floats) -> Iterator[ArrayPair]:
     """Yield finite values with positive weight, and weights of sum one, of each sample, (P, n)."""
     rows = np.broadcast_to(values, weights.shape)
     for row, w in zip(rows, weights, strict=True):
@@ -75,7 +75,7 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
     return np.asarray(np.interp(grid, x, density, left=0.0, right=0.0))
 
 
-def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:
+def pointwise_band(curves: Floats, prob: float) -> ArrayPair:
     """Return the sides between which the share ``prob`` of curves, (P, g), lies at each point."""
     low, high = np.quantile(curves, central_levels(prob), axis=0)
     return low, high
@@ -120,7 +120,7 @@ def axis_range(
     return low - width, high + width
 
 
-def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+def staircase(observed: Floats, weights: Floats, low: float, high: float) -> ArrayPair:
     """Return the corners of the distribution function of weighted values from low to high."""
     order = np.argsort(observed, kind="stable")
     values = observed[order]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, Labels, NamedArrays, positive_integer, wrong_type
+from prbayes._validate import Floats, Labels, NamedArrays, Record, positive_integer, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -223,7 +223,7 @@ def _draw_marks(axis: Axes, path: Any, optimum: Floats, local_optima: Floats) ->
     if path is not None:
         text = "path of the optimiser"
         axis.scatter(path[0], path[1], 14, color=ink(), label=text, gid="evaluated", zorder=2)
-    look: dict[str, Any] = {"color": VERMILION, "zorder": 3}
+    look: Record = {"color": VERMILION, "zorder": 3}
     axis.scatter(optimum[0], optimum[1], 90, marker="D", label="optimum", gid="optimum", **look)
     if local_optima.size:
         text = "other optima"

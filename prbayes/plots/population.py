@@ -11,7 +11,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, share
+from prbayes._validate import ArrayPair, Floats, Labels, Record, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.margins import Margin, margins
@@ -123,7 +123,7 @@ def plot_population(
     return finish(figure)
 
 
-def _coordinates(evaluator: Evaluator, margin: Margin) -> dict[str, Any]:
+def _coordinates(evaluator: Evaluator, margin: Margin) -> Record:
     """Return the coordinates of a margin: its group, and its index in a multivariate input."""
     variable = variable_of(margin.name)
     places = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
@@ -165,7 +165,7 @@ def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float
 
 def margin_densities(
     evaluator: Evaluator, shown: list[Margin], thetas: Floats
-) -> dict[str, tuple[Floats, Floats]]:
+) -> dict[str, ArrayPair]:
     """Return by margin a grid, shape (g,), and densities at thetas, shape (P, g); or probabilities.
 
     They are exact where the input has an elementwise density or is a multivariate normal, otherwise

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, share, wrong_type
+from prbayes._validate import Floats, Labels, Record, share, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
@@ -219,7 +219,7 @@ def _draw(
     texts: dict[str, str],
     prob: float,
     backend: str | None,
-    pc_kwargs: dict[str, Any],
+    pc_kwargs: Record,
 ) -> PlotCollection:
     """Return the picture that ArviZ draws of summaries by hyperparameter."""
     import arviz as az  # heavy, and only needed for pictures

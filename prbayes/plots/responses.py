@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL, distribution_function, positive_scale
-from prbayes._validate import Floats, Labels, flag, share
+from prbayes._validate import ArrayPair, Floats, Labels, Record, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
@@ -199,8 +199,8 @@ class _Drawing:
     def distribution(
         self,
         output: Output,
-        population: tuple[Floats, Floats],
-        earlier: tuple[Floats, Floats] | None,
+        population: ArrayPair,
+        earlier: ArrayPair | None,
         limits: Limits,
         *,
         ecdf: bool,
@@ -212,7 +212,7 @@ class _Drawing:
         is_sheet = output.node.metric.exact_likelihood
         grid = np.linspace(*limits, GRID_POINTS)
         curves_of = distribution_function if ecdf else smooth_densities
-        marks: dict[str, Any] = {"marker": "|", "color": ink(), "gid": "rug", "zorder": 3}
+        marks: Record = {"marker": "|", "color": ink(), "gid": "rug", "zorder": 3}
         top = 1.0 if ecdf else 0.0
         if is_sheet:
             top = 0.0
@@ -245,8 +245,8 @@ class _Drawing:
     def lines(
         self,
         output: Output,
-        population: tuple[Floats, Floats],
-        earlier: tuple[Floats, Floats] | None,
+        population: ArrayPair,
+        earlier: ArrayPair | None,
     ) -> None:
         """Draw a line over all outputs for each specimen; median and most of the population."""
         axis = self.axis
@@ -345,7 +345,7 @@ class Output:
         return self.column is None and bool(self.node.outputs.event)
 
     @property
-    def coordinates(self) -> dict[str, Any]:
+    def coordinates(self) -> Record:
         """The labels of output and group by dimension."""
         outputs, groups = self.node.outputs, self.node.inputs.groups
         labels = {} if self.column is None else {outputs.dim: outputs.labels[self.column]}
@@ -384,7 +384,7 @@ class Output:
         """Return the values of this output among those of all, (..., m) -> (...)."""
         return values if self.column is None else values[..., self.column]
 
-    def measured(self) -> tuple[Floats, Floats]:
+    def measured(self) -> ArrayPair:
         """Return the measured values of one output, without NaN, and weights that sum to one."""
         values = self.of(self.node.observed)
         weights = self.node.weights

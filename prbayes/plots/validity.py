@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
-from prbayes._validate import Bools, Floats
+from prbayes._validate import Bools, Floats, Record
 from prbayes.plots.canvas import (
     BLUE,
     PALE,
@@ -76,7 +76,7 @@ def plot_validity(
         if is_fleet(tests):
             return plot_tests(of_products, pc_kwargs)
         tests = of_products
-    by_name: dict[str, Any] = dict(tests) if isinstance(tests, Mapping) else {"": tests}
+    by_name: Record = dict(tests) if isinstance(tests, Mapping) else {"": tests}
     if not by_name or not all(isinstance(test, ValidityTest) for test in by_name.values()):
         kinds = {type(test).__name__ for test in by_name.values()}
         got = ", ".join(sorted(kinds)) or "nothing"
@@ -94,7 +94,7 @@ def plot_validity(
             # All conditions with a single output make one more line.
             single = test.u_values[~_is_of_direction(test)]
             lines = [single, *directions] if single.size else directions
-            thin: dict[str, Any] = {"color": color, "linewidth": 0.8}
+            thin: Record = {"color": color, "linewidth": 0.8}
             if not test.folded:
                 axis.plot(*_ecdf(lines), **thin, gid="ecdf")
             folded = _ecdf([np.abs(2 * u - 1) for u in (lines if test.folded else directions)])

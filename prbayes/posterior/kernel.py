@@ -24,6 +24,7 @@ from prbayes._validate import (
     FORMAT,
     Floats,
     NamedArrays,
+    Record,
     StrPath,
     called,
     positive_integer,
@@ -355,7 +356,7 @@ class Checkpoint:
         self.problem = problem
         self.settings = dict(settings)
         self.arrays: NamedArrays = {}
-        self.note: dict[str, Any] = {}
+        self.note: Record = {}
         self.digest = b""  # digest of the file as this run has read or written it last
         if self.path.exists():
             self._read()

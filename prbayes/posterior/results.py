@@ -12,7 +12,17 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import Findings
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, NamedArrays, called, flag
+from prbayes._validate import (
+    AT_ONCE,
+    IN_CACHE,
+    Floats,
+    Indices,
+    NamedArrays,
+    NamedValues,
+    Record,
+    called,
+    flag,
+)
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
     arviz_attributes,
@@ -46,7 +56,7 @@ class Chains:
     """Chains of draws with the diagnostics of their sampler."""
 
     thetas: Floats  # (chains, draws, d): draws in unconstrained space
-    sampler: Mapping[str, Any]  # attributes of the result: name of the sampler, and diagnostics
+    sampler: NamedValues  # attributes of the result: name of the sampler, and diagnostics
     sample_stats: xr.Dataset
     # (chains, draws): log-likelihood up to a constant; None for log-likelihoods by specimen
     log_likelihood: Floats | None = None
@@ -63,7 +73,7 @@ class Chains:
 def posterior_tree(
     evaluator: Evaluator,
     chains: Chains,
-    attrs: Mapping[str, Any],
+    attrs: NamedValues,
     groups: Mapping[str, xr.Dataset],
 ) -> xr.DataTree:
     """Return the DataTree of a sampler's chains with groups of `arviz_groups`."""
@@ -83,7 +93,7 @@ def posterior_tree(
     return xr.DataTree.from_dict(tree)
 
 
-def posterior_group(evaluator: Evaluator, thetas: Floats, attrs: Mapping[str, Any]) -> xr.Dataset:
+def posterior_group(evaluator: Evaluator, thetas: Floats, attrs: NamedValues) -> xr.Dataset:
     """Return the draws, (chains, draws, d), with attributes of the run and of the model."""
     return _variables(evaluator, thetas).assign_attrs(
         {
@@ -346,7 +356,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
 
 def require_selection(
     var_names: object, idata_kwargs: object, model: pm.Model
-) -> tuple[list[str] | None, dict[str, Any]]:
+) -> tuple[list[str] | None, Record]:
     """Return names of variables, None for all, and keywords for the groups; raise if invalid."""
     names: list[str] | None = None
     if var_names is not None:

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json, sentences_of
-from prbayes._validate import Floats
+from prbayes._validate import Floats, Record
 from prbayes.decision.population_table import population
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import readable_variables, variable_of
@@ -199,7 +199,7 @@ def decision(m: Material) -> list[Section]:
     return sections
 
 
-def _risk(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
+def _risk(table: xr.Dataset, m: Material) -> list[Record]:
     """Return the rows of a probability, one for each bound."""
     values, errors = (np.atleast_1d(table[key].values) for key in ("probability", "error"))
     bounds = table["bound"].values if "bound" in table.coords else [""]
@@ -224,7 +224,7 @@ def _risk(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
     ]
 
 
-def _indices(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
+def _indices(table: xr.Dataset, m: Material) -> list[Record]:
     """Return the rows of sensitivity indices, one for each factor."""
     value = plus_minus(float(table.attrs["value"]), float(table.attrs["sd"]))
     quantity = f"{table.attrs['quantity']} = {value}"
@@ -241,11 +241,11 @@ def _indices(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
     return rows
 
 
-def _plan(table: xr.Dataset, m: Material) -> list[dict[str, Any]]:
+def _plan(table: xr.Dataset, m: Material) -> list[Record]:
     """Return the rows of a plan, with the present standard deviations first."""
     names = [str(name) for name in table.name.values]
 
-    def row(text: str, sd: xr.DataArray) -> dict[str, Any]:
+    def row(text: str, sd: xr.DataArray) -> Record:
         sds = {named(name, m.labels): number(float(sd.sel(name=name)), 3) for name in names}
         return {"specimens": text, **sds}
 

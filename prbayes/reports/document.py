@@ -18,6 +18,7 @@ from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
     Labels,
+    NamedValues,
     StrPath,
     called,
     file_path,
@@ -311,7 +312,7 @@ class Report:
         return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
 
 
-def _refuse_beside_fleet(results: Mapping[str, Any]) -> None:
+def _refuse_beside_fleet(results: NamedValues) -> None:
     """Raise if a report of a whole fleet has results, by name, that belong to one product."""
     for name, result in results.items():
         if result is not None:

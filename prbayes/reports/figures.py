@@ -13,7 +13,7 @@ import pymc as pm
 
 from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Function
+from prbayes._validate import Function, Record
 from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import variable_of
 from prbayes.plots.comparison import plot_comparison
@@ -170,7 +170,7 @@ def requests(m: Material) -> dict[str, Request]:
     return requested
 
 
-def _labels_of(m: Material, names: Iterable[Any]) -> dict[str, Any]:
+def _labels_of(m: Material, names: Iterable[Any]) -> Record:
     """Return the labels of names, as keywords of a picture without a model."""
     variables = {variable_of(str(name)) for name in names}
     texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
@@ -271,8 +271,8 @@ def _svg(model: pm.Model) -> bytes:
     plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
     simulators = {simulator.name for simulator in population_simulators(model)}
 
-    def formatted(rv: Any) -> dict[str, Any]:
-        style: dict[str, Any] = plain(rv)
+    def formatted(rv: Any) -> Record:
+        style: Record = plain(rv)
         label = {"label": f"{rv.name}\n~\nSimulator"} if rv.name in simulators else {}
         return style | label
 

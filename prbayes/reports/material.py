@@ -13,7 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, called, texts, wrong_type
+from prbayes._validate import Floats, Labels, NamedValues, Names, Record, called, texts, wrong_type
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
@@ -66,7 +66,7 @@ class Material:
 
     model: pm.Model | None
     # variables and simulators of the model, which a file describes too; empty lists if unknown
-    description: dict[str, Any]
+    description: Record
     optima: dict[str, xr.DataTree]
     live_optima: dict[str, Optimum]  # optima in memory, which have an evaluator
     posteriors: dict[str, xr.DataTree]
@@ -154,13 +154,13 @@ def metrics_of(m: Material) -> dict[str, str]:
     }
 
 
-def constants_of(description: Mapping[str, Any]) -> set[str]:
+def constants_of(description: NamedValues) -> set[str]:
     """Return the names of inputs that are numbers."""
     inputs = [x for s in description["simulators"] for x in s["inputs"]]
     return {name for name, _, text in inputs if text.startswith("=")}
 
 
-def names_in(description: Mapping[str, Any]) -> set[str]:
+def names_in(description: NamedValues) -> set[str]:
     """Return the names of variables, and of inputs that are numbers."""
     return {v["name"] for v in description["variables"]} | constants_of(description)
 
@@ -223,7 +223,7 @@ def gather(
 
     stored = (from_attributes(attributes_of(tree)) for tree in results.values())
     descriptions = filter(None, stored if model is None else [describe(model)])
-    description: dict[str, Any] = next(descriptions, {"variables": [], "simulators": []})
+    description: Record = next(descriptions, {"variables": [], "simulators": []})
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)
@@ -253,7 +253,7 @@ def gather(
     )
 
 
-def _tests_of(posteriors: Mapping[str, Any]) -> dict[str, ValidityTest]:
+def _tests_of(posteriors: NamedValues) -> dict[str, ValidityTest]:
     """Return the validity tests that posteriors of products have."""
     tests: dict[str, ValidityTest] = {}
     for result in posteriors.values():
@@ -261,7 +261,7 @@ def _tests_of(posteriors: Mapping[str, Any]) -> dict[str, ValidityTest]:
     return tests
 
 
-def _by_label(results: Any, kind: str) -> dict[str, Any]:
+def _by_label(results: Any, kind: str) -> Record:
     if results is None:
         return {}
     if isinstance(results, Mapping) and not isinstance(results, xr.DataTree | xr.Dataset):
@@ -274,11 +274,11 @@ def _by_label(results: Any, kind: str) -> dict[str, Any]:
 
 def _require_kinds(
     model: Any,
-    optima: dict[str, Any],
-    posteriors: dict[str, Any],
-    tests: dict[str, Any],
+    optima: Record,
+    posteriors: Record,
+    tests: Record,
     comparison: Any,
-    decisions: dict[str, Any],
+    decisions: Record,
     labels: Any,
 ) -> None:
     """Raise if an argument is of another kind."""
@@ -327,7 +327,7 @@ def _validations(validation: Any) -> dict[str, Validation]:
     return validations
 
 
-def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
+def _require_group(label: str, tree: Any, group: str, dims: Names, origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
         expected = f"a DataTree with the group {group}, from {origin}"
         raise wrong_type(tree, f"Report: {label}", expected)

@@ -13,7 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from prbayes._display import View
-from prbayes._validate import wrong_type
+from prbayes._validate import Names, Record, wrong_type
 
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
@@ -107,7 +107,7 @@ def enumerated(items: list[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def described(y: Any) -> dict[str, Any]:
+def described(y: Any) -> Record:
     """Return counts, range, mean and spread of an output; NaN was not measured, +inf failed."""
     measured = y[~np.isnan(y)]
     finite = measured[np.isfinite(measured)]
@@ -129,7 +129,7 @@ def described(y: Any) -> dict[str, Any]:
     }
 
 
-def with_zeros(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def with_zeros(rows: list[Record]) -> list[Record]:
     """Return rows with a zero for no failures and no missing values, if another row has some."""
     for key in ("failed", "missing"):
         if any(row[key] for row in rows):
@@ -146,11 +146,11 @@ _NUMBER = re.compile(r"-?\d*\.?\d+(e[-+]?\d+)?%?|-?∞")  # all that `number` an
 class Cells:
     """A table as text."""
 
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    header: Names
+    rows: tuple[Names, ...]
     numeric: tuple[bool, ...]  # whether a column consists of numbers
 
-    def aligned(self) -> tuple[tuple[str, ...], ...]:
+    def aligned(self) -> tuple[Names, ...]:
         """Return the rows with spaces after numbers that align decimal points."""
         # A figure space is as wide as a digit, a punctuation space as a point (Unicode, 6.2).
         digit, point = "\u2007", "\u2008"
@@ -195,7 +195,7 @@ def cells(table: Any) -> Cells:
     return Cells(header, rows, tuple(numeric))
 
 
-def rows_table(rows: list[dict[str, Any]]) -> Any:
+def rows_table(rows: list[Record]) -> Any:
     """Return a table without columns that are empty in every row, or None; NaN is not empty."""
     if not rows:
         return None

@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Labels
+from prbayes._validate import Labels, NamedValues, Names, Record
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
     element_name,
@@ -227,7 +227,7 @@ def _with_labels(sentences: Mapping[str, list[str]]) -> list[str]:
 
 def failures(m: Material) -> list[Section]:
     """Return the failed responses with the reasons, at most a page."""
-    rows: dict[tuple[str, ...], dict[str, Any]] = {}
+    rows: dict[Names, Record] = {}
     for tree in m.results.values():
         if "failures" in tree.children:
             table = tree["failures"].to_dataset()
@@ -250,7 +250,7 @@ def failures(m: Material) -> list[Section]:
 def metric(m: Material) -> list[Section]:
     """Return the discrepancies and epsilons of the results, or their log-likelihoods."""
     objective = _objective_texts(m)
-    rows: list[dict[str, Any]] = []
+    rows: list[Record] = []
     for label, calibration in m.calibrations.items():
         sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
         means = calibration["discrepancy"].mean(sample_dims, skipna=False)
@@ -303,11 +303,11 @@ def optima(m: Material) -> list[Section]:
     return sections
 
 
-def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
+def _titled(title: str, label: str, results: NamedValues) -> str:
     return title if len(results) == 1 else f"{title}: {label}"
 
 
-def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+def _other_optimum(mode: NamedValues, point: Mapping[Any, Any], names: Sequence[str]) -> str:
     """Return a sentence on another optimum; of many elements it names scalar variables alone."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
@@ -352,7 +352,7 @@ def posteriors(m: Material) -> list[Section]:
     return sections
 
 
-def _posterior_rows(tree: xr.DataTree, names: Sequence[str], prob: float) -> list[dict[str, Any]]:
+def _posterior_rows(tree: xr.DataTree, names: Sequence[str], prob: float) -> list[Record]:
     """Return estimates and diagnostics of the draws of each variable."""
     import arviz as az  # heavy
 
@@ -487,7 +487,7 @@ def validity(m: Material) -> list[Section]:
     return [Section("Test statistics", (about, *nulls), rows_table(rows), level=3)]
 
 
-def _test_row(test: ValidityTest) -> dict[str, Any]:
+def _test_row(test: ValidityTest) -> Record:
     directions = len(in_directions(test))
     values = "|2u - 1|" if test.folded else "u"
     if directions and not test.folded:
@@ -599,7 +599,7 @@ def origin(m: Material) -> list[Section]:
         costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
     rows = []
     for label, by, record, responses in costs:
-        row: dict[str, Any] = {"result": label, "by": by}
+        row: Record = {"result": label, "by": by}
         row["responses"] = str(int(record[responses])) if responses in record else None
         seconds = record.get("seconds")
         if seconds is not None:  # Below ten a tenth matters.

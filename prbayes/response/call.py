@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
 from prbayes._stats import positive_scale
-from prbayes._validate import NO_POPULATION, Bools, Floats, Function, Indices, Shape, unmasked
+from prbayes._validate import (
+    NO_POPULATION,
+    Bools,
+    Floats,
+    Function,
+    Indices,
+    Names,
+    Shape,
+    unmasked,
+)
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -362,7 +371,7 @@ def shapes(arguments: Sequence[Any]) -> str:
     return ", ".join(str(np.shape(a)) for a in arguments)
 
 
-def column_names(names: Sequence[str], sizes: Sequence[int]) -> tuple[str, ...]:
+def column_names(names: Sequence[str], sizes: Sequence[int]) -> Names:
     """Return a name for each number of a point, from the names and sizes of the inputs."""
     pairs = zip(names, sizes, strict=True)
     return tuple(f"{x}[{i}]" if k > 1 else x for x, k in pairs for i in range(k))
@@ -423,7 +432,7 @@ class CallSettings:
     retry_failed: bool = False  # whether points stored as failed, or NaN, are computed again
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # stated outputs; None takes those of the first run
-    columns: tuple[str, ...] = ()  # names of the numbers of a point
+    columns: Names = ()  # names of the numbers of a point
     takes_policy: bool = True  # whether the caller of the public function can pass on_failure
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import StrPath, called, flag, folder_path, positive_number, unmasked
+from prbayes._validate import Names, StrPath, called, flag, folder_path, positive_number, unmasked
 from prbayes.response.call import scalar
 from prbayes.response.outputs import relabelled
 
@@ -114,7 +114,7 @@ def command(
     return scalar(program)
 
 
-def _checked_arguments(arguments: object) -> tuple[str, ...]:
+def _checked_arguments(arguments: object) -> Names:
     """Return the path of the program, and its arguments."""
     if isinstance(arguments, str) or not isinstance(arguments, Sequence) or not arguments:
         raise TypeError(
@@ -136,7 +136,7 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
     return (os.path.abspath(path), *rest)  # absolute, because it runs in another folder
 
 
-def _checked_names(inputs: object) -> tuple[str, ...]:
+def _checked_names(inputs: object) -> Names:
     if isinstance(inputs, str) or not isinstance(inputs, Sequence):
         raise TypeError(
             f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
@@ -178,8 +178,8 @@ def _read_templates(write: object) -> dict[str, str]:
 class Program:
     """A program as a function of one specimen's inputs."""
 
-    arguments: tuple[str, ...]
-    inputs: tuple[str, ...]
+    arguments: Names
+    inputs: Names
     templates: dict[str, str]  # templates of the files to write, by the name of the file
     read: Callable[[Path], Any]
     timeout: float | None

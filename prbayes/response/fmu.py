@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 from prbayes._validate import (
     Floats,
     Labels,
+    Record,
     StrPath,
     called,
     file_path,
@@ -450,7 +451,7 @@ class Simulation:
         """The name of the unit."""
         return self.unit.name
 
-    def __call__(self, *values: float) -> float | Floats | dict[str, Any]:
+    def __call__(self, *values: float) -> float | Floats | Record:
         """Simulate one specimen: a number, a curve, or a mapping of these."""
         self._refuse_inputs(self.unit.name, [1] * len(values))
         start_values = [*self.parameters]

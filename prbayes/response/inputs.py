@@ -23,6 +23,7 @@ from prbayes._validate import (
     Function,
     Indices,
     Labels,
+    Record,
     Shape,
     plain_text,
     real_array,
@@ -78,7 +79,7 @@ class Inputs:
             self.sizes.append(int(math.prod(shape)))
         self.dimensions = sum(math.prod(shape) for shape in self.event_shapes)
         # Data that the user may change, such as `pymc.Data`, by name.
-        self.data: dict[str, Any] = {
+        self.data: Record = {
             str(variable.name or f"shared variable {i}"): variable
             for i, variable in enumerate(_ancestry([*self.aleatory, *self.epistemic]))
             if hasattr(variable, "get_value")

@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Bools, Floats, Indices, Shape, first_text, real_array, unmasked
+from prbayes._validate import (
+    Bools,
+    Floats,
+    Indices,
+    NamedValues,
+    Names,
+    Record,
+    Shape,
+    first_text,
+    real_array,
+    unmasked,
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +33,7 @@ class Outputs:
     # Keys of a response that returns a mapping, with the number of outputs of each key; None is one
     # number without an axis. Outputs without names have no keys.
     keys: tuple[tuple[str, int | None], ...] = ()
-    units: tuple[str, ...] = ()  # unit of each output, or of the one number; empty if unknown
+    units: Names = ()  # unit of each output, or of the one number; empty if unknown
 
     @property
     def event(self) -> Shape:
@@ -35,7 +46,7 @@ class Outputs:
         return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
 
     @property
-    def attrs(self) -> dict[str, Any]:
+    def attrs(self) -> Record:
         """The units as an attribute of an array: a text if all outputs have the same."""
         if not self.units:
             return {}
@@ -57,7 +68,7 @@ class Outputs:
             start = stop
         return arrays
 
-    def assembled(self, result: Mapping[str, Any]) -> Any:
+    def assembled(self, result: NamedValues) -> Any:
         """Concatenate a mapping's arrays along the last axis; raise KeyError for other keys."""
         if not self.keys:
             raise KeyError(
@@ -253,7 +264,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     return values, Outputs(units=unit) if unit else SINGLE_OUTPUT
 
 
-def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
+def _units_in(observed: Any, labels: Sequence[Any]) -> Names:
     """Return the unit of each output, from the attributes of a labelled array.
 
     A text is the unit of all outputs. A mapping has units by label, a list in the order of outputs.
@@ -270,7 +281,7 @@ def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
 def _labelled_columns(observed: Any, m: int) -> Outputs:
     """Return the outputs of an array, DataFrame or DataArray of m columns."""
     labels: tuple[Any, ...] = tuple(range(m))
-    units: tuple[str, ...] = ()
+    units: Names = ()
     dim = "output"
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])

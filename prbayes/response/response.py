@@ -18,7 +18,16 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, Function, Indices, Shape, called, executes, folder_path
+from prbayes._validate import (
+    Floats,
+    Function,
+    Indices,
+    Record,
+    Shape,
+    called,
+    executes,
+    folder_path,
+)
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
@@ -134,7 +143,7 @@ class StoredRuns:
     # at any use.
     is_repeated: bool | None = False
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         return {**vars(self), "last": None, "is_repeated": False}
 
     def at(self, points: Sequence[Floats]) -> Floats | None:

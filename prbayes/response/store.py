@@ -25,7 +25,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import FORMAT, Bools, Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import (
+    FORMAT,
+    Bools,
+    Floats,
+    Record,
+    plain_text,
+    positive_integer,
+    stated_path,
+)
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -128,11 +136,11 @@ class Store:
         self._local = threading.local()
         self._read()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         keys = ("folder", "name", "columns", "version", "outputs")
         return {key: vars(self)[key] for key in keys}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Record) -> None:
         vars(self).update(state)
         self.verified = self.version is not None
         self._local = threading.local()

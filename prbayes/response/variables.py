@@ -25,6 +25,8 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from prbayes._validate import Record
+
 # A text that identifies an object without its parts, and pairs of a name and a part. A part
 # without a name belongs to the variable of its owner.
 type Opened = tuple[str, Iterable[tuple[str, Any]]]
@@ -43,7 +45,7 @@ def digests_of(function: object, most: int = 10_000) -> dict[str, str]:
     The function's own code has the name "". The function is not called, and no object is kept. Of
     more than ``most`` objects those that are nearest to the function count.
     """
-    hashes: dict[str, Any] = {}
+    hashes: Record = {}
     opened: dict[int, tuple[str, Any]] = {}  # objects with their variables; kept, so that ids stay
     waiting = deque([("", function)])
     while waiting and len(opened) < most:
@@ -205,9 +207,9 @@ def _slots(kind: Any) -> tuple[Any, ...]:
     return tuple(x for x in slots if not x.__name__.endswith("offset__"))  # no addresses
 
 
-def _attributes(value: object) -> dict[str, Any]:
+def _attributes(value: object) -> Record:
     """Return the attributes of an object without a call of its own methods."""
-    attributes: dict[str, Any] = {}
+    attributes: Record = {}
     with suppress(AttributeError):
         variables = object.__getattribute__(value, "__dict__")
         attributes.update((k, v) for k, v in variables.items() if type(k) is str)

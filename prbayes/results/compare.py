@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, NamedArrays, called, wrong_type
+from prbayes._validate import Floats, NamedArrays, NamedValues, Record, called, wrong_type
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
@@ -162,7 +162,7 @@ def compare(
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-def _epsilon_findings(results: Mapping[str, Any], model: pm.Model | None) -> list[Finding]:
+def _epsilon_findings(results: NamedValues, model: pm.Model | None) -> list[Finding]:
     """Return findings of draws whose width is that of epsilon, with the labels of the results."""
     return [
         replace(finding, text=f"{label}: {finding.text}")
@@ -199,7 +199,7 @@ def _in_all(columns: Sequence[Iterable[str]]) -> list[str]:
     return [name for name in columns[0] if name in in_all]
 
 
-def _estimate_variables(table: Floats) -> dict[str, Any]:
+def _estimate_variables(table: Floats) -> Record:
     """Return variables with estimates, (results, elements, 4), and shifts from the first result."""
     estimates, sds = table[..., 0], table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # A result may have no spread.

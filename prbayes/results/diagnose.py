@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import View, view, without_constructor
 from prbayes._finding import Finding, Findings, counted, from_json
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, NamedArrays, wrong_type
+from prbayes._validate import Floats, NamedArrays, Names, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
@@ -114,7 +114,7 @@ class Diagnosis:
     findings: Findings
     support: xr.Dataset = field(repr=False)
     remarks: Findings = ()
-    untested: tuple[str, ...] = ()
+    untested: Names = ()
     products: Mapping[str, Diagnosis] = field(default_factory=dict)
 
     @classmethod

@@ -11,7 +11,7 @@ import xarray as xr
 from prbayes._display import Tree, View
 from prbayes._finding import report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, NamedArrays, Seed, positive_integer, seed_number
+from prbayes._validate import Floats, NamedArrays, Record, Seed, positive_integer, seed_number
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
 from prbayes.model.parameters import element_name
@@ -262,7 +262,7 @@ def _population(
 
 
 def _array(
-    name: str, values: Floats, coords: dict[str, Any], outputs: Outputs | None = None
+    name: str, values: Floats, coords: Record, outputs: Outputs | None = None
 ) -> xr.DataArray:
     """Label draws, (P, n, *event), by chain, draw, specimen, and outputs or elements."""
     event = values.shape[2:]

@@ -16,7 +16,7 @@ from scipy.special import softmax
 
 from prbayes._finding import Finding, Findings, counted
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats, Names
 from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
@@ -69,7 +69,7 @@ class Checked:
 
     findings: Findings = ()
     remarks: Findings = ()  # results of tests that found nothing, with their power
-    untested: tuple[str, ...] = ()  # sentences on tests that were not run, with the reason
+    untested: Names = ()  # sentences on tests that were not run, with the reason
 
     def __add__(self, second: Checked) -> Checked:
         """Return the reports of both checks together."""
@@ -183,7 +183,7 @@ def check_population(optimum: Optimum) -> Checked:
 
 
 def reported_tests(
-    optimum: Optimum, samples: Sequence[tuple[Floats, Floats]], null: Sequence[Sequence[Floats]]
+    optimum: Optimum, samples: Sequence[ArrayPair], null: Sequence[Sequence[Floats]]
 ) -> Checked:
     """Return what tests of the population say of each likelihood.
 
@@ -258,7 +258,7 @@ def scored_specimens(
     scores: Sequence[tuple[Any, Any]],
     theta: Floats,
     data: Sequence[tuple[list[Floats], Floats]],
-) -> list[tuple[Floats, Floats]]:
+) -> list[ArrayPair]:
     """Return normal scores (N, K, d) and posterior weights (N, K) of points, by likelihood.
 
     Conditions of the specimens have no score.

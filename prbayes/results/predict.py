@@ -23,6 +23,8 @@ from prbayes._validate import (
     Function,
     Indices,
     NamedArrays,
+    NamedValues,
+    Record,
     Seed,
     StrPath,
     finite_number,
@@ -296,7 +298,7 @@ def _labelled(
 ) -> xr.DataArray:
     """Return predicted responses with dimensions; ``coords`` are of chains, draws and specimens."""
     (chain, draw, specimen), groups = coords, responses.inputs.groups
-    labels: dict[str, Any] = {chain: coords[chain], draw: coords[draw]}
+    labels: Record = {chain: coords[chain], draw: coords[draw]}
     if groups is not None:
         labels[groups.dim] = list(groups.labels)
     labels[specimen] = coords[specimen]
@@ -376,13 +378,13 @@ def _by_name(inputs: Inputs, conditions: Floats | None) -> NamedArrays:
     return dict(zip(names, conditions.T, strict=True))
 
 
-def call_settings(executor: Any, store: Any, version: Any) -> dict[str, Any]:
+def call_settings(executor: Any, store: Any, version: Any) -> Record:
     """Check where a response is computed and kept; return it as arguments of `Responses`."""
     check_call_settings(executor, store, version, Abort())
     return {"executor": executor, "store": store, "version": version}
 
 
-def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> str:
+def named_response(response: Any, calling: NamedValues, advice: str) -> str:
     """Return the name of a response; raise if a store needs its name, and it has none."""
     inner = getattr(response, "function", response)  # `scalar` wraps a function.
     name = str(getattr(inner, "__name__", type(inner).__name__))
@@ -685,7 +687,7 @@ def _vectors(inputs: Inputs) -> list[list[float]]:
 
 def _drawn_attributes(
     drawn: _Predicted, simulators: Sequence[PopulationSimulator], response: Function
-) -> dict[str, Any]:
+) -> Record:
     """Return attributes of drawn responses; one of them if their readings have an error."""
     attrs = {"source": drawn.source, "specimens_id": array_digest(*drawn.specimens)}
     if drawn.error is not None:
@@ -814,6 +816,6 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
     return {key: value for key, value in attributes.items() if value}
 
 
-def provenance(result: Any, model: pm.Model) -> dict[str, Any]:
+def provenance(result: Any, model: pm.Model) -> Record:
     """Return the fingerprint of the problem of a result, and versions of packages, for a table."""
     return {**as_attributes(identity_in(result) or identity_of(model)), **versions()}

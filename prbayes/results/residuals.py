@@ -11,7 +11,16 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Tree, View
-from prbayes._validate import Floats, Indices, NamedArrays, Seed, positive_integer, seed_number
+from prbayes._validate import (
+    Floats,
+    Indices,
+    NamedArrays,
+    Names,
+    Record,
+    Seed,
+    positive_integer,
+    seed_number,
+)
 from prbayes.model.locking import locked
 from prbayes.model.measurement import (
     Measurement,
@@ -306,8 +315,8 @@ def _labelled_residuals(
 ) -> xr.Dataset:
     """Return the residuals of one simulator with labels of specimens and outputs."""
     labels = np.arange(len(m.observed)) if m.specimens is None else np.asarray(m.specimens)
-    coords: dict[str, Any] = {"specimen": labels, "input": linear.names}
-    dims: tuple[str, ...] = ("specimen",)
+    coords: Record = {"specimen": labels, "input": linear.names}
+    dims: Names = ("specimen",)
     if m.event:
         dims = ("specimen", m.outputs.dim)
         coords[m.outputs.dim] = list(m.outputs.labels)
@@ -322,7 +331,7 @@ def _labelled_residuals(
         "CWRES": conditional,
     }
     is_missing = np.isnan(part.observed)
-    data: dict[str, Any] = {}
+    data: Record = {}
     for name, values in arrays.items():
         read = np.where(is_missing, np.nan, values)
         data[name] = (dims, read.reshape(m.observed.shape))

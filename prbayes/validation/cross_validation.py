@@ -14,6 +14,7 @@ from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, positive_scale, quantile
 from prbayes._validate import (
+    ArrayPair,
     Bools,
     Floats,
     Indices,
@@ -288,9 +289,7 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     return np.array(columns).T
 
 
-def _specimen_scores(
-    evaluator: Evaluator, thetas: Floats, held_out: list[Floats]
-) -> tuple[Floats, Floats]:
+def _specimen_scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> ArrayPair:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = number_specimens(evaluator.simulators)
     scores = np.zeros(total)

@@ -20,6 +20,7 @@ from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import (
     AT_ONCE,
+    ArrayPair,
     Floats,
     Indices,
     StrPath,
@@ -52,7 +53,7 @@ class Judgement:
 
     p_value: float
     critical_value: float
-    envelope: Callable[[], tuple[Floats, Floats]]  # lower and upper bounds, (n,)
+    envelope: Callable[[], ArrayPair]  # lower and upper bounds, (n,)
 
 
 class Null(ABC):
@@ -205,7 +206,7 @@ def table() -> tuple[Floats, Floats, Floats]:
     return rows[:, 0], -np.log(tails), rows[:, 1:]
 
 
-def _area_quantiles(n: int) -> tuple[Floats, Floats]:
+def _area_quantiles(n: int) -> ArrayPair:
     """Return minus the logs of tail probabilities and the quantiles of sqrt(n) A, (m,) each."""
     sizes, logs, quantiles = table()
     place = -1 / np.sqrt(n)
@@ -223,7 +224,7 @@ def _slope(logs: Floats, quantiles: Floats) -> float:
     return float((logs[-1] - logs[-8]) / (quantiles[-1] ** 2 - quantiles[-8] ** 2))
 
 
-def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
+def uniform_envelope(n: int, alpha: float) -> ArrayPair:
     """Return the envelope of n sorted uniform numbers, (n,) each.
 
     For many numbers it is simulated at 2000 ranks, which are closer together near the ends, and

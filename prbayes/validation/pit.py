@@ -17,8 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._stats import cumulated
 from prbayes._validate import (
+    ArrayPair,
     Floats,
     Indices,
+    NamedValues,
+    Names,
     Seed,
     Shape,
     called,
@@ -54,7 +57,7 @@ class TestedCondition:
     observed: Floats  # measured values, projected, (n,)
     predicted: Floats  # predicted values, projected, (D, S); a row for each draw
     measured: Floats  # measured values before the projection, (n,) or (n, m)
-    labels: tuple[str, ...] | None  # labels of the specimens
+    labels: Names | None  # labels of the specimens
     numbers: Indices  # numbers of the specimens, counted over all conditions, (n,)
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # attributes of the prediction
     projection: Projection | None = None  # projection of several outputs
@@ -431,7 +434,7 @@ class Comparable:
     predicted: Floats  # predicted values, (P, S); a row for each population; NaN has no weight
     unit: str = ""
     condition: str = ""
-    coords: Mapping[str, Any] = field(default_factory=dict)  # label of the output, by dimension
+    coords: NamedValues = field(default_factory=dict)  # label of the output, by dimension
 
     @property
     def weights(self) -> Floats:
@@ -496,7 +499,7 @@ class Predictive:
         cumulative = cumulated(weights[is_number], order)
         self._cumulative = cumulative / cumulative[-1]
 
-    def steps(self, y: Floats) -> tuple[Floats, Floats]:
+    def steps(self, y: Floats) -> ArrayPair:
         """Return P(Y < y) and P(Y <= y), in the shape of y; NaN for a NaN."""
         nan = np.where(np.isnan(y), np.nan, 0.0)
         n_smaller = np.searchsorted(self._values, y, side="left")
