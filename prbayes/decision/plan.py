@@ -18,7 +18,15 @@ from scipy.stats import rankdata
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._stats import positive_scale, reached
-from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
+from prbayes._validate import (
+    Floats,
+    Function,
+    StrPath,
+    called,
+    positive_integer,
+    positive_number,
+    wrong_value,
+)
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
@@ -73,9 +81,10 @@ class Condition:
         caller = "prb.decision.Condition"
         refuse_uncallable(caller, response, order="Condition(response, *inputs)")
         if metric is not None and not isinstance(metric, Metric):
-            raise TypeError(
-                f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "
-                "prb.ProbabilityResidual()"
+            raise wrong_value(
+                metric,
+                "prb.decision.Condition: metric",
+                "a metric, such as prb.ProbabilityResidual()",
             )
         self.response = response
         self.inputs = inputs
@@ -610,9 +619,8 @@ def _refuse_candidates(candidates: object) -> None:
     """Raise if candidates are no mapping of names to conditions."""
     advice = 'such as {"later": prb.decision.Condition(response, x)}'
     if not isinstance(candidates, Mapping) or not candidates:
-        raise TypeError(
-            f"prb.plan: candidates: got {called(candidates)}, expected a mapping of names to "
-            f"conditions, {advice}"
+        raise wrong_value(
+            candidates, "prb.plan: candidates", f"a mapping of names to conditions, {advice}"
         )
     for name, condition in candidates.items():
         if not isinstance(name, str) or not isinstance(condition, Condition):
@@ -627,9 +635,8 @@ def _refuse_max_sd(max_sd: object, names: list[str]) -> None:
     if max_sd is None:
         return
     if not isinstance(max_sd, Mapping) or not max_sd:
-        raise TypeError(
-            f"prb.plan: max_sd: got {called(max_sd)}, expected a mapping of names to standard "
-            f"deviations, of {names}"
+        raise wrong_value(
+            max_sd, "prb.plan: max_sd", f"a mapping of names to standard deviations, of {names}"
         )
     for name, value in max_sd.items():
         if name not in names:

@@ -12,7 +12,7 @@ import xarray as xr
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Findings
-from prbayes._validate import Floats, NamedArrays, called
+from prbayes._validate import Floats, NamedArrays, wrong_value
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations, checked_quantity
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
@@ -73,7 +73,7 @@ class PopulationReader:
         if not isinstance(requested, list | tuple):
             requested = [requested]
         if not requested:
-            raise TypeError(f"{caller}: inputs: got {called(requested)}, expected one at least")
+            raise wrong_value(requested, f"{caller}: inputs", "one at least")
         elements = []
         for x in requested:
             if isinstance(x, xr.DataArray):

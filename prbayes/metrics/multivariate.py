@@ -15,10 +15,10 @@ from prbayes._validate import (
     Floats,
     Indices,
     Names,
-    called,
     positive_integer,
     real_array,
     sample_weights,
+    wrong_value,
 )
 from prbayes.metrics.base import (
     Basis,
@@ -270,9 +270,8 @@ class Joint(Metric):
 
     def __post_init__(self) -> None:
         if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
-            raise TypeError(
-                f"metric: got {called(self.metric)}, expected a metric of one output, such as "
-                "prb.ProbabilityResidual()"
+            raise wrong_value(
+                self.metric, "metric", "a metric of one output, such as prb.ProbabilityResidual()"
             )
         for name in _DECLARED:
             object.__setattr__(self, name, getattr(self.metric, name))

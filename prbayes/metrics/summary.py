@@ -12,10 +12,10 @@ from prbayes._validate import (
     ArrayPair,
     Floats,
     Record,
-    called,
     number,
     positive_integer,
     positive_number,
+    wrong_value,
 )
 
 
@@ -242,9 +242,10 @@ def _range_of_sd(lower: Floats, upper: Floats, mean: float | None) -> tuple[floa
 def _checked_quantiles(quantiles: object) -> dict[float, float]:
     """Return quantiles by levels between 0 and 1, or raise."""
     if not isinstance(quantiles, Mapping) or not quantiles:
-        raise TypeError(
-            f"Summary: quantiles: got {called(quantiles)}, expected a mapping of levels to values, "
-            "such as {0.25: 310.0, 0.5: 330.0}"
+        raise wrong_value(
+            quantiles,
+            "Summary: quantiles",
+            "a mapping of levels to values, such as {0.25: 310.0, 0.5: 330.0}",
         )
     checked = {}
     for level, value in quantiles.items():

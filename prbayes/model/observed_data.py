@@ -26,6 +26,7 @@ from prbayes._validate import (
     called,
     real_array,
     sample_labels,
+    wrong_value,
 )
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
@@ -176,7 +177,7 @@ def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> Nam
     """Return names of the observed dimensions; raise if their lengths in the model differ."""
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
-        raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
+        raise wrong_value(dims, f"{name}: dims", "the name of one dimension")
     if len(names) != len(shape):
         raise ValueError(
             f"{name}: dims: got {names}, expected {len(shape)} names, one for each dimension of "

@@ -28,9 +28,9 @@ from prbayes._validate import (
     NamedValues,
     Record,
     Shape,
-    called,
     real_array,
     refuse_single_precision,
+    wrong_value,
 )
 from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
@@ -250,9 +250,7 @@ def unconstrained(hyperparameters: Hyperparameters, point: NamedValues) -> Float
     value is outside its support.
     """
     if not isinstance(point, Mapping):
-        raise TypeError(
-            f"start: got {called(point)}, expected a dict with a value for each free variable"
-        )
+        raise wrong_value(point, "start", "a dict with a value for each free variable")
     free = {rv.name: rv for rv in hyperparameters.model.free_RVs}
     if set(point) != set(free):
         raise KeyError(

@@ -31,6 +31,7 @@ from prbayes._validate import (
     refuse_single_precision,
     sample_weights,
     texts,
+    wrong_value,
 )
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.area import AreaMetric
@@ -226,9 +227,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     variables = _read_inputs(name, response, inputs, model)
     settings = Reweighted() if propagation is None else propagation
     if not isinstance(settings, Propagation):
-        raise TypeError(
-            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
-            "prb.Resimulated(n) or prb.Fresh(n)"
+        raise wrong_value(
+            propagation,
+            f"{name}: propagation",
+            "prb.Reweighted(n), prb.Resimulated(n) or prb.Fresh(n)",
         )
     if has_data_sheets(observed):
         unused = [metric, epsilon, weights, specimens, dims, variables.groups]
@@ -775,10 +777,12 @@ def _prepared_metric(
 ) -> Discrepancy:
     """Return the metric, prepared for the observed responses; errors begin with the name."""
     if not isinstance(metric, Metric):
-        raise TypeError(
-            f"{name}: metric: got {called(metric)}, expected a metric object such as "
+        raise wrong_value(
+            metric,
+            f"{name}: metric",
+            "a metric object such as "
             "prb.ProbabilityResidual() or prb.AreaMetric(); wrap a function of your own in "
-            "prb.FunctionMetric(f)"
+            "prb.FunctionMetric(f)",
         )
     try:
         if np.ndim(observed) != 2:

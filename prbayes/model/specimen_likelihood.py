@@ -25,7 +25,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Bools, Floats, Indices, called
+from prbayes._validate import Bools, Floats, Indices, wrong_value
 from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -669,7 +669,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     Simulators with common specimens have the same one.
     """
     if not isinstance(model, pm.Model):
-        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
+        raise wrong_value(model, "model", "a pm.Model")
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
     result = {rv: rv.owner.op.record for rv in rvs}

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from prbayes._validate import Floats, Labels, NamedValues, Record, called, positive_integer, texts
+from prbayes._validate import (
+    Floats,
+    Labels,
+    NamedValues,
+    Record,
+    positive_integer,
+    texts,
+    wrong_value,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
@@ -39,9 +47,10 @@ def check_options(labels: object, pc_kwargs: NamedValues, *, by_arviz: bool = Fa
         texts(labels, "labels")
     unknown = set(pc_kwargs) - {"figsize", "col_wrap", "figure_kwargs"}
     if unknown and not by_arviz:
-        raise TypeError(
-            f"{min(unknown)}: got {called(pc_kwargs[min(unknown)])}, expected figsize, col_wrap or "
-            "figure_kwargs: Matplotlib draws this picture"
+        raise wrong_value(
+            pc_kwargs[min(unknown)],
+            f"{min(unknown)}",
+            "figsize, col_wrap or figure_kwargs: Matplotlib draws this picture",
         )
     if "col_wrap" in pc_kwargs:
         positive_integer(pc_kwargs["col_wrap"], "col_wrap")

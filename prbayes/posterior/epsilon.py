@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, positive_number
+from prbayes._validate import Floats, positive_number, wrong_value
 from prbayes.inference.asymptotics import (
     Information,
     first_order_shifts,
@@ -248,9 +248,10 @@ def checked_epsilon(
 ) -> dict[str, float]:
     """Return positive numbers by the names of simulators; raise if they are no such numbers."""
     if not isinstance(epsilon, Mapping):
-        raise TypeError(
-            f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
-            'positive numbers, such as {"y": 0.1}'
+        raise wrong_value(
+            epsilon,
+            "epsilon",
+            'a mapping of names of simulators to positive numbers, such as {"y": 0.1}',
         )
     names = [simulator.name for simulator in simulators]
     unknown = sorted(map(str, set(epsilon) - set(names)))

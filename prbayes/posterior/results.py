@@ -20,8 +20,8 @@ from prbayes._validate import (
     NamedArrays,
     NamedValues,
     Record,
-    called,
     flag,
+    wrong_value,
 )
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
@@ -362,7 +362,7 @@ def require_selection(
     if var_names is not None:
         names = [var_names] if isinstance(var_names, str) else var_names  # type: ignore[assignment]
         if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
-            raise TypeError(f"var_names: got {called(var_names)}, expected names of variables")
+            raise wrong_value(var_names, "var_names", "names of variables")
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         unknown = [name for name in names if name not in variables]
         if unknown or not names:
@@ -370,7 +370,7 @@ def require_selection(
     if idata_kwargs is None:
         return names, {}
     if not isinstance(idata_kwargs, Mapping):
-        raise TypeError(f"idata_kwargs: got {called(idata_kwargs)}, expected a dict")
+        raise wrong_value(idata_kwargs, "idata_kwargs", "a dict")
     expected = ["coords", "dims", "log_likelihood", "log_prior"]
     unknown = sorted(map(str, set(idata_kwargs) - set(expected)))
     if unknown:
@@ -382,7 +382,7 @@ def require_selection(
         if name.startswith("log"):
             flag(value, f"idata_kwargs: {name}")
         elif not isinstance(value, Mapping):
-            raise TypeError(f"idata_kwargs: {name}: got {called(value)}, expected a dict")
+            raise wrong_value(value, f"idata_kwargs: {name}", "a dict")
     return names, dict(idata_kwargs)
 
 

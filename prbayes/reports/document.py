@@ -26,6 +26,7 @@ from prbayes._validate import (
     folder_path,
     plain_text,
     wrong_type,
+    wrong_value,
 )
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.fleet import fleet_sections
@@ -153,9 +154,7 @@ class Report:
         plain_text(note or "", "Report: note", empty=True)
         flag(pictures, "Report: pictures")
         if not isinstance(sections, Sequence):
-            raise TypeError(
-                f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
-            )
+            raise wrong_value(sections, "Report: sections", "prb.reports.Section objects")
         contents = tuple(sections)
         fleet: Any = posterior
         if not contents and is_fleet(fleet):
@@ -208,7 +207,7 @@ class Report:
             If no section has that title.
         """
         if not isinstance(section, Section):
-            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
+            raise wrong_value(section, "section", "a prb.reports.Section")
         place = len(self.sections)
         if after is not None:
             titles = [section.title for section in self.sections]

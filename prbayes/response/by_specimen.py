@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from prbayes._validate import Function, Indices, called
+from prbayes._validate import Function, Indices, called, wrong_value
 from prbayes.response.call import scalar, unwrapped
 
 
@@ -149,9 +149,10 @@ def by_specimen(
     else:
         is_table = isinstance(records, Mapping | str | bytes) or hasattr(records, "columns")
         if is_table or not hasattr(records, "__len__"):
-            raise TypeError(
-                f"{caller}: records: got {called(records)}, expected a list with the record of "
-                "each specimen, beside one function"
+            raise wrong_value(
+                records,
+                f"{caller}: records",
+                "a list with the record of each specimen, beside one function",
             )
         objects = list(cast(Sequence[Any], records))
         separate = [_with_record(functions, record) for record in objects]

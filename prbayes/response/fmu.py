@@ -40,6 +40,7 @@ from prbayes._validate import (
     flag,
     positive_number,
     real_array,
+    wrong_value,
 )
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
@@ -179,7 +180,7 @@ def _names(argument: str, value: object) -> dict[str, str]:
         pairs = [(name, name) for name in value]
     are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
     if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
-        raise TypeError(f"fmu: {argument}: got {called(value)}, expected {expected}")
+        raise wrong_value(value, f"fmu: {argument}", f"{expected}")
     return dict(pairs)
 
 
@@ -187,9 +188,10 @@ def _parameter_values(parameters: object) -> dict[str, Value]:
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
-        raise TypeError(
-            f"fmu: parameters: got {called(parameters)}, expected a mapping of the unit's "
-            'variables to their values, such as {"mass.m": 2.0}'
+        raise wrong_value(
+            parameters,
+            "fmu: parameters",
+            'a mapping of the unit\'s variables to their values, such as {"mass.m": 2.0}',
         )
     values = {name: v.item() if isinstance(v, np.generic) else v for name, v in parameters.items()}
     for name, value in values.items():

@@ -24,9 +24,9 @@ from prbayes._validate import (
     Indices,
     Record,
     Shape,
-    called,
     executes,
     folder_path,
+    wrong_value,
 )
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
@@ -75,9 +75,10 @@ def refuse_uncallable(
     ``order`` is that of the arguments of the function that was called.
     """
     if not callable(function) or isinstance(function, type):
-        raise TypeError(
-            f"{name}: {argument}: got {called(function)}, expected a function of the inputs, such "
-            f"as lambda x: x**2; the order is {order}"
+        raise wrong_value(
+            function,
+            f"{name}: {argument}",
+            f"a function of the inputs, such as lambda x: x**2; the order is {order}",
         )
 
 
@@ -117,14 +118,16 @@ def check_call_settings(
     if store is not None:
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
-        raise TypeError(
-            f"version: got {called(version)}, expected a text that names the response as it is, "
-            "such as '2' or 'mesh 3, solver 1.4'"
+        raise wrong_value(
+            version,
+            "version",
+            "a text that names the response as it is, such as '2' or 'mesh 3, solver 1.4'",
         )
     if not isinstance(on_failure, OnFailure):
-        raise TypeError(
-            f"on_failure: got {called(on_failure)}, expected prb.response.Abort(), "
-            "prb.response.Replace() or prb.response.Retry()"
+        raise wrong_value(
+            on_failure,
+            "on_failure",
+            "prb.response.Abort(), prb.response.Replace() or prb.response.Retry()",
         )
 
 

@@ -15,7 +15,14 @@ from scipy.special import ndtri
 from prbayes._display import Table, View
 from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, NamedArrays, NamedValues, Record, called, wrong_type
+from prbayes._validate import (
+    Floats,
+    NamedArrays,
+    NamedValues,
+    Record,
+    wrong_type,
+    wrong_value,
+)
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
@@ -176,17 +183,13 @@ def _refuse_wrong_arguments(results: Any, metrics: Any) -> None:
     for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
         refuse_model(result, "compare: results")
     if not isinstance(results, Mapping):
-        raise TypeError(
-            f"compare: results: got {called(results)}, expected a mapping such as "
-            "{'optimum': optimum, 'ABC': idata}"
+        raise wrong_value(
+            results, "compare: results", "a mapping such as {'optimum': optimum, 'ABC': idata}"
         )
     if metrics is not None and not (
         isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
     ):
-        raise TypeError(
-            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
-            "[prb.AreaMetric()]"
-        )
+        raise wrong_value(metrics, "compare: metrics", "metric objects, such as [prb.AreaMetric()]")
     if not results:
         raise ValueError(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"

@@ -23,6 +23,7 @@ from prbayes._validate import (
     flag,
     positive_integer,
     seed_number,
+    wrong_value,
 )
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets
@@ -436,9 +437,10 @@ def rank(
 def _require_candidates(candidates: object) -> None:
     """Raise unless this is a mapping with two or more optima or cross-validations."""
     if not isinstance(candidates, Mapping):
-        raise TypeError(
-            f"rank: candidates: got {called(candidates)}, expected a mapping such as "
-            "{'normal': optimum, 'lognormal': other}"
+        raise wrong_value(
+            candidates,
+            "rank: candidates",
+            "a mapping such as {'normal': optimum, 'lognormal': other}",
         )
     if len(candidates) < 2:
         raise ValueError(

@@ -24,10 +24,10 @@ from prbayes._validate import (
     Floats,
     Indices,
     StrPath,
-    called,
     positive_integer,
     positive_number,
     share,
+    wrong_value,
 )
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points
@@ -402,9 +402,10 @@ class JointNull(Null):
             if isinstance(self.responses, Mapping):
                 tested = list(self.responses.values())
             if not tested or not all(isinstance(t, tuple) and t and callable(t[0]) for t in tested):
-                raise TypeError(
-                    f"JointNull: responses: got {called(self.responses)}, expected a tuple "
-                    "(response, *inputs), or a mapping of conditions to such"
+                raise wrong_value(
+                    self.responses,
+                    "JointNull: responses",
+                    "a tuple (response, *inputs), or a mapping of conditions to such",
                 )
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)

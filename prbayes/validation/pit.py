@@ -24,11 +24,11 @@ from prbayes._validate import (
     Names,
     Seed,
     Shape,
-    called,
     flag,
     real_array,
     sample_labels,
     seed_number,
+    wrong_value,
 )
 from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
@@ -452,9 +452,8 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     pairs = []
     for name, y, prediction, _ in _by_condition(observed, predicted, None):
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
-            raise TypeError(
-                f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
-                "prb.predict"
+            raise wrong_value(
+                prediction, f"{caller}: {name}: predicted", "the DataArray of prb.predict"
             )
         values = real_array(y, f"{caller}: {name}: observed")
         dims = [dim for dim in prediction.dims if dim not in _SAMPLE_DIMS]
