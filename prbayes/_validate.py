@@ -92,6 +92,22 @@ def unmasked(values: Any) -> Any:
     return np.ma.filled(values.astype(np.float64) if values.dtype.kind in "biu" else values, np.nan)
 
 
+def complete_rows(values: Floats) -> Bools:
+    """Return which rows of a matrix have finite numbers only, (n, m) -> (n,)."""
+    is_complete: Bools = np.isfinite(values).all(axis=1)
+    return is_complete
+
+
+def finite_or_nan(values: Floats) -> Floats:
+    """Return values with NaN in place of infinite ones."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def flat_rows[T: np.generic](values: NDArray[T]) -> NDArray[T]:
+    """Return the values of each specimen, or other row, as a vector, (n, ...) -> (n, m)."""
+    return values.reshape(len(values), -1)
+
+
 def real_array(values: ArrayLike, name: str) -> Floats:
     """Return values as a float array, NaN where masked; a `TypeError` if they are not numbers."""
     try:

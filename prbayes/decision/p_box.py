@@ -14,7 +14,15 @@ import xarray as xr
 from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import ArrayPair, Floats, Function, StrPath, positive_integer, share
+from prbayes._validate import (
+    ArrayPair,
+    Floats,
+    Function,
+    StrPath,
+    complete_rows,
+    positive_integer,
+    share,
+)
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
@@ -259,4 +267,4 @@ def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
     functions = sample.evaluate(
         lambda values, weights: distribution_function(values, weights, y), sample.populations.thetas
     )
-    return functions[np.isfinite(functions).all(axis=1)]
+    return functions[complete_rows(functions)]

@@ -23,6 +23,8 @@ from prbayes._validate import (
     Function,
     StrPath,
     called,
+    complete_rows,
+    flat_rows,
     positive_integer,
     positive_number,
     wrong_value,
@@ -418,7 +420,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     is_observable = observable(sample.outputs, node.target)
     values = sample.outputs[is_observable]
     mass = sample.masses(center[None])[0, is_observable]
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    order = np.argsort(flat_rows(values)[:, 0])
     rows = order[reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)]
     target = (metric or node.metric).against(values[rows])
     bound = design.copied(design.design.with_values(sample.outputs))
@@ -543,7 +545,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     if sample.design.has_runs:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
     else:
-        is_observable = np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+        is_observable = complete_rows(flat_rows(outputs))
     is_used = (weights[0] > 0) & is_observable
     weights = weights[:, is_used]
     with np.errstate(divide="ignore", invalid="ignore"):

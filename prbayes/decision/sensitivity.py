@@ -19,7 +19,16 @@ from scipy.stats import rankdata
 
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, report, sentences_of
-from prbayes._validate import ArrayPair, Floats, Seed, StrPath, flag, positive_integer, seed_number
+from prbayes._validate import (
+    ArrayPair,
+    Floats,
+    Seed,
+    StrPath,
+    finite_or_nan,
+    flag,
+    positive_integer,
+    seed_number,
+)
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
@@ -290,7 +299,7 @@ def _hyperparameter_indices(
             "populations, expected one in all but 1%; where specimens fail, ask for a smaller "
             "probability, or an Exceedance"
         )
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = finite_or_nan(values)
     indices = []
     sds = np.repeat([c.conditional_sd for c in copulas], REPLICATES // n_blocks, axis=0)
     for i, step in enumerate(np.eye(d) * _STEP / 2):

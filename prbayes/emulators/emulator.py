@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from prbayes._validate import ArrayPair, Bools, Floats, Indices
+from prbayes._validate import ArrayPair, Bools, Floats, Indices, complete_rows, flat_rows
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
@@ -193,7 +193,7 @@ def with_failures(values: Floats, points: Floats, runs: Floats, outputs: Floats)
     Points (k, d) and runs (n, d) have common units. Outputs (n, ...) of runs that failed are not
     finite. The values are overwritten.
     """
-    has_failed = ~np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+    has_failed = ~complete_rows(flat_rows(outputs))
     if has_failed.any():
         from scipy.spatial import cKDTree
 

@@ -15,6 +15,7 @@ from prbayes._validate import (
     Floats,
     Indices,
     Names,
+    finite_or_nan,
     positive_integer,
     real_array,
     sample_weights,
@@ -129,7 +130,7 @@ def components_of(target: Discrepancy) -> tuple[Components, ...]:
 
 def failure_caps(observed: Floats) -> Floats:
     """Return the value of a failure in each output: the largest observed one plus the range."""
-    finite = np.where(np.isfinite(observed), observed, np.nan)
+    finite = finite_or_nan(observed)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)
     return np.asarray(highest + (highest - lowest))

@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 
 from prbayes._finding import counted
 from prbayes._stats import quantile
-from prbayes._validate import ArrayPair, Floats, Indices
+from prbayes._validate import ArrayPair, Floats, Indices, complete_rows
 from prbayes.metrics.density import spread
 
 # Largest number of outputs that are compared without principal components. Eight outputs need
@@ -56,7 +56,7 @@ class Components:
     def share_left_out(self, values: Floats, weights: Floats) -> float:
         """Return the share of the variance of a population, (n, m), that they leave out."""
         values = values[:, self.outputs]
-        is_usable = np.isfinite(values).all(axis=1) & (weights > 0)
+        is_usable = complete_rows(values) & (weights > 0)
         values = values[is_usable]
         weights = weights[is_usable]
         deviations = values - np.average(values, axis=0, weights=weights)

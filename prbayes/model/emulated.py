@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from scipy.special import logsumexp, ndtr
 
-from prbayes._validate import AT_ONCE, ArrayFunction, Bools, Floats, Indices, Shape
+from prbayes._validate import AT_ONCE, ArrayFunction, Bools, Floats, Indices, Shape, complete_rows
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -120,7 +120,7 @@ class EmulatedResponse:
         if not self.is_continued or not rows.size:
             return 0.0
         columns = values.reshape(len(z), -1)
-        finite = columns[np.isfinite(columns).all(axis=1)]
+        finite = columns[complete_rows(columns)]
         steeper = self.steepened([x[rows] for x in inputs]).reshape(len(rows), -1)
         with np.errstate(invalid="ignore"):  # Infinite outputs, of failed specimens, stay.
             change = np.abs(steeper - columns[rows])
@@ -291,7 +291,7 @@ def emulator_of(
     coordinates = Coordinates.of_prior(responses.inputs)
     z = coordinates.of(points, 1)
     y = values.reshape(len(z), -1)
-    is_finite = np.isfinite(y).all(axis=1)
+    is_finite = complete_rows(y)
     if is_finite.sum() < 8:
         raise DesignError(
             f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
@@ -346,7 +346,7 @@ def _emulator_through(
     coordinates: Coordinates, z: Floats, y: Floats, is_near: Bools, event: Shape
 ) -> EmulatedResponse:
     """Return the emulator of the finite ones of the runs y at z; errors are those of near runs."""
-    is_finite = np.isfinite(y).all(axis=1)
+    is_finite = complete_rows(y)
     _, distinct = np.unique(z[is_finite], axis=0, return_index=True)
     rows = np.flatnonzero(is_finite)[distinct]
     near = is_near[rows]

@@ -22,7 +22,7 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Names, Record, Shape, require_format
+from prbayes._validate import Floats, Names, Record, Shape, flat_rows, require_format
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
@@ -203,7 +203,7 @@ def _simulator_identity(
 
 def _in_fixed_order(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
     """Return data in sorted order, because a metric does not depend on the order of specimens."""
-    order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
+    order = np.lexsort((weights, *flat_rows(observed).T[::-1]))
     return observed[order], weights[order], None if labels is None else labels[order]
 
 

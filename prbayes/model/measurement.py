@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, Indices, NamedValues, Record, Shape
+from prbayes._validate import Floats, Indices, NamedValues, Record, Shape, flat_rows
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
@@ -71,7 +71,7 @@ class Measurement:
     @property
     def rows(self) -> Floats:
         """Observed values, (N, m)."""
-        return self.observed.reshape(len(self.observed), -1)
+        return flat_rows(self.observed)
 
     @property
     def gross_errors(self) -> Any:

@@ -23,7 +23,9 @@ from prbayes._validate import (
     Labels,
     Names,
     called,
+    finite_or_nan,
     flag,
+    flat_rows,
     observed_sample,
     plain_text,
     positive_number,
@@ -626,7 +628,7 @@ def _checked_specimens(arguments: _Arguments) -> Floats:
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
             f"2 specimens; {NO_POPULATION}"
         )
-    rows = values.reshape(len(values), -1)
+    rows = flat_rows(values)
     if np.isnan(rows).all(axis=1).any():
         row = int(np.flatnonzero(np.isnan(rows).all(axis=1))[0])
         raise ValueError(
@@ -807,7 +809,7 @@ def _prepared_metric(
 
 def try_function(target: Discrepancy) -> None:
     """Call a user's function before any run, for two populations in the range of the data."""
-    finite = np.where(np.isfinite(target.observed), target.observed, np.nan)
+    finite = finite_or_nan(target.observed)
     low, high = np.nanmin(finite, axis=0), np.nanmax(finite, axis=0)
     trial = np.linspace(low, high, 2 * len(finite)).reshape(2, *finite.shape)
     with np.errstate(all="ignore"):

@@ -25,7 +25,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Bools, Floats, Indices, wrong_value
+from prbayes._validate import Bools, Floats, Indices, flat_rows, wrong_value
 from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -260,7 +260,7 @@ def _of_points(
     if likelihood.error_is_known:
         return points.log_likelihoods(parents)
     result = np.empty((len(errors), len(rows)))
-    order = np.lexsort(errors.reshape(len(errors), -1).T)
+    order = np.lexsort(flat_rows(errors).T)
     of_readings = _reading_density(likelihood).at_errors(errors[order])
     of_points = points.log_densities([p[order] for p in parents])
     for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):

@@ -14,7 +14,7 @@ from typing import cast
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Function
+from prbayes._validate import Bools, Floats, Function, complete_rows
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.metrics.readings import robust_spread
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
@@ -123,7 +123,7 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
             "expected ranges that overlap; check the units, and the order of the inputs"
         )
     z = np.unique(np.concatenate(runs), axis=0)
-    z = z[np.isfinite(z).all(axis=1)]
+    z = z[complete_rows(z)]
     y = OfTables.of(likelihood, Runs.__call__)(z)
     near = z[near_readings(y, data.readings)]
     residuals = OfTables.of(likelihood, left_out_nearby)(near)

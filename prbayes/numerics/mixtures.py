@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._stats import reached
-from prbayes._validate import ArrayPair, Floats
+from prbayes._validate import ArrayPair, Floats, complete_rows
 from prbayes.numerics.points import sobol
 
 
@@ -66,7 +66,7 @@ def pareto_smoothed(log_w: Floats) -> ArrayPair:
         quantiles = np.expm1(-k * log_p) / k
         smoothed = np.log(cutoff + sigma * quantiles)
     k[quarter <= tail[:, :1]] = np.nan
-    is_smoothed = np.isfinite(smoothed).all(axis=1)
+    is_smoothed = complete_rows(smoothed)
     is_smoothed &= np.isfinite(k[:, 0])
     rows = np.flatnonzero(is_smoothed)
     result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)

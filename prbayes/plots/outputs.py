@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import ArrayPair, Floats, Labels, Record
+from prbayes._validate import ArrayPair, Floats, Labels, Record, complete_rows
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
@@ -245,7 +245,7 @@ def _range(output: Output, population: ArrayPair, tail: float) -> Limits:
 def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> ArrayPair:
     """Return the points, (n, 2), that have two outputs, and their weights."""
     points = np.column_stack([x.of(values), y.of(values)])
-    finite = np.isfinite(points).all(axis=1)
+    finite = complete_rows(points)
     return points[finite], weights[finite]
 
 

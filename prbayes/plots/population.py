@@ -11,7 +11,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import ArrayPair, Floats, Labels, Record, share
+from prbayes._validate import ArrayPair, Floats, Labels, Record, complete_rows, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.margins import Margin, margins
@@ -150,7 +150,7 @@ def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float
     n = max(2, 200_000 // len(ensemble.mixture))
     draws = _draws(ensemble.evaluator, x.node, ensemble.mixture, n, seed=0)
     points = np.column_stack([_values(draws, margin).ravel() for margin in (x, y)])
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[complete_rows(points)]
     weights = np.full(len(points), 1 / len(points))
     half, region = outlines(points, weights, (0.5, prob))
     for gid, p, line, style in (("half", 0.5, half, "--"), ("region", prob, region, "-")):

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL, distribution_function, positive_scale
-from prbayes._validate import ArrayPair, Floats, Labels, Record, flag, share
+from prbayes._validate import ArrayPair, Floats, Labels, Record, finite_or_nan, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
@@ -258,7 +258,7 @@ class _Drawing:
             center, unit = np.zeros(places.size), np.ones(places.size)
         else:  # Outputs with names have different units: each is divided by its spread.
             places = np.arange(len(outputs.labels), dtype=np.float64)
-            finite = np.where(np.isfinite(observed), observed, np.nan)
+            finite = finite_or_nan(observed)
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), positive_scale(spread)
             _name_ticks(axis, places, outputs.names)

@@ -26,6 +26,7 @@ from prbayes._validate import (
     NamedArrays,
     Record,
     StrPath,
+    complete_rows,
     positive_integer,
     real_array,
     require_format,
@@ -331,7 +332,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
         if rv_names[name] not in start:
             thetas[:, first : first + size] = values[name].reshape(draws, size)
         first += size
-    finite = np.isfinite(thetas).all(axis=1)
+    finite = complete_rows(thetas)
     outside = ~(finite & in_support(hyperparameters, np.where(finite[:, None], thetas, 0.0)))
     if outside.any():
         raise ValueError(

@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import p_digits, percentage
 from prbayes._finding import counted, from_json
 from prbayes._stats import INTERVAL
-from prbayes._validate import Labels, NamedValues, Names, Record
+from prbayes._validate import Labels, NamedValues, Names, Record, finite_or_nan
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
     element_name,
@@ -576,7 +576,7 @@ def measured_values(m: Material) -> list[Section]:
 
 def _correlations(name: str, y: Observed) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    columns = {output: np.where(np.isfinite(x), x, np.nan) for output, _, x in shown_columns(y)}
+    columns = {output: finite_or_nan(x) for output, _, x in shown_columns(y)}
     r = pd.DataFrame(columns).corr(min_periods=3).values
     about = "Each of the specimens that have both outputs, without those that failed."
     table = correlation_table(list(columns), r, 3)

@@ -30,6 +30,7 @@ from prbayes._validate import (
     Indices,
     Names,
     Shape,
+    complete_rows,
     unmasked,
 )
 from prbayes.response.budget import BudgetError, budget
@@ -649,7 +650,7 @@ def revealing_rows(values: Floats) -> Indices:
 
 def finite_runs(values: Floats) -> Indices:
     """Return the rows of responses, (n,) or (n, m), all outputs of which are finite."""
-    return np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
+    return np.flatnonzero(complete_rows(by_output(values)))
 
 
 def tolerance_of(values: Floats, share: float = 0.0) -> Any:

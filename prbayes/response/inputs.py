@@ -25,6 +25,7 @@ from prbayes._validate import (
     Labels,
     Record,
     Shape,
+    flat_rows,
     plain_text,
     real_array,
 )
@@ -128,7 +129,7 @@ class Inputs:
         Covariates, (k,) or (k, m), are repeated cyclically to (k, n).
         """
         return [
-            p.reshape(len(p), -1)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
+            flat_rows(p)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
             for r, p in zip(self.parents, params, strict=True)
         ]
 

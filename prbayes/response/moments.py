@@ -11,7 +11,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from scipy.special import ndtr
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, finite_or_nan
 from prbayes.response.compile import PLAIN, compile_batched, interpreted
 from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, quantiles
@@ -130,4 +130,4 @@ class InputMoments:
             below = np.tril(np.ones(correlation.shape[1:], dtype=bool), -1)
             rows = np.where(below, correlation, np.nan)  # a column for each earlier element
             numbers = np.concatenate([numbers, np.swapaxes(rows, 1, 2)[:, :-1]], axis=1)
-        return np.where(np.isfinite(numbers), numbers, np.nan)
+        return finite_or_nan(numbers)

@@ -16,7 +16,7 @@ from scipy.special import softmax
 
 from prbayes._finding import Finding, Findings, counted
 from prbayes._stats import positive_scale
-from prbayes._validate import ArrayPair, Floats, Names
+from prbayes._validate import ArrayPair, Floats, Names, complete_rows
 from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
@@ -396,7 +396,7 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
         return Checked(remarks=(Finding("prior-agrees", text),))
     prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
-    if np.isfinite(predictive).all(axis=1).mean() < 0.5:
+    if complete_rows(predictive).mean() < 0.5:
         reason = "the information of most populations of the prior is not finite"
         return _not_tested(_CONFLICT, reason)
     findings = conflict_findings(names, prior, optimum.theta, errors, mean, predictive)

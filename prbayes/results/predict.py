@@ -27,6 +27,7 @@ from prbayes._validate import (
     Record,
     Seed,
     StrPath,
+    complete_rows,
     finite_number,
     flag,
     plain_text,
@@ -640,7 +641,7 @@ def _checked_responses(
         findings = report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)
-        is_finite = np.isfinite(flat).all(axis=1)
+        is_finite = complete_rows(flat)
         spread = np.full(error.shape, np.nan)
         if is_finite.any():
             # Quartiles as well, because few specimens beside a pole have most of the variance.

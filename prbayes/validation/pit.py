@@ -24,6 +24,7 @@ from prbayes._validate import (
     Names,
     Seed,
     Shape,
+    complete_rows,
     flag,
     real_array,
     sample_labels,
@@ -317,7 +318,7 @@ def projections(pool: Floats) -> list[Projection]:
     m = pool.shape[-1]
     rows = pool.reshape(-1, m)
     rows = rows[~np.isnan(rows).any(axis=1)]
-    finite = rows[np.isfinite(rows).all(axis=1)]
+    finite = rows[complete_rows(rows)]
     # 4096 specimens determine correlations to .02. The test has the right size for any directions.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
