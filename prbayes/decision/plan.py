@@ -461,7 +461,7 @@ class ReadingErrors:
     """Errors, rounding and limits of the readings of a response."""
 
     readings: Readings  # readings whose errors and steps apply, and repeat if there are more points
-    unknown: Variable[Any, Any] | None  # model variable that is the error, if it is unknown
+    unknown: Variable | None  # model variable that is the error, if it is unknown
     limits: tuple[Any, Any]  # lower and upper limits, NaN without a limit
 
     @classmethod

@@ -170,7 +170,7 @@ class Populations:
         responses = self.responses(response, inputs)
         population = responses.inputs
         simulator = serving(self.evaluator.simulators, responses)
-        replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+        replaced: dict[Variable, Variable] = {}
         if simulator is None:
             simulator, replaced = replaced_inputs(self.evaluator.emulated, responses)
             places = {new: old for old, new in replaced.items()}

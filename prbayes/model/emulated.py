@@ -146,7 +146,7 @@ def values_of_inputs(
     values: Sequence[Floats],
     inputs: Inputs,
     subset: Inputs,
-    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]] = MappingProxyType({}),
+    replaced: Mapping[Variable, Variable] = MappingProxyType({}),
 ) -> list[Floats]:
     """Return the values of a subset of the inputs, from those of all inputs of a response.
 
@@ -360,7 +360,7 @@ def _emulator_through(
 
 def replaced_inputs(
     simulators: Sequence[EmulatedSimulator], responses: Responses
-) -> tuple[EmulatedSimulator | None, dict[Variable[Any, Any], Variable[Any, Any]]]:
+) -> tuple[EmulatedSimulator | None, dict[Variable, Variable]]:
     """Return a simulator whose inputs a response has from another population, and which are which.
 
     The response of the simulator has its inputs in the same places. Another response has inputs of
@@ -378,9 +378,7 @@ def replaced_inputs(
     return None, {}
 
 
-def _replaced(
-    simulator: EmulatedSimulator, responses: Responses
-) -> dict[Variable[Any, Any], Variable[Any, Any]]:
+def _replaced(simulator: EmulatedSimulator, responses: Responses) -> dict[Variable, Variable]:
     """Return the inputs of a response by the simulator's inputs in whose place they are."""
     model_inputs, inputs = simulator.inputs, responses.inputs
     if responses.function is not simulator.responses.function:
@@ -434,7 +432,7 @@ class EmulatedSample:
     inputs: Inputs  # inputs of the simulator, or of another population
     n_points: int  # number of specimens
     # inputs of the simulator that are those of another population here
-    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]]
+    replaced: Mapping[Variable, Variable]
     density: PopulationDensity
     # Whether the points are spread evenly over the tails, by inverse distribution functions.
     has_tails: bool
@@ -452,7 +450,7 @@ class EmulatedSample:
         simulator: EmulatedSimulator,
         parents: Sequence[Floats],
         inputs: Inputs,
-        replaced: Mapping[Variable[Any, Any], Variable[Any, Any]],
+        replaced: Mapping[Variable, Variable],
     ) -> EmulatedSample:
         """Draw specimens of inputs from populations at parents, shapes (k, *shape)."""
         places = np.linspace(0, len(parents[0]) - 1, _SIZES.populations)
