@@ -44,6 +44,7 @@ Shape = tuple[int, ...]  # sizes of the axes of an array
 Labels = Mapping[str, str]  # labels, units or other texts by name
 StrPath = str | os.PathLike[str]  # path of a file or folder
 NamedArrays = dict[str, Floats]  # arrays by name
+ArraysByName = Mapping[str, Floats]  # the same, which are only read
 NamedValues = Mapping[str, Any]  # values of any type by name, which are only read
 Record = dict[str, Any]  # values of any type by name, such as a row of a table
 Names = tuple[str, ...]  # names or other texts, in a fixed order

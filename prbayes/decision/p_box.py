@@ -163,7 +163,8 @@ def p_box(
 
     def tails(sample: ResponseSample) -> str:
         populations = sample.populations
-        functions = [_mean_function(replace(x, populations=populations), y) for x in samples]
+        at_populations = [replace(x, populations=populations) for x in samples]
+        functions = [_distribution_functions(x, y).mean(axis=0) for x in at_populations]
         low = min(_place(function, y, 0.01) for function in functions)
         high = max(_place(function, y, 0.99) for function in functions)
         return f"{low:.4g} and {high:.4g}"
@@ -254,12 +255,6 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     # Specimens without response may be above all values, or below them.
     lower, upper = lower * (1 - sample.lost), upper * (1 - sample.lost) + sample.lost
     return lower, upper, mean, error
-
-
-def _mean_function(sample: ResponseSample, y: Floats) -> Floats:
-    """Return the distribution function of a new specimen at y, (m,)."""
-    functions = _distribution_functions(sample, y)
-    return np.asarray(functions.mean(axis=0))
 
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:

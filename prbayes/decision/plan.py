@@ -253,11 +253,9 @@ def plan(
 
 def _with_findings_of(candidates: Mapping[str, Condition], findings: Findings) -> Findings:
     """Return findings and those of the candidates' responses, each once."""
-    of_candidates = [findings_of(condition.response) for condition in candidates.values()]
-    distinct = dict.fromkeys(findings)
-    for of_response in of_candidates:
-        distinct.update(dict.fromkeys(of_response))
-    return tuple(distinct)
+    responses = [condition.response for condition in candidates.values()]
+    of_candidates = [finding for response in responses for finding in findings_of(response)]
+    return tuple(dict.fromkeys([*findings, *of_candidates]))
 
 
 def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import ArraysByName, Floats
 from prbayes.response.inputs import Inputs
 
 
-def stacked_values(values: Mapping[str, Floats]) -> Floats | None:
+def stacked_values(values: ArraysByName) -> Floats | None:
     """Return the values of conditions, (N,) by name, as an array (N, C); None without one."""
     return np.stack(list(values.values()), axis=1) if values else None
 

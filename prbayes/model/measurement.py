@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, Indices, NamedValues, Record, Shape, flat_rows
+from prbayes._validate import ArraysByName, Floats, Indices, NamedValues, Record, Shape, flat_rows
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
@@ -54,7 +54,7 @@ class Measurement:
     outputs: Outputs
     groups: Indices | None = None  # (N,): index of each specimen's group
     # Conditions on which the population of a specimen depends, as values (N,) by name.
-    covariates: Mapping[str, Floats] = field(default_factory=dict)
+    covariates: ArraysByName = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
     # Whether outputs are readings at values of a vector condition, or of functions by specimen.
     at_conditions: bool = False
@@ -401,9 +401,7 @@ class SpecimenLikelihood:
         """The index of each group, None without groups, and its specimens."""
         return rows_by_group(self.stacked.groups, len(self.readings))
 
-    def parents(
-        self, values: Mapping[str, Floats], group: int | None, specimens: Indices
-    ) -> list[Floats]:
+    def parents(self, values: ArraysByName, group: int | None, specimens: Indices) -> list[Floats]:
         """Return the parents of the inputs of specimens in a group, (P, *shape).
 
         Values are those of the model's variables by name, (P, *shape). The covariates of specimens,

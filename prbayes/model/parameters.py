@@ -22,6 +22,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._validate import (
     ArrayFunction,
+    ArraysByName,
     Floats,
     Indices,
     NamedArrays,
@@ -343,7 +344,7 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, I
 
 
 def parent_values(
-    values: Mapping[str, Floats], inputs: Inputs, group: int | None, covariates: Sequence[Floats]
+    values: ArraysByName, inputs: Inputs, group: int | None, covariates: Sequence[Floats]
 ) -> list[Floats]:
     """Return the parents of inputs, in the group with this index, shapes (P, *shape).
 

@@ -8,7 +8,7 @@ cost no run: these are the observed specimens with other weights, or simulated s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,7 +19,7 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._stats import positive_scale
-from prbayes._validate import IN_CACHE, ArrayPair, Bools, Floats, Indices, NamedArrays
+from prbayes._validate import IN_CACHE, ArrayPair, ArraysByName, Bools, Floats, Indices, NamedArrays
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -680,7 +680,7 @@ class _Copies:
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    values: Mapping[str, Floats],
+    values: ArraysByName,
     rng: np.random.Generator,
     size: int = 2000,
 ) -> Callable[[np.random.Generator], SpecimenData]:

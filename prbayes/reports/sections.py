@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
-from prbayes._finding import counted, from_json
+from prbayes._finding import counted, sentences_of
 from prbayes._stats import INTERVAL
 from prbayes._validate import Labels, NamedValues, Names, Record, finite_or_nan
 from prbayes.model.description import labelled
@@ -206,8 +206,8 @@ def diagnostics(m: Material) -> list[Section]:
         for sentence in (*diagnosis.notes, *diagnosis.untested):
             remarks.setdefault(sentence, []).append(label)
     for label, table in m.decisions.items():
-        for finding in from_json(str(table.attrs.get("findings", "[]"))):
-            problems.setdefault(str(finding), []).append(label)
+        for sentence in sentences_of(table.attrs):
+            problems.setdefault(sentence, []).append(label)
     if not problems:
         return []
     sections = [Section("Diagnostics", _with_labels(problems))]

@@ -13,9 +13,10 @@ import xarray as xr
 from scipy.special import ndtri
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._finding import Finding, as_json, report, sentences_of
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
+    ArraysByName,
     Floats,
     NamedArrays,
     NamedValues,
@@ -237,7 +238,7 @@ class Comparison(Table):
                 estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
                 shift = f"{float(row['shift']) + 0.0:.2f}"  # The sum turns -0.0 into 0.0.
                 rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}", shift])
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         for key, scores in scores_in(self).items():
             items = scores.to_series().items()
             listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
@@ -292,7 +293,7 @@ def estimates_of(
     return estimates, optimum_elements(point, stderr)
 
 
-def thetas_at(evaluator: Evaluator, elements: Mapping[str, Floats]) -> Floats:
+def thetas_at(evaluator: Evaluator, elements: ArraysByName) -> Floats:
     """Return thetas, (n, d), from elements of the free variables by name, (n,) or (1,) each.
 
     Raises a KeyError if an element is missing.

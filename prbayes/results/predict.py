@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._display import ShownArray, View
-from prbayes._finding import Finding, Findings, as_json, counted, from_json, report
+from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._progress import shown
 from prbayes._stats import positive_scale, reached
 from prbayes._validate import (
+    ArraysByName,
     Floats,
     Function,
     Indices,
@@ -283,7 +284,7 @@ class Prediction(ShownArray, xr.DataArray):
             f"Predicted {self.name}: {size} specimens of each of {populations}, "
             f"from {self.attrs['source']}"
         )
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         failed = float(np.mean(np.isposinf(values)))
         if failed:
             sentences.append(
@@ -315,7 +316,7 @@ def covariate_values(
     label: str,
     inputs: Inputs,
     at: Mapping[str, float] | None,
-    stated: Mapping[str, Floats],
+    stated: ArraysByName,
     size: int,
     *,
     has_runs: bool,
