@@ -41,6 +41,7 @@ _LARGEST = 1e152
 FORMAT = 10
 
 Shape = tuple[int, ...]  # sizes of the axes of an array
+Arrays = Sequence[Floats]  # arrays in a fixed order, such as one for each input
 Labels = Mapping[str, str]  # labels, units or other texts by name
 StrPath = str | os.PathLike[str]  # path of a file or folder
 NamedArrays = dict[str, Floats]  # arrays by name

@@ -19,6 +19,7 @@ from prbayes._stats import INTERVAL, positive_scale, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     ArrayFunction,
+    Arrays,
     Bools,
     Floats,
     Function,
@@ -660,7 +661,7 @@ class _Points:
 
 def rare_event(
     transform: InverseTransform,
-    parents: Sequence[Floats],
+    parents: Arrays,
     respond: ArrayFunction,
     limit: float,
     size: int,
@@ -758,7 +759,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
 
 def _draw_points(
     transform: InverseTransform,
-    parents: Sequence[Floats],
+    parents: Arrays,
     respond: ArrayFunction,
     rng: np.random.Generator,
     proposals: list[_Proposal],

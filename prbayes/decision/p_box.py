@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
 from prbayes._validate import (
     ArrayPair,
+    Arrays,
     Floats,
     Function,
     StrPath,
@@ -219,7 +219,7 @@ def _place(function: Floats, y: Floats, probability: float) -> float:
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 
-def outermost(lower: Sequence[Floats], upper: Sequence[Floats]) -> ArrayPair:
+def outermost(lower: Arrays, upper: Arrays) -> ArrayPair:
     """Return the outermost of bands, (band, y): a bound of a distribution function holds beyond."""
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     flipped = np.minimum.accumulate(np.flip(upper, -1), axis=-1)

@@ -19,6 +19,7 @@ from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._stats import positive_scale, reached
 from prbayes._validate import (
+    Arrays,
     Floats,
     Function,
     StrPath,
@@ -258,7 +259,7 @@ def _with_findings_of(candidates: Mapping[str, Condition], findings: Findings) -
     return tuple(dict.fromkeys([*findings, *of_candidates]))
 
 
-def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
+def _several_modes(populations: Populations, modes: Arrays) -> Findings:
     """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
     page = "likelihood_findings.md#several-modes"
     if isinstance(populations.result, Optimum):
@@ -345,7 +346,7 @@ class _Forecast:
     quantity: Quantity | None
     sample: ResponseSample | None  # responses that the quantity is computed from
 
-    def _thetas(self, information: Sequence[Floats]) -> Floats:
+    def _thetas(self, information: Arrays) -> Floats:
         """Return the draws of all modes after information, (d, d) of each mode."""
         pairs = zip(self.draws, information, strict=True)
         return np.concatenate([draws.with_information(a) for draws, a in pairs])
@@ -368,7 +369,7 @@ class _Forecast:
         assert self.sample is not None
         return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
-    def needed(self, information: Sequence[Floats], name: str, max_sd: float | None) -> float:
+    def needed(self, information: Arrays, name: str, max_sd: float | None) -> float:
         """Return the smallest sufficient number of specimens: inf if none, NaN without a limit."""
         if max_sd is None:
             return np.nan

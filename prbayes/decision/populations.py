@@ -23,6 +23,7 @@ from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     ArrayFunction,
+    Arrays,
     Floats,
     Function,
     Indices,
@@ -296,7 +297,7 @@ class ResponseSample:
         """The specimens, shapes (n, *event), by input."""
         return list(self.design.points_of(self.design.inputs))
 
-    def emulated(self, points: Sequence[Floats]) -> list[Floats]:
+    def emulated(self, points: Arrays) -> list[Floats]:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.
 
         The others differ from it by an estimate of its error: they lack a block of the runs each,
@@ -652,7 +653,7 @@ class InverseTransform:
         """Return the aleatory inputs, shapes (n, *event), of z (n, size)."""
         return self._of_populations(self.parents, z)
 
-    def _of_populations(self, parents: Sequence[Floats], z: Floats) -> list[Floats]:
+    def _of_populations(self, parents: Arrays, z: Floats) -> list[Floats]:
         """Return the aleatory inputs of k populations at z (n, size), shapes (k n, *event)."""
         shapes = self.inputs.event_shapes
         k = len(parents[0]) if parents else 1
@@ -666,7 +667,7 @@ class InverseTransform:
             for v, shape in zip(values, shapes, strict=True)
         ]
 
-    def has_support_of(self, parents: Sequence[Floats]) -> bool:
+    def has_support_of(self, parents: Arrays) -> bool:
         """Return whether the population has a density wherever the k populations of parents do.
 
         Their ends are compared, five standard deviations of z from the middle.

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from prbayes._validate import ArraysByName, Floats
+from prbayes._validate import Arrays, ArraysByName, Floats
 from prbayes.response.inputs import Inputs
 
 
@@ -15,9 +13,7 @@ def stacked_values(values: ArraysByName) -> Floats | None:
     return np.stack(list(values.values()), axis=1) if values else None
 
 
-def at_conditions(
-    inputs: Inputs, specimens: Sequence[Floats], conditions: Floats | None
-) -> list[Floats]:
+def at_conditions(inputs: Inputs, specimens: Arrays, conditions: Floats | None) -> list[Floats]:
     """Return inputs (..., n, *event) with the conditions, (N, C), of specimens in turn."""
     result = list(specimens)
     if conditions is not None:

@@ -21,6 +21,7 @@ from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
 from prbayes._validate import (
     ArrayPair,
+    Arrays,
     Bools,
     Floats,
     Indices,
@@ -181,7 +182,7 @@ def _constant(column: Floats) -> str:
 def check_failing_region(
     name: str,
     observed: Floats,
-    points: Sequence[Floats],
+    points: Arrays,
     responses: Floats,
     max_lost: float,
     remedy: str = "repair the response",

@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from scipy.special import logsumexp, ndtr
 
-from prbayes._validate import AT_ONCE, ArrayFunction, Bools, Floats, Indices, Shape, complete_rows
+from prbayes._validate import (
+    AT_ONCE,
+    ArrayFunction,
+    Arrays,
+    Bools,
+    Floats,
+    Indices,
+    Shape,
+    complete_rows,
+)
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -79,7 +88,7 @@ class EmulatedResponse:
     # Whether responses beyond the runs' range are those at its end, or NaN.
     is_continued: bool = True
 
-    def __call__(self, inputs: Sequence[Floats]) -> Floats:
+    def __call__(self, inputs: Arrays) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
         Beyond the runs' range an input has the response at the end of the range, or NaN. Where
@@ -92,7 +101,7 @@ class EmulatedResponse:
             values[(np.abs(z - ends) > 1e-9).any(axis=1)] = np.nan
         return values.reshape(len(z), *self.event)
 
-    def steepened(self, inputs: Sequence[Floats]) -> Floats:
+    def steepened(self, inputs: Arrays) -> Floats:
         """Return responses that have twice the end slope of the runs' range beyond it.
 
         Their difference from the constant response there estimates its error.
@@ -110,7 +119,7 @@ class EmulatedResponse:
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
 
-    def share_beyond(self, inputs: Sequence[Floats], values: Floats) -> float:
+    def share_beyond(self, inputs: Arrays, values: Floats) -> float:
         """Return the share of specimens, with responses (n, *event), beyond the runs' range.
 
         It counts those that twice the end slope would move by a tenth of the standard deviation.
@@ -143,7 +152,7 @@ class EmulatedResponse:
 
 
 def values_of_inputs(
-    values: Sequence[Floats],
+    values: Arrays,
     inputs: Inputs,
     subset: Inputs,
     replaced: Mapping[Variable, Variable] = MappingProxyType({}),
@@ -250,7 +259,7 @@ class EmulatedSimulator:
 
 
 def draw_specimens(
-    simulator: EmulatedSimulator, inputs: Inputs, parents: Sequence[Floats], n: int
+    simulator: EmulatedSimulator, inputs: Inputs, parents: Arrays, n: int
 ) -> list[Floats]:
     """Return n specimens of each of k populations, (k n, *event) by input."""
     rng = np.random.default_rng(0)
@@ -259,9 +268,7 @@ def draw_specimens(
     return [x.reshape(-1, *x.shape[2:]) for x in specimens]
 
 
-def _at_conditions(
-    simulator: EmulatedSimulator, inputs: Inputs, specimens: Sequence[Floats]
-) -> list[Floats]:
+def _at_conditions(simulator: EmulatedSimulator, inputs: Inputs, specimens: Arrays) -> list[Floats]:
     """Return inputs of specimens with the conditions of those of the simulator in turn."""
     conditions = simulator.measurement.conditions
     rows = None if conditions is None else conditions[simulator.rows]
@@ -269,7 +276,7 @@ def _at_conditions(
 
 
 def emulator_of(
-    simulator: EmulatedSimulator, responses: Responses, specimens: Sequence[Floats]
+    simulator: EmulatedSimulator, responses: Responses, specimens: Arrays
 ) -> EmulatedResponse:
     """Return a response of a simulator's inputs as a function of them.
 
@@ -491,7 +498,7 @@ class EmulatedSample:
         """Return a response of the specimens, (n,) or (n, m)."""
         return _emulator(self, responses)(self.points_of(responses.inputs))
 
-    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+    def emulated(self, responses: Responses, points: Arrays) -> list[Floats]:
         """Return a response at any points, (n,) or (n, m), and with two errors of it.
 
         The errors are that at left-out runs, and that beyond the range of the runs.
@@ -512,7 +519,7 @@ class EmulatedSample:
         with np.errstate(invalid="ignore"):
             return None, normalised_weights(log_p)
 
-    def refuse_unsupported(self, name: str, parents: Sequence[Floats]) -> None:
+    def refuse_unsupported(self, name: str, parents: Arrays) -> None:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(parents)
         size = float(np.median(effective_sample_size(weights)))
@@ -525,7 +532,7 @@ class EmulatedSample:
             )
 
 
-def _squared_scores(inputs: Inputs, scores: Sequence[Floats]) -> Floats:
+def _squared_scores(inputs: Inputs, scores: Arrays) -> Floats:
     """Return the squared lengths of normal scores, (k, n, *event) by input -> (k, n)."""
     total: Any = 0.0
     for dist, z in zip(inputs.aleatory, scores, strict=True):

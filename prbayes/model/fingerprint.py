@@ -11,7 +11,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -22,7 +22,7 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Names, Record, Shape, flat_rows, require_format
+from prbayes._validate import Arrays, Floats, Names, Record, Shape, flat_rows, require_format
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
@@ -221,7 +221,7 @@ def _first_runs(
     Designs grow at their ends, so that the first runs do not change. A likelihood by specimen has
     none before its first use, and a user's own propagation may store no points.
     """
-    points: Sequence[Floats] = ()
+    points: Arrays = ()
     values = np.empty(0)
     if isinstance(simulator, Node):
         values = simulator.bound.first_responses

@@ -22,6 +22,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._validate import (
     ArrayFunction,
+    Arrays,
     ArraysByName,
     Floats,
     Indices,
@@ -188,7 +189,7 @@ class Hyperparameters:
         graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
         return compiled(batched, [graph], allow_input_downcast=True)
 
-    def thetas_of(self, draws: Sequence[Floats]) -> Floats:
+    def thetas_of(self, draws: Arrays) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
         (thetas,) = self._transform(*draws)
         return np.asarray(thetas)
@@ -344,7 +345,7 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, I
 
 
 def parent_values(
-    values: ArraysByName, inputs: Inputs, group: int | None, covariates: Sequence[Floats]
+    values: ArraysByName, inputs: Inputs, group: int | None, covariates: Arrays
 ) -> list[Floats]:
     """Return the parents of inputs, in the group with this index, shapes (P, *shape).
 

@@ -25,7 +25,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import ArraysByName, Bools, Floats, Indices, flat_rows, wrong_value
+from prbayes._validate import Arrays, ArraysByName, Bools, Floats, Indices, flat_rows, wrong_value
 from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -248,7 +248,7 @@ def _gross_share(measurement: Measurement, values: ArraysByName) -> Any:
 def _of_points(
     likelihood: SpecimenLikelihood,
     errors: Floats,
-    parents: Sequence[Floats],
+    parents: Arrays,
     points: WeightedPoints,
     rows: Indices,
     columns: slice = slice(None),
@@ -532,7 +532,7 @@ def population_inputs(
     )
 
 
-def response_at(likelihood: SpecimenLikelihood, inputs: Sequence[Floats]) -> Floats:
+def response_at(likelihood: SpecimenLikelihood, inputs: Arrays) -> Floats:
     """Return the emulated outputs of all simulators at inputs (P, n, *event), (P, n, M).
 
     Beyond the range of the runs the response is that at the end of the range.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from prbayes._finding import Finding
-from prbayes._validate import ArrayPair, Floats
+from prbayes._validate import ArrayPair, Arrays, Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
@@ -161,7 +160,7 @@ def find_local_optima(search: Search, fit: Fit, starts: int) -> list[LocalOptimu
 
 
 def optima_from_prior(
-    reference: Reference, starts: int, seed: int, candidates: Sequence[Floats] = ()
+    reference: Reference, starts: int, seed: int, candidates: Arrays = ()
 ) -> list[LocalOptimum]:
     """Descend from points of the prior and candidates; return the optima that barriers separate.
 

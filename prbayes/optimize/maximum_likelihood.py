@@ -19,7 +19,16 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._stats import positive_scale
-from prbayes._validate import IN_CACHE, ArrayPair, ArraysByName, Bools, Floats, Indices, NamedArrays
+from prbayes._validate import (
+    IN_CACHE,
+    ArrayPair,
+    Arrays,
+    ArraysByName,
+    Bools,
+    Floats,
+    Indices,
+    NamedArrays,
+)
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -844,7 +853,7 @@ class SpecimenRefits:
             thetas, converged = self.fit(weights, stacked)
             yield from zip(thetas, converged, data, strict=True)
 
-    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
+    def reweighted(self, weights: Arrays) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.
 
         ``weights``, (S, n_k), are of the specimens of each of `Evaluator.emulated`, with any sum.

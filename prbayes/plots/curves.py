@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import import_module
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from prbayes._stats import cumulated, positive_scale, quantile
-from prbayes._validate import ArrayPair, Floats
+from prbayes._validate import ArrayPair, Arrays, Floats
 from prbayes.metrics.density import GaussianKDE, silverman
 
 # number of points of a curve; a step is one or two pixels of a panel
@@ -184,7 +184,7 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     return joined
 
 
-def with_gaps(lines: Sequence[Floats]) -> Floats:
+def with_gaps(lines: Arrays) -> Floats:
     """Join lines, (k, 2) each, into one, (2, k), with NaN between them."""
     gap = np.full((1, 2), np.nan)
     parts = [part for line in lines for part in (line, gap)]

@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from prbayes._finding import Finding, Findings, as_json, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
+    Arrays,
     Floats,
     Seed,
     StrPath,
@@ -640,9 +641,9 @@ def run_chains(
     settings: SamplingSettings,
     seeds: Sequence[np.random.SeedSequence],
     log_likelihood: LogDensity | None = None,
-    starts: Sequence[Floats] | None = None,
+    starts: Arrays | None = None,
     checkpoint: Checkpoint | None = None,
-    refinements: Sequence[Floats] = (),
+    refinements: Arrays = (),
 ) -> Chains:
     """Run a chain for each seed on the designs as they are, or as many as a budget allows.
 
@@ -709,7 +710,7 @@ def _saved_states(checkpoint: Checkpoint, round_: int) -> list[State]:
     return states
 
 
-def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence[Floats]) -> None:
+def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Arrays) -> None:
     """Save the states of the kernels that have begun, and refinements."""
     arrays = {f"refined{i}_thetas": thetas for i, thetas in enumerate(refinements)}
     for i, (particles, _) in enumerate(states):

@@ -20,7 +20,7 @@ from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import Floats
+from prbayes._validate import Arrays, Floats
 from prbayes.response.compile import (
     PLAIN,
     compile_batched,
@@ -121,7 +121,7 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
     return rows
 
 
-def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
+def refuse_lopsided(name: str, inputs: Inputs, params: Arrays) -> None:
     """Raise if a covariance is not symmetric, at values of the parents, (k, *shape)."""
     # Densities and draws would read one triangle of the matrix and ignore the other.
     symbols = inputs.placeholders()

@@ -19,6 +19,7 @@ from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
 from prbayes._validate import (
+    Arrays,
     Floats,
     Function,
     Indices,
@@ -149,7 +150,7 @@ class StoredRuns:
     def __getstate__(self) -> Record:
         return {**vars(self), "last": None, "is_repeated": False}
 
-    def at(self, points: Sequence[Floats]) -> Floats | None:
+    def at(self, points: Arrays) -> Floats | None:
         """Return the responses of a stored batch, (n,) or (n, m), None if it is not stored."""
         for stored_points, values in self.stored:
             if _equal(stored_points, points):
@@ -289,7 +290,7 @@ class Responses:
             for x, y in zip(sources, other_sources, strict=True)
         )
 
-    def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
+    def __call__(self, aleatory: Arrays, epistemic: Arrays) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         batch, full = broadcast_batch(values, self.inputs.event_ndims)
@@ -351,7 +352,7 @@ class Responses:
                 self.runs.version = self.watched.version
             yield
 
-    def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
+    def refuse_change(self, points: Arrays, values: Floats, stored: Responses) -> None:
         """Raise if stored runs differ when a part of them is computed again.
 
         ``points`` are those of this response's aleatory inputs, ``values`` their runs, (n,) or
@@ -401,7 +402,7 @@ class Responses:
         self.count += size
         self._n_reused += size
 
-    def _points(self, full: Sequence[Floats], batch: Shape) -> Points:
+    def _points(self, full: Arrays, batch: Shape) -> Points:
         """Return the points of a batch, each a row, from values of all inputs."""
         n = math.prod(batch)
         k = len(self.inputs.aleatory)
@@ -409,7 +410,7 @@ class Responses:
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
         return Points(self.inputs.fill(rows[:k], rows[k:]), varying)
 
-    def _called(self, values: Sequence[Floats], batch: Shape, *, is_run: bool = True) -> Floats:
+    def _called(self, values: Arrays, batch: Shape, *, is_run: bool = True) -> Floats:
         """Call the function once for a batch of any shape."""
         k = len(self.inputs.aleatory)
         arguments = self.inputs.fill(values[:k], values[k:])
@@ -431,7 +432,7 @@ class Responses:
             raise ResponseError(f"{self.name}: {error}") from None
         return responses
 
-    def _again(self, values: Sequence[Floats], rows: Indices) -> Floats:
+    def _again(self, values: Arrays, rows: Indices) -> Floats:
         """Compute some specimens, (n, *event) by input, again; NaN where the response raises.
 
         The calls are not counted as runs, and are not stored.
@@ -445,7 +446,7 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
+    def _refuse_state(self, specimens: Arrays, values: Floats) -> None:
         """Raise if one of a few specimens differs when it is computed again, by itself.
 
         They are the last one, on which a state that passes from specimen to specimen has the most
@@ -509,7 +510,7 @@ class Responses:
                 "state from one specimen to the next, or write it for one specimen, in prb.scalar"
             )
 
-    def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
+    def _refuse_late_change(self, specimens: Arrays, values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
         is_unchanged = written_form(self.function) == self._written_form
         is_random = self.scatter is None or self.repeats > 1
@@ -534,7 +535,7 @@ class Responses:
             )
 
 
-def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int) -> str:
+def _place_of_specimen(responses: Responses, points: Arrays, row: int) -> str:
     """Return the aleatory inputs of a specimen as a text, with their names."""
     inputs = responses.inputs
     sizes = [math.prod(shape) for shape in inputs.event_shapes]
@@ -542,9 +543,7 @@ def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int)
     return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
 
 
-def _refuse_one_size(
-    responses: Responses, specimens: Sequence[Floats], error: ResponseError
-) -> None:
+def _refuse_one_size(responses: Responses, specimens: Arrays, error: ResponseError) -> None:
     """Raise if the response takes no other number of specimens than that of its batch.
 
     Such a response contains an array with a value for each specimen, whose values would be
@@ -561,7 +560,7 @@ def _refuse_one_size(
         ) from None
 
 
-def _refuse_other_times(responses: Responses, specimens: Sequence[Floats], values: Floats) -> None:
+def _refuse_other_times(responses: Responses, specimens: Arrays, values: Floats) -> None:
     """Raise if outputs of the last specimen change where the times of other outputs do.
 
     Every second time, the last one among them, moves halfway to the time before it.
@@ -617,13 +616,13 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
         )
 
 
-def _equal(first: Sequence[Floats], second: Sequence[Floats]) -> bool:
+def _equal(first: Arrays, second: Arrays) -> bool:
     pairs = zip(first, second, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def deduplicated_responses(
-    responses: Responses, points: Sequence[Floats], stored: tuple[Sequence[Floats], Floats] | None
+    responses: Responses, points: Arrays, stored: tuple[Arrays, Floats] | None
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m); equal points are computed once.
 

@@ -16,7 +16,7 @@ from scipy.special import softmax
 
 from prbayes._finding import Finding, Findings, counted
 from prbayes._stats import positive_scale
-from prbayes._validate import ArrayPair, Floats, Names, complete_rows
+from prbayes._validate import ArrayPair, Arrays, Floats, Names, complete_rows
 from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
@@ -183,7 +183,7 @@ def check_population(optimum: Optimum) -> Checked:
 
 
 def reported_tests(
-    optimum: Optimum, samples: Sequence[ArrayPair], null: Sequence[Sequence[Floats]]
+    optimum: Optimum, samples: Sequence[ArrayPair], null: Sequence[Arrays]
 ) -> Checked:
     """Return what tests of the population say of each likelihood.
 
