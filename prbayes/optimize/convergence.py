@@ -15,7 +15,7 @@ import numpy as np
 from pytensor.gradient import NullTypeGradError
 
 from prbayes._progress import progress
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
@@ -446,7 +446,7 @@ def approach(
         options={"gtol": 1e-2},  # coarse, because the area metric is left before it converges
         callback=stop_with_overlap,
     )
-    # Record the values of the model's own objective in the trace, not the areas.
+    # dict[str, Any] the values of the model's own objective in the trace, not the areas.
     objective.values = [guide.records[t.tobytes()][1] for t in objective.thetas]
     return objective.best, trace.extended(objective)
 
@@ -496,9 +496,7 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     return np.asarray(thetas[np.argmin(values)])
 
 
-def overlapping_populations(
-    evaluator: Evaluator, thetas: Floats
-) -> tuple[list[tuple[Floats, Floats]], Floats]:
+def overlapping_populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[ArrayPair], Floats]:
     """Return responses and weights by simulator, and their overlaps with the data, (K, P)."""
     populations = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
     pairs = zip(evaluator.nodes, populations, strict=True)

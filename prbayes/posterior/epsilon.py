@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pymc as pm
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, positive_number
+from prbayes._validate import Floats, positive_number, wrong_value
 from prbayes.inference.asymptotics import (
     Information,
     first_order_shifts,
@@ -248,7 +247,7 @@ def _by_coverage(information: Information) -> float | None:
     # the posteriors of all data sets.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
-    distances: Any = 0  # (n_sets, M): discrepancies of the data sets at the thetas
+    distances = 0  # (n_sets, M): discrepancies of the data sets at the thetas
     for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
@@ -281,9 +280,10 @@ def checked_epsilon(
 ) -> dict[str, float]:
     """Return positive numbers by the names of simulators; raise if they are no such numbers."""
     if not isinstance(epsilon, Mapping):
-        raise TypeError(
-            f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
-            'positive numbers, such as {"y": 0.1}'
+        raise wrong_value(
+            epsilon,
+            "epsilon",
+            'a mapping of names of simulators to positive numbers, such as {"y": 0.1}',
         )
     names = [simulator.name for simulator in simulators]
     unknown = sorted(map(str, set(epsilon) - set(names)))

@@ -23,7 +23,7 @@ from scipy.special import ndtri
 
 from prbayes._finding import Findings
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices, complete_rows
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import (
@@ -164,7 +164,7 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    blocks: list[LogDensity] = []
+    blocks = []
     if isinstance(likelihood, RefitLikelihood) and likelihood.counts:
         blocks = [likelihood.without_block(block, 8).log_likelihood for block in range(8)]
     return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale, blocks)
@@ -478,7 +478,7 @@ def near_statistics(statistics: Floats, r: int, noise: float) -> tuple[Floats, B
     Without it populations at another optimum would count like those at the best, however much worse
     they fit.
     """
-    is_near = np.isfinite(statistics).all(axis=1)
+    is_near = complete_rows(statistics)
     estimates, differences = np.split(statistics[is_near], [r], axis=1)
     spread = differences.std(axis=0)
     # A difference below a tenth of the noise comes from the stored responses.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Function, Shape, called, positive_integer
+from prbayes._validate import Function, Shape, positive_integer, wrong_value
 from prbayes.response.call import scalar
 from prbayes.response.response import refuse_misfit
 
@@ -80,9 +80,7 @@ class Stochastic:
                 "it; write prb.scalar(prb.response.Stochastic(f)), with f = response.function"
             )
         if not callable(function) or isinstance(function, type):
-            raise TypeError(
-                f"{label}: function: got {called(function)}, expected a function of the inputs"
-            )
+            raise wrong_value(function, f"{label}: function", "a function of the inputs")
         if isinstance(function, Stochastic):
             raise TypeError(f"{label}: function: got a Stochastic, expected a plain function")
         self.function = function
