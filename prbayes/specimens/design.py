@@ -755,16 +755,12 @@ def without_spurious_modes(
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
     likeliest, before = likely.best(), emulation
-    units = np.concatenate([scale, spread])
     for _ in range(8):
         modes = proposals.modes
         z = data.within(mode_coordinates(proposals))
         deviation = np.sqrt(emulation.surface.variance(z))
-        # Without runs whose inputs and outputs are near, the deviation may be far too small.
-        values = emulation.surface.values(z)
-        runs, outputs = (a[np.isfinite(emulation.y).all(axis=1)] for a in (emulation.z, emulation.y))
-        near = np.hstack([runs, outputs]), np.hstack([z, values])
-        is_far = squared_distances(*near, units) > len(units)
+        # Farther from the runs than the population is wide, the deviation may be far too small.
+        is_far = squared_distances(emulation.z, z, scale) > z.shape[1]
         cost = modes.misfit + (modes.a**2).sum(axis=1) / 2
         is_far[best_rows(modes.specimen, cost)] = False
         is_uncertain = (deviation > largest).any(axis=1)
