@@ -45,7 +45,7 @@ Arrays = Sequence[Floats]  # arrays in a fixed order, such as one for each input
 Labels = Mapping[str, str]  # labels, units or other texts by name
 StrPath = str | os.PathLike[str]  # path of a file or folder
 NamedArrays = dict[str, Floats]  # arrays by name
-ArraysByName = Mapping[str, Floats]  # the same, which are only read
+ArraysByName = Mapping[str, Floats]  # arrays by name, which are only read
 NamedValues = Mapping[str, Any]  # values of any type by name, which are only read
 Names = tuple[str, ...]  # names or other texts, in a fixed order
 ArrayPair = tuple[Floats, Floats]  # two arrays, such as values and their weights
@@ -66,7 +66,7 @@ def wrong_type(value: object, name: str, expected: str) -> TypeError:
 
 
 def wrong_value(value: object, name: str, expected: str) -> TypeError:
-    """Return the error for an argument of another type, with the start of its text."""
+    """Return the error for an argument of a wrong type, which shows the start of its value."""
     return TypeError(f"{name}: got {called(value)}, expected {expected}")
 
 

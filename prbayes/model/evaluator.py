@@ -388,8 +388,8 @@ def read_inputs_of_copy(
             raise wrong_value(
                 function,
                 name,
-                "the random response of a simulator of "
-                "the model, whose distribution is emulated; pass that very object",
+                "the random response of a simulator of the model, whose distribution is "
+                "emulated; pass that very object",
             )
         inputs = [*(x for x in inputs if x is not noises[0]), noises[0]]
     return read_inputs(name, inputs, model, fixed=fixed, originals=originals)

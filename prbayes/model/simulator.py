@@ -793,9 +793,8 @@ def _prepared_metric(
         raise wrong_value(
             metric,
             f"{name}: metric",
-            "a metric object such as "
-            "prb.ProbabilityResidual() or prb.AreaMetric(); wrap a function of your own in "
-            "prb.FunctionMetric(f)",
+            "a metric object such as prb.ProbabilityResidual() or prb.AreaMetric(); wrap a "
+            "function of your own in prb.FunctionMetric(f)",
         )
     try:
         if np.ndim(observed) != 2:

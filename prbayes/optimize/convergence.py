@@ -446,7 +446,7 @@ def approach(
         options={"gtol": 1e-2},  # coarse, because the area metric is left before it converges
         callback=stop_with_overlap,
     )
-    # dict[str, Any] the values of the model's own objective in the trace, not the areas.
+    # Record the values of the model's own objective in the trace, not the areas.
     objective.values = [guide.records[t.tobytes()][1] for t in objective.thetas]
     return objective.best, trace.extended(objective)
 

@@ -48,7 +48,7 @@ def check_options(labels: object, pc_kwargs: NamedValues, *, by_arviz: bool = Fa
     if unknown and not by_arviz:
         raise wrong_value(
             pc_kwargs[min(unknown)],
-            f"{min(unknown)}",
+            min(unknown),
             "figsize, col_wrap or figure_kwargs: Matplotlib draws this picture",
         )
     if "col_wrap" in pc_kwargs:

@@ -179,7 +179,7 @@ def _names(argument: str, value: object) -> dict[str, str]:
         pairs = [(name, name) for name in value]
     are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
     if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
-        raise wrong_value(value, f"fmu: {argument}", f"{expected}")
+        raise wrong_value(value, f"fmu: {argument}", expected)
     return dict(pairs)
 
 
@@ -541,7 +541,7 @@ _messages = threading.local()
 
 
 def _record_message(*arguments: Any) -> None:
-    """dict[str, Any] a warning or error of a unit; FMI 2 and 3 end their arguments alike."""
+    """Record a warning or error of a unit; FMI 2 and 3 end their arguments alike."""
     status, _, message = arguments[-3:]
     if status != 0 and message:
         _messages.lines = [*getattr(_messages, "lines", ())[-4:], message]

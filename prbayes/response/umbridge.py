@@ -202,7 +202,7 @@ def _plain_config(config: object) -> Any:
     raise wrong_value(
         config,
         "umbridge: config",
-        f"a mapping of settings to values that "
+        "a mapping of settings to values that "
         f'can be written as JSON, such as {{"level": 2}}: texts, numbers, lists{reason}',
     )
 
