@@ -275,10 +275,9 @@ def sequential_design(
             if is_good and emulation.surface is not before.surface:
                 # The audit's runs changed the surface, so that another population may be likely.
                 earlier, likely = plausible, Likely.of(data, emulation, population, batches)
-                emulation = without_spurious_modes(run, data, emulation, likely)
-                plausible = Plausible.of(data, emulation, wider(population))
+                emulation, plausible = known_again(run, data, emulation, likely, population, rng)
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-                is_good &= bool(np.isfinite(emulation.bias))
+                is_good &= emulation.bias <= 1.5 * bias
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
@@ -295,6 +294,22 @@ def sequential_design(
         count = batch_size(data, emulation, previous)
         emulation = extended(run, data, emulation, likely, count, rng)
         batches += 1
+
+
+def known_again(
+    run: Run,
+    data: SpecimenData,
+    emulation: Emulation,
+    likely: Likely,
+    population: Normal,
+    rng: np.random.Generator,
+) -> tuple[Emulation, Plausible]:
+    """Return the emulation without spurious modes of a changed surface, and posterior draws."""
+    after = without_spurious_modes(run, data, emulation, likely)
+    plausible = Plausible.of(data, after, wider(population))
+    if after is not emulation:  # Rounds may end with spurious modes left.
+        after = audited(run, data, after, Likely.of_draws(data, plausible), rng)
+    return after, plausible
 
 
 def population_elsewhere(
@@ -361,11 +376,19 @@ def at_most_runs(
     run: Run, data: SpecimenData, emulation: Emulation, likely: Likely, population: Normal
 ) -> tuple[Emulation, Plausible]:
     """Return an emulation with the largest number of runs, corrected where it may be, or raise."""
-    if np.isfinite(emulation.bias) and may_correct(data, likely):
+    if may_correct(data, likely):
         emulation = corrected(run, data, emulation, population)
     if emulation.bias > data.options.bias:
         require_accurate(data, emulation, likely)
-    return emulation, Plausible.of(data, emulation, wider(population))
+    plausible = Plausible.of(data, emulation, wider(population))
+    likely = Likely.of_draws(data, plausible)
+    candidates, _ = likely.sample(64 * data.options.sampled, np.random.default_rng([data.seed, 7]))
+    far = data.within(_far_from_runs(data, emulation, likely, candidates))
+    if len(far):
+        bias = _bias_of_possible(data, run(far) - emulation.surface.values(far))
+        if bias > 1.5 * data.options.bias:
+            require_accurate(data, replace(emulation, bias=bias), likely)
+    return emulation, plausible
 
 
 def batch_size(data: SpecimenData, emulation: Emulation, previous: Emulation | None) -> int:
@@ -491,16 +514,19 @@ def _compared(
 ) -> tuple[Emulation, Floats, Bools]:
     """Return the emulation with runs at points, its misfits there, (k, m), and which are new, (k,).
 
-    Misfits are zero at old points. The surface is not fitted again.
+    Points that coincide have the misfit of one run. The surface is not fitted again.
     """
+    from scipy.spatial import cKDTree
+
     is_new = _is_new(emulation.z, z, scale)
-    misfit = np.zeros((len(z), emulation.y.shape[1]))
-    outputs = run(z[is_new]) if is_new.any() else misfit[:0]
-    misfit[is_new] = outputs - emulation.surface.values(z[is_new])
+    outputs = run(z[is_new]) if is_new.any() else emulation.y[:0]
+    grown = emulation.with_runs(z[is_new], outputs)
+    _, rows = cKDTree(grown.z / scale).query(z / scale)
+    misfit = grown.y[rows] - emulation.surface.values(grown.z[rows])
     # Squares of larger numbers overflow, for example where a response is an exponential function.
     finite = np.isfinite(misfit)
     misfit[finite] = np.clip(misfit[finite], -1e100, 1e100)
-    return emulation.with_runs(z[is_new], outputs), misfit, is_new
+    return grown, misfit, is_new
 
 
 def _refitted(
@@ -646,6 +672,23 @@ def squared_distances(runs: Floats, z: Floats, scale: Floats) -> Floats:
     return squares
 
 
+def _is_far(emulation: Emulation, z: Floats, scale: Floats, spread: Floats) -> Bools:
+    """Return which points (k, d) have no run whose inputs and outputs are near theirs, (k,)."""
+    units = np.concatenate([scale, spread])
+    runs = np.hstack([emulation.z, emulation.y])
+    runs = runs[complete_rows(runs)]
+    predicted = np.hstack([z, emulation.surface.values(z)])
+    return squared_distances(runs, predicted, units) > len(units)
+
+
+def _far_from_runs(
+    data: SpecimenData, emulation: Emulation, likely: Likely, candidates: Floats
+) -> Floats:
+    """Return some of the candidates, (n, d), that may be inputs of the emulator alone."""
+    is_far = _is_far(emulation, candidates, likely.scale(data), data.readings.spread())
+    return candidates[is_far][: data.options.sampled // 2]
+
+
 def _explored(
     data: SpecimenData, emulation: Emulation, runs: Floats, z: Floats, count: int, scale: Floats
 ) -> Floats:
@@ -693,6 +736,8 @@ def audited(
     rows = rng.permutation(least_certain)[: len(sampled)]
     specimens = np.concatenate([specimens, owners[rows]])
     possible = likely.possible(data, data.options.sampled // 4, rng)
+    far = _far_from_runs(data, emulation, likely, candidates)
+    possible = np.concatenate([possible, far])
     z = np.concatenate([sampled, candidates[rows], possible])
     z = data.within(z)
     grown, misfit, is_new = _compared(run, emulation, z, likely.scale(data))
@@ -756,17 +801,12 @@ def without_spurious_modes(
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
     likeliest, before = likely.best(), emulation
-    units = np.concatenate([scale, spread])
     for _ in range(8):
         modes = proposals.modes
         z = data.within(mode_coordinates(proposals))
         deviation = np.sqrt(emulation.surface.variance(z))
-        runs = np.hstack([emulation.z, emulation.y])
-        runs = runs[complete_rows(runs)]
         # Without runs whose inputs and outputs are near, the deviation may be far too small.
-        values = emulation.surface.values(z)
-        squares = squared_distances(runs, np.hstack([z, values]), units)
-        is_far = squares > len(units)
+        is_far = _is_far(emulation, z, scale, spread)
         cost = modes.misfit + (modes.a**2).sum(axis=1) / 2
         is_far[best_rows(modes.specimen, cost)] = False
         is_uncertain = (deviation > largest).any(axis=1)
@@ -780,8 +820,6 @@ def without_spurious_modes(
         if exist or (np.abs(change) > largest).any():
             break
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
-    else:
-        return replace(emulation, bias=np.inf)
     # A response that oscillates far off is not known from a few runs, which also make the surface
     # worse at the specimens.
     harmless = np.maximum(0.01 * spread, 3 * before.error)
