@@ -36,7 +36,7 @@ from prbayes.inference.checks.population import (
     replaced_findings,
 )
 from prbayes.inference.checks.prior import elements_at_prior_ends
-from prbayes.inference.checks.sample_size import few_specimens
+from prbayes.inference.checks.sample_size import few_specimens, spread_in_common
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.metrics.readings import with_values
 from prbayes.model.evaluator import (
@@ -534,7 +534,7 @@ def _findings(
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = [*failing_region_findings(evaluator, best.theta)]
     findings += replaced_findings(evaluator, best.theta)
-    findings += few_specimens(evaluator)
+    findings += [*few_specimens(evaluator), *spread_in_common(evaluator)]
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(
