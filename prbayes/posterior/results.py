@@ -117,9 +117,7 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 # -- calibration -----------------------------------------------------------------------------------
 
 
-def _calibration(
-    evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset
-) -> xr.Dataset:
+def _calibration(evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
 
     ``log_likelihoods`` are those of specimens, and empty if they have not been computed. Their
