@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._finding import Finding, from_json
@@ -173,9 +174,7 @@ def test_gross_errors_need_no_runs() -> None:
     y = np.exp(x)
     y[0] += 60
     metric = prb.LogLikelihood(error=0.1, gross_errors=True)
-    with pm.Model() as model:
-        of_specimens = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.exp, of_specimens, observed=y, metric=metric)
+    model = one_input(y, metric, response=np.exp)
     evaluator = Evaluator.of(model)
     prepared(evaluator.likelihoods[0])
     n_runs = evaluator.n_responses

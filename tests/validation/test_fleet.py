@@ -259,9 +259,7 @@ def test_heavy_tails_of_few_specimens_are_reported(n_inputs: int) -> None:
 def test_an_emulator_beside_a_pole_is_reported() -> None:
     """One specimen at twice the inputs of the others seems to have an input beyond the pole."""
     x = np.array([60.0, *np.random.default_rng(3).normal(28, 3, 14)[1:]])
-    with pm.Model() as model:
-        k = pm.Normal.dist(pm.Normal("mu", 20, 8), pm.HalfNormal("sigma", 4))
-        prb.Simulator("y", lambda x: 100 / x, k, observed=100 / x)
+    model = one_input(100 / x, response=lambda x: 100 / x, mu=(20, 8), sigma=4)
     data = {"p0": 100 / x, "p1": 100 / x[1:]}
     for text in prb.calibrate_each(data, model=model, **QUIET)["products"]["finding"].values:
         assert "not smooth enough" in text
