@@ -191,7 +191,7 @@ def _monte_carlo_errors(evaluator: Evaluator, thetas: Floats) -> Floats:
     """Return the Monte Carlo error of the log-likelihood at thetas, (M, d), in nats."""
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
-    return np.asarray(np.sqrt(variance))
+    return np.sqrt(variance)
 
 
 def _known(errors: Floats, n_specimens: int) -> Bools:
@@ -203,7 +203,7 @@ def _known(errors: Floats, n_specimens: int) -> Bools:
     for rounded readings is .06 nats a specimen.
     """
     limit = max(0.5, 0.1 * float(np.sqrt(n_specimens)))
-    return np.asarray(errors <= limit)
+    return errors <= limit
 
 
 def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
