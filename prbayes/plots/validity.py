@@ -72,12 +72,7 @@ def plot_validity(
     """
     check_options(None, pc_kwargs)
     if isinstance(tests, xr.DataTree):
-        of_products = tests_of_products(tests)
-        if not of_products:
-            raise ValueError(
-                "plot_validity: got a result without validity tests, expected a fleet of "
-                "prb.calibrate_each(..., validation=...)"
-            )
+        of_products = _tests_in(tests)
         if is_fleet(tests):
             return plot_tests(of_products, pc_kwargs)
         tests = of_products
@@ -125,6 +120,17 @@ def plot_validity(
         title = f"{first}\n{second}: {verdict}"
         axis.set(xlabel="|2u - 1|" if test.folded else x, ylabel=y, title=title)
     return finish(figure)
+
+
+def _tests_in(fleet: xr.DataTree) -> dict[str, ValidityTest]:
+    """Return the tests of the products of a fleet, or raise if there is none."""
+    tests = tests_of_products(fleet)
+    if not tests:
+        raise ValueError(
+            "plot_validity: got a result without validity tests, expected a fleet of "
+            "prb.calibrate_each(..., validation=...)"
+        )
+    return tests
 
 
 def in_directions(test: ValidityTest) -> list[Floats]:

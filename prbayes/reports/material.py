@@ -160,6 +160,11 @@ def constants_of(description: NamedValues) -> set[str]:
     return {name for name, _, text in inputs if text.startswith("=")}
 
 
+def names_in(description: NamedValues) -> set[str]:
+    """Return the names of variables, and of inputs that are numbers."""
+    return {v["name"] for v in description["variables"]} | constants_of(description)
+
+
 def attributes_of(result: xr.DataTree) -> dict[Any, Any]:
     """Return the attributes of a posterior or an optimum."""
     return dict(estimates_in(result).attrs)
@@ -197,9 +202,7 @@ def gather(
         label: one_posterior(result, f"Report: {label}")
         for label, result in _by_label(posterior, "posterior").items()
     }
-    tests = _by_label(validity, "validity")
-    for result in () if tests else posteriors.values():
-        tests |= tests_of_products(result)
+    tests = _by_label(validity, "validity") or _tests_of(posteriors)
     decisions = _by_label(decision, "decision")
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, labels)
     validations = _validations(validation)
@@ -225,8 +228,7 @@ def gather(
         comparison = compare(results | live_optima, model=model)
     observed, sheets = _observed(model, results)
     if labels and description["variables"]:
-        names = {*validations, *sheets, *observed, *constants_of(description)}
-        names |= {variable["name"] for variable in description["variables"]}
+        names = {*validations, *sheets, *observed, *names_in(description)}
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
@@ -249,6 +251,14 @@ def gather(
         validation=validations,
         labels=dict(labels or {}),
     )
+
+
+def _tests_of(posteriors: NamedValues) -> dict[str, ValidityTest]:
+    """Return the validity tests that posteriors of products have."""
+    tests: dict[str, ValidityTest] = {}
+    for result in posteriors.values():
+        tests |= tests_of_products(result)
+    return tests
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:
