@@ -11,6 +11,7 @@ import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._display import View, view
@@ -20,13 +21,7 @@ from prbayes.model.random_variable import simulators
 
 @cache
 def build() -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 3.0, 4.0],
-            propagation=prb.Reweighted(64),
-        )  # fmt: skip
-    return model
+    return one_input([0.0, 2.0, 3.0, 4.0], prb.AreaMetric(), propagation=prb.Reweighted(64), sd=1.0)
 
 
 def test_texts_are_escaped() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from scipy.stats import norm, t
 
 import prbayes as prb
@@ -333,9 +334,7 @@ def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) 
 
 
 def test_conflict_of_prior_and_data(problem: Problem) -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", -1.0, 0.1), pm.HalfNormal("sigma", 1.0))
-        prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=problem.observed)
+    model = one_input(problem.observed, response=lambda x: np.exp(0.5 * x), mu=(-1.0, 0.1))
     optimum = prb.minimize(model, starts=0, progressbar=False)
     checked = check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None])
     assert [finding.code for finding in checked.findings] == ["prior-conflict"]
@@ -345,10 +344,8 @@ def test_conflict_of_prior_and_data(problem: Problem) -> None:
 @pytest.mark.long
 def test_conflict_is_reported_with_censored_readings_too() -> None:
     readings = np.minimum(np.random.default_rng(1).normal(4, 1, 20), 4.5)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0.0, 0.5), pm.HalfNormal("sigma", 1.0))
-        metric = prb.LogLikelihood(censored=(None, 4.5))
-        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, observed=readings)
+    metric = prb.LogLikelihood(censored=(None, 4.5))
+    model = one_input(readings, metric, response=lambda x: 1.0 * x, mu=(0.0, 0.5))
     posterior = prb.sample(model=model, progressbar=False)
     diagnosis = prb.diagnose(posterior, model=model)
     assert "prior-conflict" in [finding.code for finding in diagnosis.findings]

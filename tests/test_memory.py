@@ -11,6 +11,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from line_problem import OBSERVED, line
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.metrics.density import twice_silverman
@@ -23,15 +24,12 @@ MIB = 1 << 20
 
 
 def build(n: int = 128) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-        keywords: dict[str, Any] = {
-            "metric": prb.AreaMetric(),
-            "observed": OBSERVED,
-            "progressbar": False,
-        }
-        prb.Simulator("y", line, x, propagation=prb.Reweighted(n), **keywords)
-    return model
+    keywords: dict[str, Any] = {
+        "metric": prb.AreaMetric(),
+        "observed": OBSERVED,
+        "progressbar": False,
+    }
+    return one_input(response=line, propagation=prb.Reweighted(n), mu=(2, 1), **keywords)
 
 
 def alive() -> int:
@@ -105,10 +103,7 @@ def test_readings_in_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def by_specimen() -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", line, x, observed=OBSERVED)
-    return model
+    return one_input(OBSERVED, response=line, mu=(2, 1))
 
 
 @pytest.mark.long
@@ -156,11 +151,9 @@ def test_points_of_a_model_that_was_never_compiled_go() -> None:
 
 def test_many_observed_values_are_compared_in_blocks_of_populations() -> None:
     observed = np.random.default_rng(0).normal(2.0, 1.0, 100_000)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
-        prb.Simulator(
-            "y", line, x, metric=prb.AreaMetric(), observed=observed, propagation=prb.Reweighted(64)
-        )
+    model = one_input(
+        observed, prb.AreaMetric(), response=line, propagation=prb.Reweighted(64), mu=(2, 1), sd=1.0
+    )
     evaluator = Evaluator.of(model)
     thetas = np.linspace(1, 3, 128)[:, None]
     single = evaluator.discrepancies(thetas[[7]], 0)

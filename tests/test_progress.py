@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 from rich.console import Console
 
 import prbayes as prb
@@ -163,11 +164,8 @@ def test_a_bar_is_taken_away_when_the_work_fails(screen: io.StringIO, clock: Clo
 
 def build(**settings: Any) -> pm.Model:
     settings = {"propagation": prb.Reweighted(64), "epsilon": 0.1} | settings
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        data = {"metric": prb.AreaMetric(), "observed": np.linspace(-1, 3, 20)}
-        prb.Simulator("y", np.positive, x, **data, **settings)
-    return model
+    data = {"metric": prb.AreaMetric(), "observed": np.linspace(-1, 3, 20)}
+    return one_input(sd=1.0, **data, **settings)
 
 
 @pytest.mark.parametrize("visible", [True, False])

@@ -7,8 +7,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 
@@ -48,16 +48,14 @@ class Unit:
 @cache
 def answers(kind: str, factor: float) -> dict[str, Any]:
     response = Unit(factor)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1.2, 1.0), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator(
-            "y",
-            response,
-            x,
-            metric=METRICS[kind],
-            observed=response(INPUTS),
-            propagation=prb.Reweighted(256),
-        )
+    model = one_input(
+        response(INPUTS),
+        METRICS[kind],
+        response=response,
+        propagation=prb.Reweighted(256),
+        mu=(1.2, 1.0),
+        sigma=0.5,
+    )
     optimum = prb.minimize(model, progressbar=False)
     posterior = prb.sample(
         500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False

@@ -403,7 +403,7 @@ class _Estimate:
 
     def _of_all(self, interval: Floats) -> Floats:
         """Return the interval of all specimens from that of those with a response."""
-        return np.asarray(interval * (1 - self.lost) + [0.0, self.lost])
+        return interval * (1 - self.lost) + [0.0, self.lost]
 
     def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
         """Return whether the error is above a share of the interval's distance to a requirement."""

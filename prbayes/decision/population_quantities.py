@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from prbayes._finding import Findings
 from prbayes._validate import Floats, NamedArrays, wrong_value
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations, checked_quantity
-from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
+from prbayes.decision.quantities import Mean, Quantile, StandardDeviation
 from prbayes.model.evaluator import read_inputs_of_copy
 from prbayes.model.fingerprint import identity_from_attributes, require_together
 from prbayes.model.margins import margins, select_margins
@@ -139,9 +139,11 @@ class PopulationReader:
             findings, _ = checked_quantity(output, by_level[-1])
             quantities = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
-            numbers[0, :, -len(quantities) :] = output.evaluate(
-                _side_by_side(quantities), self._thetas
-            )
+
+            def computed(values: Floats, weights: Floats, of: Sequence[Any] = quantities) -> Floats:
+                return np.stack([quantity.of(values, weights) for quantity in of], axis=-1)
+
+            numbers[0, :, -len(quantities) :] = output.evaluate(computed, self._thetas)
             name = element_name(sample.responses.name, [label] if several else [])
             unit = outputs.units[column] if outputs.units else ""
             named = _by_name(["mean", "sd", *self.levels], numbers)
@@ -180,15 +182,6 @@ class PopulationReader:
             Element(element_name(name, labels[j : j + 1]), str(unit), groups, _by_name(names, x))
             for j, (unit, x) in enumerate(zip(units, np.moveaxis(numbers, -1, 0), strict=True))
         ]
-
-
-def _side_by_side(quantities: Sequence[Quantity]) -> Callable[[Floats, Floats], Floats]:
-    """Return a functional whose last axis has the quantities."""
-
-    def functional(values: Floats, weights: Floats) -> Floats:
-        return np.stack([quantity.of(values, weights) for quantity in quantities], axis=-1)
-
-    return functional
 
 
 def _by_name(names: Sequence[str], numbers: Floats) -> NamedArrays:

@@ -201,7 +201,9 @@ def _numbers(values: Floats, populations: Populations, prob: float, bound: float
     if bound is not None:
         (estimate,) = _quantiles(draws, [bound])
         return [estimate, *np.full((2, len(draws)), np.nan)]
-    estimate = _means(draws) if populations.are_draws else values[:, 0]
+    estimate = values[:, 0]
+    if populations.are_draws:  # the mean of the draws that are finite
+        estimate = np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
     return [estimate, *_quantiles(draws, tail_levels(prob))]
 
 
@@ -250,11 +252,6 @@ def _covariates(populations: Populations, at: Any) -> Mapping[str, float]:
             f"{sorted(covariates)}"
         )
     return at or {}
-
-
-def _means(draws: Floats) -> Floats:
-    """Return means over populations, (groups, k) -> (groups,), without infinite draws."""
-    return np.array([_defined(row, ~np.isfinite(row)).mean() for row in draws])
 
 
 def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:

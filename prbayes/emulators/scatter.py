@@ -33,11 +33,11 @@ class Region:
         """Return the place of inputs, (..., d), in the cube [-1, 1]^d."""
         inverse = np.linalg.inv(self.root)
         centred = x - self.center
-        return np.asarray(centred @ inverse.T)
+        return centred @ inverse.T
 
     def at(self, unit: Floats) -> Floats:
         """Return the inputs at places of the cube, (..., d)."""
-        return np.asarray(self.center + unit @ self.root.T)
+        return self.center + unit @ self.root.T
 
     def contains(self, other: Region, slack: float = 0.25) -> bool:
         """Return whether the axes of another region end in this one, or a little beyond."""

@@ -133,7 +133,7 @@ def failure_caps(observed: Floats) -> Floats:
     finite = finite_or_nan(observed)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)
-    return np.asarray(highest + (highest - lowest))
+    return highest + (highest - lowest)
 
 
 def sufficient_directions(m: int) -> int:

@@ -113,7 +113,7 @@ def audited_likelihood(
 
 def _uncertainty(emulation: Emulation, z: Floats) -> Floats:
     """Return predictive standard deviations relative to the stated error, (n,)."""
-    return np.asarray((np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1))
+    return (np.sqrt(emulation.surface.variance(z)) / emulation.error).max(axis=1)
 
 
 def audit_points(

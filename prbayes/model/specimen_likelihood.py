@@ -563,7 +563,7 @@ def read_outputs(
         gross_errors = middle + width * (2 * uniform - 1)
         is_gross = rng.random((size, n, 1)) < np.reshape(share, (-1, 1, 1))
         result = np.where(is_gross, gross_errors, result)
-    return np.asarray(result)
+    return result
 
 
 class SpecimenRV(ObservedRV):

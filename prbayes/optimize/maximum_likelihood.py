@@ -36,7 +36,7 @@ from prbayes.inference.checks.population import (
     replaced_findings,
 )
 from prbayes.inference.checks.prior import elements_at_prior_ends
-from prbayes.inference.checks.sample_size import few_specimens
+from prbayes.inference.checks.sample_size import few_specimens, spread_in_common
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.metrics.readings import with_values
 from prbayes.model.evaluator import (
@@ -191,7 +191,7 @@ def _monte_carlo_errors(evaluator: Evaluator, thetas: Floats) -> Floats:
     """Return the Monte Carlo error of the log-likelihood at thetas, (M, d), in nats."""
     values = variables_at(evaluator.hyperparameters, thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
-    return np.asarray(np.sqrt(variance))
+    return np.sqrt(variance)
 
 
 def _known(errors: Floats, n_specimens: int) -> Bools:
@@ -203,7 +203,7 @@ def _known(errors: Floats, n_specimens: int) -> Bools:
     for rounded readings is .06 nats a specimen.
     """
     limit = max(0.5, 0.1 * float(np.sqrt(n_specimens)))
-    return np.asarray(errors <= limit)
+    return errors <= limit
 
 
 def is_known_at(evaluator: Evaluator, thetas: Floats) -> Bools:
@@ -534,7 +534,7 @@ def _findings(
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = [*failing_region_findings(evaluator, best.theta)]
     findings += replaced_findings(evaluator, best.theta)
-    findings += few_specimens(evaluator)
+    findings += [*few_specimens(evaluator), *spread_in_common(evaluator)]
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(

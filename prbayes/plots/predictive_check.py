@@ -178,7 +178,7 @@ def _bins(x: Floats, bins: int) -> Indices:
 
     values, inverse = np.unique(x, return_inverse=True)
     if values.size <= bins:
-        return np.asarray(inverse)
+        return inverse
     clusters = fcluster(linkage(values[:, None], "ward"), bins, "maxclust")
     return np.asarray(clusters[inverse])
 

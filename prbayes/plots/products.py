@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,7 +138,7 @@ def plot_tests(tests: Mapping[str, ValidityTest], pc_kwargs: Mapping[str, Any]) 
     verdicts = np.array(["rejected" if tests[name].rejected else "not rejected" for name in order])
     figure, axes = panels(["u"], size=(5.6, _height_of(len(order))), pc_kwargs=pc_kwargs)
     axis = axes["u"]
-    rows = np.arange(len(order) - 1.0, -1.0, -1.0)
+    rows = _row_heights(order)
     for verdict, color in _COLORS.items():
         of_verdict = [k for k in range(len(order)) if verdicts[k] == verdict]
         if of_verdict:
@@ -193,7 +193,7 @@ def _height_of(n: int) -> float:
     return float(np.clip(1.4 + 0.19 * n, 2.2, 10.0))
 
 
-def _row_heights(values: Floats) -> Floats:
+def _row_heights(values: Sized) -> Floats:
     """Return the heights of rows; the first one is on top."""
     return np.arange(len(values) - 1.0, -1.0, -1.0)
 
@@ -221,7 +221,7 @@ def _draw_products(axis: Axes, panel: xr.Dataset, quantity: str, verdicts: Any) 
 
 def _label_products(axis: Axes, texts: Sequence[str], verdicts: Any, most: int = 45) -> None:
     """Name the rows, or of many those that were rejected, as far as there is room."""
-    rows = np.arange(len(texts) - 1.0, -1.0, -1.0)
+    rows = _row_heights(texts)
     shown: Indices = np.arange(len(texts))
     if len(texts) > most:
         shown = np.flatnonzero(verdicts == "rejected")

@@ -414,7 +414,9 @@ def panels_of(
     for name in names:
         output = available[name]
         outputs = by_node[output.node.name]
-        if in_one_panel(output.node.outputs) and {x.name for x in outputs} <= set(names):
+        # Curves and more than eight outputs are drawn as lines over their labels.
+        is_line = len(outputs) > 8 or is_curve(output.node.outputs)
+        if is_line and {x.name for x in outputs} <= set(names):
             output = Output(output.node, None, alone)
         shown[output.name] = output
     if coords is not None and sum(x.column is not None for x in shown.values()) > 24:
@@ -426,11 +428,6 @@ def displayed_outputs(node: PopulationSimulator, *, alone: bool) -> list[Output]
     """Return all outputs of a simulator, or its only one."""
     columns = range(len(node.outputs.labels)) if node.outputs.event else [None]
     return [Output(node, column, alone) for column in columns]
-
-
-def in_one_panel(outputs: Outputs) -> bool:
-    """Return whether outputs are drawn as lines over their labels: a curve, or more than eight."""
-    return len(outputs.labels) > 8 or is_curve(outputs)
 
 
 def is_curve(outputs: Outputs) -> bool:

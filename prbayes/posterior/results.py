@@ -77,13 +77,12 @@ def posterior_tree(
 ) -> xr.DataTree:
     """Return the DataTree of a sampler's chains with groups of `arviz_groups`."""
     attrs = {**attrs, **chains.sampler, "stopped": chains.stopped, **versions()}
+    log_likelihoods = groups.get("log_likelihood", xr.Dataset())
     tree = {
         "posterior": posterior_group(evaluator, chains.thetas, attrs),
         **groups,
         "sample_stats": chains.sample_stats,
-        "calibration": _calibration(evaluator, chains, groups.get("log_likelihood")).assign_attrs(
-            attrs
-        ),
+        "calibration": _calibration(evaluator, chains, log_likelihoods).assign_attrs(attrs),
         "observed_data": observed_dataset(evaluator),
     }
     failures = failures_dataset(evaluator)
@@ -118,13 +117,11 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 # -- calibration -----------------------------------------------------------------------------------
 
 
-def _calibration(
-    evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset | None
-) -> xr.Dataset:
+def _calibration(evaluator: Evaluator, chains: Chains, log_likelihoods: xr.Dataset) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws.
 
-    ``log_likelihoods`` are those of specimens, if they have been computed. Their simulators come
-    last, and have minus log-likelihoods as discrepancies.
+    ``log_likelihoods`` are those of specimens, and empty if they have not been computed. Their
+    simulators come last, and have minus log-likelihoods as discrepancies.
     """
     records = simulator_records(evaluator)
     n_chains, n_draws, d = chains.thetas.shape
@@ -275,17 +272,17 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
 
 
 def _log_likelihood_totals(
-    evaluator: Evaluator, rows: Floats, by_specimen: xr.Dataset | None
+    evaluator: Evaluator, rows: Floats, log_likelihoods: xr.Dataset
 ) -> NamedArrays:
     """Return the log-likelihood of all specimens by simulator at thetas, (S, d) -> (S,).
 
-    The log-likelihoods ``by_specimen`` are summed if they have all draws. Of simulators that share
+    The ``log_likelihoods`` of specimens are summed if they have all draws. Of simulators that share
     specimens the last one has their log-likelihood, and the others have zeros.
     """
     totals = {m.name: np.zeros(len(rows)) for m in evaluator.measurements}
-    sizes = {} if by_specimen is None else by_specimen.sizes
-    if by_specimen is not None and sizes["chain"] * sizes["draw"] == len(rows):
-        for variable, values in by_specimen.data_vars.items():
+    sizes = log_likelihoods.sizes
+    if log_likelihoods and sizes["chain"] * sizes["draw"] == len(rows):
+        for variable, values in log_likelihoods.data_vars.items():
             over_specimens = values.sum(str(values.dims[-1]))
             totals[str(variable)] = over_specimens.values.ravel()
         return totals

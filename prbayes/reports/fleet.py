@@ -22,7 +22,13 @@ from prbayes.reports.material import Material, kind_of_decision
 from prbayes.reports.numbers import NOTHING, in_percent, rows_table
 from prbayes.reports.section import Section
 from prbayes.reports.sections import comparison_of_responses, model
-from prbayes.results.products import data_sheets, failed_products, product_names, validity_verdicts
+from prbayes.results.products import (
+    data_sheets,
+    failed_products,
+    product_names,
+    texts_by_product,
+    validity_verdicts,
+)
 
 _FOREST = Illustration(
     plot_products,
@@ -102,8 +108,7 @@ def _verdict_on_fleet(fleet: xr.DataTree) -> Section:
             f"Of valid products about {alpha * n_tested:.2g} would be rejected at the level of "
             f"{percentage(alpha)}. Do not use the predictions of rejected products."
         )
-    findings = fleet["products"].to_dataset()["finding"].values.tolist()
-    n_found = sum(bool(text) for text in findings) - counts["failed"]
+    n_found = len(texts_by_product(fleet, "finding")) - counts["failed"]
     reported = {
         "not tested": counts["not tested"],
         "failed": counts["failed"],
@@ -198,9 +203,8 @@ def _findings_of_products(
     fleet: xr.DataTree, decisions: Mapping[str, xr.Dataset], most: int = 40
 ) -> list[str]:
     """Return the findings of the products, at most a page."""
-    texts = fleet["products"].to_dataset()["finding"].values.tolist()
-    pairs = zip(product_names(fleet), texts, strict=True)
-    lines = [f"{name}: {text.removeprefix(f'{name}: ')}" for name, text in pairs if text]
+    texts = texts_by_product(fleet, "finding")
+    lines = [f"{name}: {text.removeprefix(f'{name}: ')}" for name, text in texts.items()]
     for question, table in decisions.items():
         for finding in from_json(str(table.attrs.get("findings", "[]"))):
             lines.append(f"{question}: {finding}")

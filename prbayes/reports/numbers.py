@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from prbayes._display import View
 from prbayes._validate import Names, wrong_type
 
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
@@ -208,11 +207,6 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
             if any(value not in (None, "") for value in column)
         }
     )
-
-
-def view_table(shown: View) -> Any:
-    """Return the rows of what a reader sees of a result, as a table."""
-    return pd.DataFrame(shown.rows, columns=shown.header)
 
 
 def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:

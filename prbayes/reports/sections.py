@@ -57,7 +57,6 @@ from prbayes.reports.numbers import (
     plus_minus,
     rows_table,
     span,
-    view_table,
 )
 from prbayes.reports.section import Section
 from prbayes.results.compare import Comparison, estimates_of
@@ -395,7 +394,7 @@ def comparison(m: Material) -> list[Section]:
         "deviations of the result in the row.",
         *shown.sentences,
     ]
-    columns = view_table(shown)
+    columns = pd.DataFrame(shown.rows, columns=shown.header)
     if m.prob != INTERVAL:  # All intervals of a report have the same probability.
         columns = columns.drop(columns=f"{INTERVAL:.0%} interval")
     return [Section("Comparison of results", text, columns, level=3)]
@@ -539,14 +538,13 @@ def _specimen_labels(condition: str, n: int, m: Material) -> list[str]:
             mask = [text.split(DIRECTION)[0] == name for text in test.conditions.tolist()]
             labels = list(dict.fromkeys(test.specimens[mask].tolist()))
             if (is_single or name == condition) and len(labels) == n:
-                return [_specimen_label(label, name) for label in labels]
+                # Tests count specimens without labels from zero, and a report from one.
+                texts = [label.removeprefix(f"{name}, ") for label in labels]
+                return [
+                    str(int(text) + 1) if text != label and text.isdigit() else label
+                    for label, text in zip(labels, texts, strict=True)
+                ]
     return [str(i + 1) for i in range(n)]
-
-
-def _specimen_label(label: str, condition: str) -> str:
-    """Return a label; tests count specimens without labels from zero, and a report from one."""
-    index = label.removeprefix(f"{condition}, ")
-    return str(int(index) + 1) if index != label and index.isdigit() else label
 
 
 # -- appendix: data --------------------------------------------------------------------------

@@ -149,7 +149,7 @@ class Expansion:
         terms = covariance @ self.weights
         terms = terms.reshape(*at.shape, -1)
         distance = (at - self.zero) / self.farthest
-        return np.asarray(distance[..., None] * terms)
+        return distance[..., None] * terms
 
 
 def rational_quadratic(first: Floats, second: Floats, length: float) -> Floats:
@@ -157,7 +157,7 @@ def rational_quadratic(first: Floats, second: Floats, length: float) -> Floats:
     difference = first[:, None] - second
     distance = difference / length
     ratio = 0.5 * distance**2
-    return np.asarray(1 / (1 + ratio))
+    return 1 / (1 + ratio)
 
 
 def residual_whitening(covariance: Floats, dropped: float) -> Floats:
@@ -178,7 +178,7 @@ def residual_whitening(covariance: Floats, dropped: float) -> Floats:
     signs = np.sign(vectors[largest, columns])
     scales = np.sqrt(values)
     weights = vectors * signs / scales
-    return np.asarray(weights[:, :count])
+    return weights[:, :count]
 
 
 class ModelDiscrepancy(ABC):
@@ -243,7 +243,7 @@ class ModelDiscrepancy(ABC):
         product = np.asarray(coefficients) * basis
         if self.event:
             product = product.sum(axis=-1)
-        return np.asarray(np.where(np.isnan(at), 0.0, product))
+        return np.where(np.isnan(at), 0.0, product)
 
     @abstractmethod
     def combined(self, response: Floats, value: Floats) -> Floats:

@@ -246,7 +246,7 @@ def _shrinkage(values: Floats, population: Floats, *, is_log: bool) -> Floats:
     """Return one minus the spread of the specimens' means over that of the population, (*event)."""
     scale = np.log if is_log else np.positive
     within = scale(population).std(axis=1).mean(axis=0)
-    return np.asarray(1 - scale(values).mean(axis=0).std(axis=0) / within)
+    return 1 - scale(values).mean(axis=0).std(axis=0) / within
 
 
 def _population(

@@ -201,12 +201,18 @@ def is_fleet(result: Any) -> bool:
 
 def findings_of_calibration(result: Any) -> dict[str, Findings]:
     """Return the findings of the products of a fleet, or of one, that have a posterior."""
-    if not product_names(result):
-        return {}
-    texts = np.atleast_1d(result["products"]["finding"].values).tolist()
-    pairs = zip(product_names(result), texts, strict=True)
     page = "fleets.md#products-that-fail"
-    return {name: (Finding("product-finding", text, page),) for name, text in pairs if text}
+    texts = texts_by_product(result, "finding")
+    return {name: (Finding("product-finding", text, page),) for name, text in texts.items()}
+
+
+def texts_by_product(result: Any, key: str) -> dict[str, str]:
+    """Return the texts of products that have one, such as findings of a calibration."""
+    if not product_names(result) or key not in result["products"]:
+        return {}
+    texts = np.atleast_1d(result["products"][key].values).tolist()
+    pairs = zip(product_names(result), texts, strict=True)
+    return {name: text for name, text in pairs if text}
 
 
 def failed_products(fleet: Any) -> dict[str, str]:
@@ -323,11 +329,8 @@ def _observing(model: pm.Model, data: Mapping[str, Any]) -> pm.Model:
 
 def data_sheets(result: Any) -> dict[str, Summary]:
     """Return the data sheets of products that have one in place of specimens."""
-    if not product_names(result) or "data_sheet" not in result["products"]:
-        return {}
-    texts = np.atleast_1d(result["products"]["data_sheet"].values).tolist()
-    pairs = zip(product_names(result), texts, strict=True)
-    return {name: summary_from(text) for name, text in pairs if text}
+    texts = texts_by_product(result, "data_sheet")
+    return {name: summary_from(text) for name, text in texts.items()}
 
 
 def summary_as_text(summary: Summary) -> str:

@@ -349,4 +349,4 @@ def _whitened(residual: Floats, covariance: Floats) -> Floats:
         out=np.zeros_like(residual),
         where=is_regular,
     )
-    return np.asarray(vectors @ scaled)
+    return vectors @ scaled

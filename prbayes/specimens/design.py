@@ -241,6 +241,7 @@ def sequential_design(
         emulation = replace(previous, bias=np.inf, offsets=None)
     population = normal_of(data.inner[:, data.free])
     most, bias = largest_design(data), data.options.bias
+    limit = 1.5 * bias
     rng = np.random.default_rng([data.seed, 1])
     enough_batches = 1 if has_fewer_readings(data) else 2
     # The emulator of earlier data needs one batch, which measures its error at the new data.
@@ -269,7 +270,7 @@ def sequential_design(
             # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
-            is_good = emulation.bias <= 1.5 * bias
+            is_good = emulation.bias <= limit
             if not is_good and not likely.has_runs(data, before.z):
                 continue
             if is_good and emulation.surface is not before.surface:
@@ -277,7 +278,7 @@ def sequential_design(
                 earlier, likely = plausible, Likely.of(data, emulation, population, batches)
                 emulation, plausible = known_again(run, data, emulation, likely, population, rng)
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-                is_good &= emulation.bias <= 1.5 * bias
+                is_good &= emulation.bias <= limit
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)

@@ -496,7 +496,7 @@ class SpecimenFleet(Fleet):
         predicted: dict[int, Floats] = {}
         if tested:
             # Products differ in their specimens, and not in the way in which these are measured.
-            draw = partial(draw_readings_of, likelihood)
+            draw = partial(draw_readings, likelihood, measurement=likelihood.measurements[0])
             responses = self._predicted([values[row] for row in tested], draw)
             predicted = dict(zip(tested, responses, strict=True))
         findings = _misfits(likelihood, sizes)
@@ -533,15 +533,9 @@ class SpecimenFleet(Fleet):
         )
         predicted = None
         if name in self.further:
-            (predicted,) = self._predicted([values], partial(draw_readings_of, likelihood))
+            draw = partial(draw_readings, likelihood, measurement=likelihood.measurements[0])
+            (predicted,) = self._predicted([values], draw)
         return Drawn(values, pareto_k, predicted, finding)
-
-
-def draw_readings_of(
-    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats], n: int
-) -> Floats:
-    """Return readings of new specimens of the populations, (P, n) or (P, n, m)."""
-    return draw_readings(likelihood, rng, values, n, likelihood.measurements[0])
 
 
 def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:

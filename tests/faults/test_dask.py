@@ -18,6 +18,7 @@ import pymc as pm
 import pytest
 import units
 from first_use import first_use
+from one_input import one_input
 from um_server import Real
 
 import prbayes as prb
@@ -38,16 +39,14 @@ def slow(x: float) -> float:
 
 
 def build(**keywords: object) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator(
-            "y",
-            prb.scalar(slow),
-            x,
-            metric=prb.AreaMetric(),
-            observed=[1, 2.0],
-            propagation=prb.Reweighted(N, **keywords),
-        )
+    model = one_input(
+        [1, 2.0],
+        prb.AreaMetric(),
+        response=prb.scalar(slow),
+        propagation=prb.Reweighted(N, **keywords),
+        mu=(1, 1),
+        sd=1.0,
+    )
     first_use(model)
     return model
 

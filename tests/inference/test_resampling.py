@@ -222,12 +222,10 @@ def weighted_mean(simulated: Any, observed: Any, weights: Any) -> Any:
 def test_specimens_without_a_response_cannot_be_observed_and_failures_only_if_they_count() -> None:
     def of_failing(metric: Any) -> Evaluator:
         """Return a model of specimens of which half are lost, and a few fail."""
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-            failing = lambda x: np.where(x > 1.2, np.inf, np.where(x < 0, np.nan, x))  # noqa: E731
-            given: dict[str, Any] = {"observed": OBSERVED[OBSERVED < 1]}
-            given["propagation"] = prb.Reweighted(256, max_lost=0.9)
-            prb.Simulator("y", failing, x, metric=metric, **given)
+        failing = lambda x: np.where(x > 1.2, np.inf, np.where(x < 0, np.nan, x))  # noqa: E731
+        given: dict[str, Any] = {"observed": OBSERVED[OBSERVED < 1]}
+        given["propagation"] = prb.Reweighted(256, max_lost=0.9)
+        model = one_input(metric=metric, response=failing, mu=(0, 1), sd=0.5, **given)
         return Evaluator.of(model)
 
     rng = np.random.default_rng(0)

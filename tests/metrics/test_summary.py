@@ -9,6 +9,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from one_input import one_input
 from scipy.special import ndtri
 from scipy.stats import chi2, norm
 
@@ -147,10 +148,7 @@ def test_rounded_statistics_of_samples_are_accepted(method: Any) -> None:
 
 def with_sheet(**settings: Any) -> pm.Model:
     sheet = prb.Summary(n=40, mean=330.0, sd=11.3, minimum=300.0, maximum=355.0)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 320, 30), pm.HalfNormal("sigma", 30))
-        prb.Simulator("y", lambda x: 1.0 * x, x, observed=sheet, **settings)
-    return model
+    return one_input(sheet, response=lambda x: 1.0 * x, mu=(320, 30), sigma=30, **settings)
 
 
 @pytest.mark.parametrize(

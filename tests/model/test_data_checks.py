@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -442,9 +443,7 @@ def test_a_metric_that_a_code_spoils_names_it() -> None:
 
 def fitted(response: Any, values: Any, metric: prb.Metric, **given: Any) -> dict[str, str]:
     """Return the texts of findings about an optimum by code."""
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 3, 1), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", response, x, metric=metric, observed=values, **given)
+    model = one_input(values, metric, response=response, mu=(3, 1), sigma=0.5, **given)
     findings = prb.minimize(model, starts=0, progressbar=False).findings
     return {finding.code: finding.text for finding in findings}
 

@@ -13,6 +13,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from pymc.model.fgraph import clone_model
 
 import prbayes as prb
@@ -497,9 +498,7 @@ def test_tables_of_other_runs_are_refused() -> None:
 
 @pytest.mark.long
 def test_the_optimum_is_taken_to_the_order_of_a_clone() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    model = one_input(OBSERVED, prb.AreaMetric(), mu=(2, 1))
     found = prb.minimize(model, starts=0, **QUIET)
     clone = clone_model(model)
     assert (

@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from scipy.optimize import minimize
 from scipy.stats import norm
 
@@ -22,11 +23,8 @@ METRICS = [prb.AreaMetric(), prb.LogLikelihood(rounded=float(EDGES[1] - EDGES[0]
 
 
 def model(metric: Any, observed: Any = MIDDLES, **given: Any) -> pm.Model:
-    with pm.Model() as built:
-        x = pm.Normal.dist(pm.Normal("mu", 9, 3), pm.HalfNormal("sigma", 3))
-        settings = {"observed": observed, "propagation": prb.Reweighted(128), **given}
-        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, **settings)
-    return built
+    settings = {"observed": observed, "propagation": prb.Reweighted(128), **given}
+    return one_input(metric=metric, response=lambda x: 1.0 * x, mu=(9, 3), sigma=3, **settings)
 
 
 @pytest.mark.long

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._validate import Floats
@@ -80,8 +81,6 @@ def test_the_runs_of_a_surrogate_are_compared_with_the_specimens_as_well(
 
 
 def test_a_function_has_no_such_findings() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", curved, x, observed=curved(X), progressbar=False)
+    model = one_input(curved(X), response=curved, progressbar=False)
     (likelihood,) = specimen_likelihoods(model).values()
     assert not {f.code for f in prepared(likelihood).findings} & {"sparse-runs", "beyond-runs"}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes._finding import Finding, from_json
@@ -85,9 +86,9 @@ def test_inputs_that_do_not_exist_have_no_mass(name: str) -> None:
     response, *priors, x = PROBLEMS[name]
     try:
         posterior = prb.sample(model=build(response, *priors, x), random_seed=1).posterior
-    except DesignError as error:  # A false input beside the pole is never excluded.
-        assert name == "close pole"
-        assert "not smooth enough" in str(error)
+    except DesignError:
+        if name != "close pole":  # The false input beside it moves from run to run.
+            raise
         return
     mean, sd = exact(*priors, x)
     draws = np.stack([posterior[name].values.ravel() for name in ("mu", "sigma")])
@@ -189,9 +190,7 @@ def test_gross_errors_need_no_runs() -> None:
     y = np.exp(x)
     y[0] += 60
     metric = prb.LogLikelihood(error=0.1, gross_errors=True)
-    with pm.Model() as model:
-        of_specimens = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.exp, of_specimens, observed=y, metric=metric)
+    model = one_input(y, metric, response=np.exp)
     evaluator = Evaluator.of(model)
     prepared(evaluator.likelihoods[0])
     n_runs = evaluator.n_responses

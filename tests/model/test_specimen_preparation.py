@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from scipy.stats import halfnorm, norm, truncnorm
 
 import prbayes as prb
@@ -65,9 +66,7 @@ def test_moments_are_those_of_the_posterior(scale: float) -> None:
 def test_readings_with_several_roots_in_the_priors_centre_are_reported(
     rate: float, codes: list[str]
 ) -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", lambda x: np.sin(rate * x), x, observed=np.sin(rate * 0.2 * X[:6]))
+    model = one_input(np.sin(rate * 0.2 * X[:6]), response=lambda x: np.sin(rate * x))
     (likelihood,) = specimen_likelihoods(model).values()
     assert [finding.code for finding in prepared(likelihood).findings] == codes
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -160,9 +161,7 @@ def test_metrics_refuse_a_population_outside_the_table_and_say_what_to_do() -> N
     assert (prb.propose_runs(model)["x"] > 3).all()
     with pytest.raises(ValueError, match="got a table of no simulator"):
         prb.propose_runs(model, runs=prb.Runs(x, x**2))
-    with pm.Model() as other:
-        dist = pm.Normal.dist(pm.Normal("mu", 2, 1), 1)
-        prb.Simulator("y", np.exp, dist, metric=prb.AreaMetric(), observed=data)
+    other = one_input(data, prb.AreaMetric(), response=np.exp, mu=(2, 1), sd=1)
     with pytest.raises(ValueError, match="got 0 tables of runs"):
         prb.propose_runs(other)
 

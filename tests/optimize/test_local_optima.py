@@ -99,12 +99,10 @@ def test_a_prior_that_excludes_one_leaves_one() -> None:
 def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     # Right where x > 0, and three times too wide a population where x < 0.
     wrong = lambda x: np.where(x > 0, x, 4 - 3 * (x + 2))  # noqa: E731
-    with pm.Model() as rough:
-        z = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
-        data = np.random.default_rng(5).normal(4.0, 0.3, 60)
-        prb.Simulator(
-            "y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(2048)
-        )
+    data = np.random.default_rng(5).normal(4.0, 0.3, 60)
+    rough = one_input(
+        data, METRICS["ll"], response=wrong, propagation=prb.Reweighted(2048), mu=(0, 3), sd=0.3
+    )
     stuck = prb.minimize(rough, start={"mu": -2.0}, starts=0)
     assert abs(stuck.point["mu"] + 2) < 0.2
     found = prb.minimize(rough, start={"mu": -2.0})

@@ -9,6 +9,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from four_metrics import METRICS, R256, same
+from one_input import one_input
 from scipy.stats import norm
 
 import prbayes as prb
@@ -20,10 +21,7 @@ N, SD = OBSERVED.size, float(OBSERVED.std())
 
 
 def build(metric: prb.Metric, propagation: Any = R256) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=propagation)
-    return model
+    return one_input(OBSERVED, metric, response=same, propagation=propagation, mu=(0, 1), sd=0.5)
 
 
 @cache
@@ -52,9 +50,9 @@ def test_standard_deviations_of_a_normal_mean(parametric: bool) -> None:
 
 
 def test_few_specimens_are_a_finding_of_the_draws() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED[:20], propagation=R256)
+    model = one_input(
+        OBSERVED[:20], METRICS["kl"], response=same, propagation=R256, mu=(0, 1), sd=0.5
+    )
     optimum = prb.minimize(model, starts=0, progressbar=False)
     findings = prb.diagnose(prb.bootstrap(optimum, 100, progressbar=False), model=model).findings
     assert [finding.code for finding in findings] == ["few-for-bootstrap"]

@@ -14,6 +14,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from scipy import stats
 
 import prbayes as prb
@@ -42,13 +43,9 @@ PROPAGATIONS: dict[str, Any] = {
 
 
 def one_mean(propagation: Any, response: Any = np.positive, metric: Any = AREA) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
-        prb.Simulator(
-            "y", response, x, metric=metric, observed=OBSERVED, epsilon=0.05,
-            propagation=propagation,
-        )  # fmt: skip
-    return model
+    return one_input(
+        OBSERVED, metric, response=response, epsilon=0.05, propagation=propagation, sd=0.5
+    )
 
 
 def evaluator(name: str) -> Evaluator:

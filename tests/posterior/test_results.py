@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from one_input import one_input
 from scipy.stats import norm
 
 import prbayes as prb
@@ -147,11 +148,8 @@ def test_trees_survive_storage(make: Any, tmp_path: Path) -> None:
 
 
 def known_sd(propagation: prb.propagation.Propagation) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 0.2), 0.5)
-        observed = DATA[:, 0]
-        prb.Simulator("y", np.positive, x, metric=AREA, observed=observed, propagation=propagation)
-    return model
+    observed = DATA[:, 0]
+    return one_input(observed, AREA, propagation=propagation, mu=(0, 0.2), sd=0.5)
 
 
 @cache
@@ -237,9 +235,7 @@ def test_many_predictive_draws_are_thinned(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.long
 def test_log_likelihoods_of_many_specimens_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     data = np.random.default_rng(1).normal(1.0, 0.5, 20)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", lambda x: 2 * x, x, observed=2 * data)
+    model = one_input(2 * data, response=lambda x: 2 * x)
     whole = prb.sample(1000, chains=2, model=model, **QUIET)
     monkeypatch.setattr(results, "AT_ONCE", 2 * 1000 * 20 // 8)
     thinned = prb.sample(1000, chains=2, model=model, **QUIET)
@@ -257,12 +253,15 @@ def test_log_likelihoods_of_many_specimens_are_thinned(monkeypatch: pytest.Monke
 
 
 def test_points_without_a_response_are_never_drawn() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-        prb.Simulator(
-            "y", lambda x: np.where(x > 2.5, np.nan, x), x, metric=AREA, epsilon=0.1,
-            observed=[-1.0, 0.0, 1.0, 0.5], propagation=prb.Reweighted(256, max_lost=0.5),
-        )  # fmt: skip
+    model = one_input(
+        [-1.0, 0.0, 1.0, 0.5],
+        AREA,
+        response=lambda x: np.where(x > 2.5, np.nan, x),
+        epsilon=0.1,
+        propagation=prb.Reweighted(256, max_lost=0.5),
+        mu=(0, 1),
+        sd=1.0,
+    )
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, **QUIET)
     assert np.isfinite(tree.prior_predictive["y"]).all()
     assert float(tree.prior_predictive["y"].max()) <= 2.5

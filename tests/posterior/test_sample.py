@@ -13,6 +13,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from normal_posterior import exact_moments, moments_of, require_close
+from one_input import one_input
 from scipy.stats import norm
 
 import prbayes as prb
@@ -27,10 +28,7 @@ DIVERGENCE = prb.KullbackLeibler()
 
 @cache
 def linear_model(**keywords: Any) -> pm.Model:
-    with pm.Model() as model:
-        inputs = pm.Normal.dist(pm.Normal("mu", 9, 3), pm.HalfNormal("sigma", 2))
-        prb.Simulator("y", lambda x: 2 * x + 1, inputs, observed=2 * X + 1, **keywords)
-    return model
+    return one_input(2 * X + 1, response=lambda x: 2 * x + 1, mu=(9, 3), sigma=2, **keywords)
 
 
 def require_exact(result: xr.DataTree, **limits: Any) -> None:
@@ -131,9 +129,7 @@ def test_an_optimum_with_another_mode_is_sampled_by_smc(monkeypatch: pytest.Monk
     found = module.modes_of
     monkeypatch.setattr(module, "modes_of", lambda *arguments: found(*arguments)[:1])
     x = np.random.default_rng(1).normal(1.5, 0.3, 15)
-    with pm.Model() as model:
-        inputs = pm.Normal.dist(pm.Normal("mu", 0, 1.5), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", lambda x: x**2, inputs, observed=x**2)
+    model = one_input(x**2, response=lambda x: x**2, mu=(0, 1.5))
     optimum = prb.minimize(model, progressbar=False)
     assert any(mode["comparable"] for mode in optimum.local_optima)
     result = prb.sample(50, chains=2, optimum=optimum, model=model, progressbar=False)
@@ -144,9 +140,7 @@ def test_modes_at_which_the_points_do_not_determine_the_likelihood_are_artefacts
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     x = np.random.default_rng(1).normal(1.5, 0.3, 15)
-    with pm.Model() as model:
-        inputs = pm.Normal.dist(pm.Normal("mu", 0.2, 1.5), 0.3)
-        prb.Simulator("y", np.square, inputs, observed=x**2)
+    model = one_input(x**2, response=np.square, mu=(0.2, 1.5), sd=0.3)
     arguments = {"draws": 50, "chains": 2, "model": model, "progressbar": False}
     assert '"second-mode"' in prb.sample(**arguments).posterior.attrs["findings"]
     monkeypatch.setattr(
@@ -176,9 +170,7 @@ def test_draws_lack_findings_of_the_optimum_that_advise_to_sample(
 def test_modes_have_their_masses_where_smc_takes_over() -> None:
     """The response x^2 has two populations, whose masses are those of the prior."""
     x = np.random.default_rng(1).normal(1.5, 0.3, 15)
-    with pm.Model() as model:
-        inputs = pm.Normal.dist(pm.Normal("mu", 0.8, 1.0), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.square, inputs, observed=x**2)
+    model = one_input(x**2, response=np.square, mu=(0.8, 1.0))
     result = prb.sample(250, chains=2, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
     mu, log_sigma = np.meshgrid(np.linspace(-4, 4, 801), np.linspace(-4, 1, 201))

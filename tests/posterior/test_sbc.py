@@ -14,6 +14,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from four_metrics import METRICS, R256, same
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -38,10 +39,7 @@ def build(
     **keywords: Any,
 ) -> pm.Model:
     settings = {"observed": OBSERVED[:n], "propagation": propagation, **keywords}
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator("y", response, x, metric=metric, **settings)
-    return model
+    return one_input(metric=metric, response=response, mu=(0, 1), sd=0.5, **settings)
 
 
 def calibrate(n: int, model: pm.Model, **keywords: Any) -> xr.DataTree:

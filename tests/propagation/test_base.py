@@ -6,9 +6,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import pytest
 from first_use import first_use
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.propagation.base import Bound, Missing, Propagation, discrepancy_error
@@ -24,11 +24,9 @@ def response(x: Any) -> Any:
 
 @cache
 def bound(propagation: Propagation, response: Any = np.positive) -> Bound:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1.0, 0.5), pm.HalfNormal("sigma", 1.0))
-        prb.Simulator(
-            "y", response, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation
-        )
+    model = one_input(
+        OBSERVED, prb.AreaMetric(), response=response, propagation=propagation, mu=(1.0, 0.5)
+    )
     (node,) = first_use(model).values()
     return node.bound
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 from scipy import optimize
 
 import prbayes as prb
@@ -89,10 +90,8 @@ def test_a_known_bias_is_a_shift_of_the_readings() -> None:
     y = np.random.default_rng(3).normal(2.0, 1.0, 12)
 
     def estimates(observed: Floats, bias: float | None) -> list[float]:
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 3), pm.HalfNormal("sigma", 3))
-            metric = prb.LogLikelihood(error=0.2, bias=bias)
-            prb.Simulator("y", np.positive, x, metric=metric, observed=observed)
+        metric = prb.LogLikelihood(error=0.2, bias=bias)
+        model = one_input(observed, metric, mu=(0, 3), sigma=3)
         point = prb.minimize(model, starts=0, progressbar=False).point
         return [float(point[name]) for name in ("mu", "sigma")]
 

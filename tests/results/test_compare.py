@@ -288,9 +288,7 @@ def test_data_that_a_default_metric_does_not_take_have_no_value_of_it() -> None:
     def curve(x: Any) -> Any:
         return np.asarray(x)[..., None] * np.array([1.0, 2.0, 3.0])
 
-    with pm.Model() as of_curves:
-        population = pm.Normal.dist(pm.Normal("mu", 0.0, 5.0), 0.3)
-        prb.Simulator("y", curve, population, observed=curve(x))
+    of_curves = one_input(curve(x), response=curve, mu=(0.0, 5.0), sd=0.3)
     for model in (of_groups, of_curves):
         table = prb.compare({"optimum": prb.minimize(model, progressbar=False)}, model=model)
         assert np.isfinite(table["estimate"]).all()

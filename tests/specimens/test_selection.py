@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 from scipy import stats
 from scipy.special import logsumexp
 
@@ -108,11 +109,9 @@ def test_log_likelihoods_of_a_selection_are_exact(error: float) -> None:
 
 @pytest.mark.long
 def test_selected_specimens_have_no_conditional_residuals() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
-        metric = prb.LogLikelihood(selected=(1.0, None))
-        y = np.array([1.2, 1.5, 1.9, 2.6, 1.1, 3.4])
-        prb.Simulator("y", np.exp, x, observed=y, metric=metric)
+    metric = prb.LogLikelihood(selected=(1.0, None))
+    y = np.array([1.2, 1.5, 1.9, 2.6, 1.1, 3.4])
+    model = one_input(y, metric, response=np.exp, mu=(0, 1))
     residuals = prb.residuals(prb.minimize(model, progressbar=False))
     assert np.isnan(residuals["y"]["CWRES"]).all()
     assert residuals["y"]["eta"].notnull().all()
@@ -153,10 +152,8 @@ def test_refused_selections(options: dict[str, Any], text: str) -> None:
 def test_an_output_without_a_limit() -> None:
     """None beside the limit of another output is no limit."""
     y = np.array([[1.0, 2.0], [2.0, np.nan], [3.0, 4.0]])
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-        metric = prb.LogLikelihood(error=0.1, selected=([0.5, None], [None, 5.0]))
-        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y, metric=metric)
+    metric = prb.LogLikelihood(error=0.1, selected=([0.5, None], [None, 5.0]))
+    model = one_input(y, metric, response=lambda x: np.stack([x, 2 * x], axis=-1), mu=(2, 1))
     selection = selection_of(list(measurements_of(model).values()))
     assert selection is not None
     np.testing.assert_array_equal([selection.low, selection.high], [[0.5, -np.inf], [np.inf, 5.0]])

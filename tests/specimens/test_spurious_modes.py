@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from one_input import one_input
 
 import prbayes as prb
 from prbayes.model.emulated import emulated_simulators
@@ -144,11 +145,9 @@ FOLDED = [0.649, 0.495, 1.824, 0.250, -0.002, 1.334, 0.108, 2.102, 0.348, 1.446,
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 def test_inaccurate_readings_at_a_fold_have_inputs_on_both_sides(scale: float) -> None:
     """Mirrored populations have the same likelihood."""
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", -1.9, 1.9), pm.HalfNormal("sigma", 0.7))
-        metric = prb.LogLikelihood(error=0.22 * scale)
-        observed = scale * np.array(FOLDED)
-        prb.Simulator("y", lambda x: scale * x**2, x, observed=observed, metric=metric)
+    metric = prb.LogLikelihood(error=0.22 * scale)
+    observed = scale * np.array(FOLDED)
+    model = one_input(observed, metric, response=lambda x: scale * x**2, mu=(-1.9, 1.9), sigma=0.7)
     logp = model.compile_fn(model.observedlogp)
     for mu, sigma in ((0.8, 0.6), (0.5, 0.4), (1.2, 0.3)):
         both = [logp({"mu": sign * mu, "sigma_log__": np.log(sigma)}) for sign in (1, -1)]
@@ -159,10 +158,8 @@ def test_accurate_readings_have_points_around_modes_far_from_the_population() ->
     """Mirrored populations that are narrow: points of the other side were at its lower edge."""
     x = -1.5 + 0.066 * np.random.default_rng(9).standard_normal(24)
     observed = x**2 + 0.041 * np.random.default_rng(10).standard_normal(24)
-    with pm.Model() as model:
-        inputs = pm.Normal.dist(pm.Normal("mu", -2.0, 2.2), pm.HalfNormal("sigma", 1.0))
-        metric = prb.LogLikelihood(error=0.041)
-        prb.Simulator("y", lambda x: x**2, inputs, observed=observed, metric=metric)
+    metric = prb.LogLikelihood(error=0.041)
+    model = one_input(observed, metric, response=lambda x: x**2, mu=(-2.0, 2.2))
     logp = model.compile_fn(model.observedlogp)
     for mu, sigma in ((1.5, 0.066), (1.48, 0.05), (1.52, 0.09)):
         both = [logp({"mu": sign * mu, "sigma_log__": np.log(sigma)}) for sign in (1, -1)]

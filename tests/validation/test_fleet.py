@@ -263,9 +263,7 @@ def test_an_emulator_that_is_not_smooth_enough_is_reported() -> None:
         return x + np.where(x > 45, 3 * np.sin(3 * x), 0)
 
     x = np.array([60.0, *np.random.default_rng(3).normal(28, 3, 14)[1:]])
-    with pm.Model() as model:
-        k = pm.Normal.dist(pm.Normal("mu", 20, 8), pm.HalfNormal("sigma", 4))
-        prb.Simulator("y", response, k, observed=response(x))
+    model = one_input(response(x), response=response, mu=(20, 8), sigma=4)
     data = {"p0": response(x), "p1": response(x[1:])}
     first, second = prb.calibrate_each(data, model=model, **QUIET)["products"]["finding"].values
     assert "not smooth enough" in first

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -126,11 +125,11 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
     Specimens of simulators with a common element of theta are added.
     """
     enough = 8
-    enters, groups, counts = specimen_counts(evaluator)
+    _, groups, counts = specimen_counts(evaluator)
     findings = unlabelled_specimens(all_simulators(evaluator.model))
     n = min(counts, default=enough)
     if not n < enough:
-        return findings + _spread_in_common(evaluator, enters, groups, counts)
+        return findings
     fewest = np.flatnonzero(groups == np.argmin(counts))
     names = ", ".join(evaluator.simulators[k].name for k in fewest)
     text = f"{names}: got {n:.3g} specimen{'s' * (n != 1)}, expected at least {enough}: "
@@ -147,19 +146,15 @@ def few_specimens(evaluator: Evaluator) -> list[Finding]:
     return [*findings, Finding("few-specimens", text, _PAGE)]
 
 
-def _spread_in_common(
-    evaluator: Evaluator,
-    enters: Bools,
-    groups: Indices,
-    counts: Sequence[float],
-) -> list[Finding]:
+def spread_in_common(evaluator: Evaluator) -> list[Finding]:
     """Report a spread that populations with means of their own underestimate (Neyman and Scott).
 
     With G means the maximum of the likelihood is sqrt(1 - G / N) of a common standard deviation,
     about G / sqrt(2 N) standard errors below it. Metrics of distributions are tested by refits
     instead.
     """
-    if evaluator.nodes:
+    enters, groups, counts = specimen_counts(evaluator)
+    if min(counts, default=0) < 8:  # `few_specimens` reports them
         return []
     findings = []
     for group, n in enumerate(counts):

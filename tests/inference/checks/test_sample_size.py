@@ -12,7 +12,12 @@ from one_input import one_input
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.checks.sample_size import few_for_bootstrap, few_specimens, interval_ratios
+from prbayes.inference.checks.sample_size import (
+    few_for_bootstrap,
+    few_specimens,
+    interval_ratios,
+    spread_in_common,
+)
 from prbayes.model.evaluator import Evaluator
 
 N = 40
@@ -127,10 +132,12 @@ def test_a_spread_in_common_of_pairs_is_reported_with_its_bias() -> None:
             prb.Simulator("y", same, x, observed=observed)
         return result
 
-    text = warned(model(2))
-    assert "20 specimens of 10 populations" in text
-    assert "by about 29%" in text
-    assert not warned(model(21))
+    (finding,) = spread_in_common(Evaluator.of(model(2)))
+    assert finding.code == "few-specimens"
+    assert "20 specimens of 10 populations" in finding.text
+    assert "by about 29%" in finding.text
+    assert not spread_in_common(Evaluator.of(model(21)))
+    assert not warned(model(2))
 
 
 @pytest.mark.parametrize(
