@@ -261,15 +261,14 @@ def peak() -> float:
 def memory(problem: str) -> dict[str, Any]:
     """Return what `prb.sample` adds to the peak memory after import, beside Numba's own."""
     import prbayes as prb
-    from prbayes.metrics.area import sum_below
+    from prbayes.metrics.grid import count
 
     job = by_likelihood(problem)
     _ = prb.sample, prb.Simulator
     imported = peak()
     # One cached loop: what Numba itself takes.
-    sum_below(
-        np.ones((1, 1)), np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.ones((1, 1))
-    )
+    ones = np.ones((1, 1))
+    count(ones, ones, 0.0, 1.0, 1, np.zeros((1, 8)), np.zeros((1, 2)))
     with_numba = peak()
     job(0)
     return {"imported": imported, "with Numba": with_numba, "added": peak() - with_numba}

@@ -403,10 +403,19 @@ def refit_likelihood(
         sampling, rest = inside, []
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
-    # All stored responses have shown which directions are identified. An eighth of them suffices
-    # for the rest.
-    theta = continuation.within(thetas[:1])[0]
-    evaluator = coarser_evaluator(evaluator, theta)
+    # Data sets are drawn in balls around the centers first.
+    r = sampling.stderr.size
+    number = options.n_sets // options.rounds
+    size = number // len(centers)
+    balls = [_points_of_ball(size, r, options, i) for i in range(len(centers))]
+
+    def in_balls() -> Floats:
+        pairs = zip(centers, balls, strict=True)
+        return np.concatenate([center.thetas(ball) for center, ball in pairs])
+
+    # All stored responses have shown which directions are identified. Fewer suffice for the rest,
+    # if they support the populations of the balls.
+    evaluator = coarser_evaluator(evaluator, continuation.within(in_balls()))
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
@@ -418,19 +427,12 @@ def refit_likelihood(
         scale=element_units(sampling, continuation) * evaluator.hyperparameters.prior_sd,
         options=options,
     )
-    r = sampling.stderr.size
     if not r:
         return likelihood
-    # Draw data sets in balls around the centers first, then around the posterior given these.
-    number = options.n_sets // options.rounds
-    balls = [
-        sampling.coordinates(center.thetas(_points_of_ball(number // len(centers), r, options, i)))
-        for i, center in enumerate(centers)
-    ]
-    x = np.concatenate(balls)
+    x = sampling.coordinates(in_balls())
     drawn = []
     for i in range(options.rounds):
-        if i:
+        if i:  # draw around the posterior given the data sets so far
             x = _posterior_points(likelihood, number)
         drawn.append(_draw(centers, x, options, seed=i, is_linear=is_linear))
         populations, counts, estimates = zip(*drawn, strict=True)
@@ -491,7 +493,7 @@ def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift:
     u = sobol(number, r + 1, options.seed + shift)
     directions = ndtri(u[:, :r])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.asarray(options.radius * u[:, r:] ** (1 / r) * directions)
+    return np.asarray(options.radius * u[:, r:] ** (1 / max(r, 1)) * directions)
 
 
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:

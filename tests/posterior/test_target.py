@@ -174,6 +174,22 @@ def test_a_uniform_prior_that_ends_near_the_estimate() -> None:
     require_normal(draws, exact.mean(), exact.std())
 
 
+@pytest.mark.parametrize("scale", [0.3, 0.02])
+def test_fewer_stored_responses_support_the_populations_around_the_estimate(scale: float) -> None:
+    """The narrower the population, the more of the stored responses it needs."""
+    y = 1 + scale * stats.norm.ppf((np.arange(12) + 0.5) / 12)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 3), pm.Uniform("sigma", 0, 1))
+        simulate(x, observed=y, propagation=prb.Reweighted(8192))
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    options = replace(OPTIONS, n_sets=64)
+    likelihood = refit_likelihood(optimum.evaluator, optimum, options)
+    bound = likelihood.evaluator.reweighted["y"]
+    assert bound.n_points < 8192
+    support = likelihood.evaluator.support(optimum.theta[None])["y"]
+    assert support["weight_ess"][0] > bound.required_ess
+
+
 def test_only_the_sum_is_identified() -> None:
     """The difference of two means keeps its prior."""
     y = data(15, mean=2.0)
