@@ -63,8 +63,10 @@ class LinearArea:
         """Return the area at theta for each data set, (n_sets,)."""
         table = correction_table(self.specimens)
         measured = self.simulated - self.gaps
-        gain = interpolated(table, measured) - interpolated(table, self.simulated)
-        return np.asarray((np.abs(self.gaps) + gain) @ self.lengths)
+        gain = interpolated(table, measured)
+        gain -= interpolated(table, self.simulated)
+        heights = np.abs(self.gaps) + gain
+        return np.asarray(heights @ self.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,9 +300,11 @@ class Information:
             # Few values occur in each data set: add up these alone, between the knots.
             sets_with, occurring_in = np.nonzero(w)
             size = knots.size + 1
-            cells = np.searchsorted(knots, part_observed)[occurring_in] + size * sets_with
+            cell = np.searchsorted(knots, part_observed)
+            cells = cell[occurring_in] + size * sets_with
             mass = np.bincount(cells, w[sets_with, occurring_in], size * len(w))
-            measured = mass.reshape(len(w), size)[:, :-1].cumsum(axis=1)
+            by_set = mass.reshape(len(w), size)
+            measured = by_set[:, :-1].cumsum(axis=1)
             simulated, measured = without_rounding(simulated), without_rounding(measured)
             gaps = simulated[0] - measured
             derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
@@ -398,7 +402,10 @@ def first_order_shifts(
                 force -= (lengths * (np.sign(area.gaps) - expected)) @ along.T
                 curvature += (lengths * density * along) @ along.T
     shifts = np.zeros_like(force)
-    squares = [(a.slopes[:, None] * a.slopes).reshape(r * r, -1) for a in areas]
+    squares = []
+    for area in areas:
+        square = area.slopes[:, None] * area.slopes
+        squares.append(square.reshape(r * r, -1))
     # Without area metrics the system is linear: one iteration suffices.
     for _ in range(30 if areas else 1):
         matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()

@@ -364,7 +364,9 @@ def _areas_by_loop(
         np.broadcast_to(np.arange(math.prod(batch)).reshape(batch), shape).ravel()
         for batch in batches
     ]
-    rows = [np.ascontiguousarray(a).reshape(-1, a.shape[-1]) for a in (weights, observed)]
+    rows = [
+        np.ascontiguousarray(array).reshape(-1, array.shape[-1]) for array in (weights, observed)
+    ]
     out = np.empty(len(places[0]))
     sum_areas(*places, *rows, order, below, *knots, out)
     return out.reshape(shape)
@@ -400,13 +402,17 @@ def sum_areas(
         levels = observed[data_set[r]]
         area = 0.0
         for k in range(len(below)):
-            height = abs(sums[below[k]] - levels[k])
+            simulated = sums[below[k]]
+            measured = levels[k]
+            height = abs(simulated - measured)
             if height < 1e-13:  # equal but for rounding, see `_heights`
                 continue
             if has_correction:
-                for sign, p in ((1, levels[k]), (-1, sums[below[k]])):
-                    cell = min(max(int(p * last), 0), last - 1)
-                    rise = table[cell + 1] - table[cell]
-                    height += sign * (table[cell] + (p * last - cell) * rise)
+                for sign, p in ((1, measured), (-1, simulated)):
+                    place = p * last
+                    cell = min(max(int(place), 0), last - 1)
+                    lower = table[cell]
+                    rise = table[cell + 1] - lower
+                    height += sign * (lower + (place - cell) * rise)
             area += height * lengths[k]
         out[r] = area
