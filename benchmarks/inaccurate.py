@@ -43,6 +43,8 @@ def exact(
     ``likelihood``, (N, K), has densities of the readings at inputs x, (K,), at equal distances.
     """
     step = x[1] - x[0]
+    is_possible = likelihood.max(axis=0) > 1e-14
+    x, likelihood = x[is_possible], likelihood[:, is_possible]
     ends = [(prior[0] - 4.5 * prior[1], prior[0] + 4.5 * prior[1])]
     ends.append((np.log(1e-3 * scale), np.log(4.5 * scale)))
     for size in (1501, 801):
@@ -94,7 +96,7 @@ def row(cell: str, number: int) -> dict[str, Any]:
         draws = prb.sample(draws=2000, random_seed=number).posterior
     figures: dict[str, Any] = {"runs": runs[0], "cpu": round(time.process_time() - begun, 2)}
     half = 4.5 * prior[1] + 4 * scale
-    inputs = np.linspace(prior[0] - half, prior[0] + half, 3001)
+    inputs = np.linspace(prior[0] - half, prior[0] + half, 12001)
     likelihood = np.exp(-(((observed[:, None] - response(inputs)) / error) ** 2) / 2)
     names, biases, widths = ("mu", "sigma"), [], []
     for name, figure in zip(names, exact(inputs, likelihood, prior, scale), strict=True):

@@ -304,8 +304,9 @@ def selection() -> Iterator[Row]:
     for cell, figures in summary("selection").items():
         share, error, way = cell.split("/")
         low, high = figures["widths"]
-        label = f"{float(share):.0%}" + (", ignored" if way == "ignored" else "")
+        label = f"{float(share):.0%}" + {"ignored": ", ignored", "window": ", window"}.get(way, "")
         seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
+        sets += f", {figures['refused']} refused" if figures["refused"] else ""
         offset, widths = f"{figures['largest offset']:.2f}", f"{low:.2f} to {high:.2f}"
         yield [label, error, offset, widths, seconds, sets]
 
@@ -317,7 +318,8 @@ def random_responses() -> Iterator[Row]:
         half = len(figures["coverage"]) // 2
         for label, part in (("mean", slice(half)), ("sd", slice(half, None))):
             numbers = [np.mean(figures[key][part]) for key in ("mean offset", "rms offset")]
-            numbers += [np.mean(figures[key][part]) for key in ("mean width", "coverage")]
+            keys = ("mean width", "coverage", "exact coverage", "expected coverage")
+            numbers += [np.mean(figures[key][part]) for key in keys]
             texts = [f"{number:.2f}" for number in numbers]
             seconds, sets = f"{figures['CPU seconds']:.0f}", str(figures["data sets"])
             yield [f"{names[cell]}: {label}", *texts, seconds, sets]

@@ -76,8 +76,11 @@ def log_two(y: Floats, x: Floats) -> Floats:
 CASES = {"one": Case(one, log_one, (1.0,), 800), "two": Case(two, log_two, (1.0, 0.0), 70)}
 
 
-def exact(case: Case, y: Floats) -> tuple[Floats, Floats]:
-    """Return means and standard deviations of means and log standard deviations of the inputs."""
+def exact(case: Case, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return means, standard deviations, and ends of 89 % intervals, (2, 2 d).
+
+    They are those of means and log standard deviations of the inputs.
+    """
     d = len(case.means)
     axis = [mean - 3.5 + 7.0 * (np.arange(case.grid) + 0.5) / case.grid for mean in case.means]
     x = np.stack([v.ravel() for v in np.meshgrid(*axis, indexing="ij")], axis=1)
@@ -89,9 +92,10 @@ def exact(case: Case, y: Floats) -> tuple[Floats, Floats]:
     def log_posterior(theta: Floats) -> Floats:
         mean, log_sd = theta[:, :d], theta[:, d:]
         sd = np.exp(log_sd)
-        density = cell * np.ones((len(theta), len(x)))
-        for k in range(d):
-            density *= stats.norm.pdf(x[:, k], mean[:, k, None], sd[:, k, None])
+        density = cell * np.ones((len(theta), 1))
+        for k, values in enumerate(axis):  # the last input varies fastest
+            of_input = stats.norm.pdf(values, mean[:, k, None], sd[:, k, None])
+            density = (density[:, :, None] * of_input[:, None]).reshape(len(theta), -1)
         with np.errstate(divide="ignore"):
             logs = np.log(density @ likelihoods).sum(axis=1)
         prior = stats.norm.logpdf(mean, case.means, 1.0) + stats.halfnorm.logpdf(sd) + log_sd
@@ -109,7 +113,16 @@ def exact(case: Case, y: Floats) -> tuple[Floats, Floats]:
         center = weights @ theta
         covariance = 1.2 * (theta - center).T @ ((theta - center) * weights[:, None])
     sd = np.sqrt(weights @ (theta - center) ** 2)
-    return center, sd
+    tail = (1 - _PROB) / 2
+    columns = [quantiles(column, weights, np.array([tail, 1 - tail])) for column in theta.T]
+    return center, sd, np.stack(columns, axis=1)
+
+
+def quantiles(values: Floats, weights: Floats, probabilities: Floats) -> Floats:
+    """Return quantiles of a weighted sample."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order]) - weights[order] / 2
+    return np.interp(probabilities, below, values[order])
 
 
 def row(cell: str, number: int) -> dict[str, Any]:
@@ -118,7 +131,7 @@ def row(cell: str, number: int) -> dict[str, Any]:
     d = len(case.means)
     x = rng.normal(case.means, 0.5, (_N, d))
     y = case.response(*x.T, rng=rng)
-    center, sd = exact(case, y)
+    center, sd, exact_ends = exact(case, y)
     response = prb.response.Stochastic(case.response, random_seed=number)
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     clock = time.process_time()
@@ -139,15 +152,22 @@ def row(cell: str, number: int) -> dict[str, Any]:
         "offset": [float((v.mean() - c) / s) for v, c, s in zip(draws, center, sd, strict=True)],
         "width": [float(v.std() / s) for v, s in zip(draws, sd, strict=True)],
         "covered": [bool(e[0] <= t <= e[1]) for e, t in zip(ends, truth, strict=True)],
+        "exact covered": ((exact_ends[0] <= truth) & (truth <= exact_ends[1])).tolist(),
         "runs": int(prb.cost(model).simulators[0].computed),
         "seconds": seconds,
     }
 
 
 def summary(rows: list[Any]) -> dict[str, Any]:
-    """Return means and root mean squares: of the means of inputs, then of log standard deviations."""
+    """Return means and root mean squares: of the means of inputs, then of log standard deviations.
+
+    The expected coverage is the probability of an interval under the exact posterior, which is
+    normal: its scatter between data sets is far smaller than that of the coverage.
+    """
     good = [r for r in rows if "error" not in r]
     offset, width = (np.array([r[key] for r in good]) for key in ("offset", "width"))
+    half = -stats.norm.ppf((1 - _PROB) / 2) * width
+    expected = stats.norm.cdf(offset + half) - stats.norm.cdf(offset - half)
     return {
         "data sets": len(rows),
         "failures": len(rows) - len(good),
@@ -155,6 +175,8 @@ def summary(rows: list[Any]) -> dict[str, Any]:
         "rms offset": np.sqrt((offset**2).mean(axis=0)).round(3).tolist(),
         "mean width": width.mean(axis=0).round(3).tolist(),
         "coverage": np.mean([r["covered"] for r in good], axis=0).round(3).tolist(),
+        "expected coverage": expected.mean(axis=0).round(3).tolist(),
+        "exact coverage": np.mean([r["exact covered"] for r in good], axis=0).round(3).tolist(),
         "runs": float(np.mean([r["runs"] for r in good])),
         "CPU seconds": round(float(np.median([r["seconds"] for r in good])), 1),
     }

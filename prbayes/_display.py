@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
+from prbayes._validate import Names
+
 
 def view(
     heading: str,
@@ -99,7 +101,7 @@ class ShownArray(Shown):
 
     __slots__ = ()
     # Names of dimensions, variables, groups and attributes that a complete result has.
-    _parts: ClassVar[tuple[str, ...]] = ()
+    _parts: ClassVar[Names] = ()
 
     # The method of xarray has no annotations, so that type checkers would refuse each subclass.
     def __init_subclass__(cls, **options: Any) -> None:
@@ -141,7 +143,7 @@ class Table(ShownArray, xr.Dataset):
 
     __slots__ = ()
     # Names of the variables that become columns of the data frame.
-    _columns: ClassVar[tuple[str, ...]] = ()
+    _columns: ClassVar[Names] = ()
 
     def to_dataframe(self, dim_order: Sequence[Any] | None = None) -> Any:
         """Return the main variables as a data frame; for a selection all, as in xarray."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
-from prbayes._validate import plain_text
+from prbayes._validate import NamedValues, plain_text
 
 _log = logging.getLogger("prbayes")
 _unreported: ContextVar[bool] = ContextVar("unreported", default=False)
@@ -91,7 +90,7 @@ def as_json(findings: Iterable[Finding]) -> str:
     return json.dumps([asdict(finding) for finding in findings])
 
 
-def sentences_of(attrs: Mapping[str, Any]) -> list[str]:
+def sentences_of(attrs: NamedValues) -> list[str]:
     """Return the findings in the attributes of a stored result as sentences."""
     return [str(finding) for finding in from_json(attrs.get("findings", "[]"))]
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._validate import Floats, Indices
+from prbayes._validate import ArrayPair, Floats, Indices
 
 # Algorithm of a sort. The order of equal values affects only the last digit of a sum of weights.
 # "stable" gives the same order on every processor, "quicksort" is seven times faster for 100 000
@@ -31,7 +31,7 @@ INTERVAL = 0.89
 ENVELOPED = 999
 
 
-def finite_sample(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def finite_sample(values: Floats, weights: Floats) -> ArrayPair:
     """Return the finite values with positive weight, (n,), and weights that sum to one."""
     is_positive = weights > 0
     is_finite = is_positive & np.isfinite(values)

@@ -41,9 +41,14 @@ _LARGEST = 1e152
 FORMAT = 10
 
 Shape = tuple[int, ...]  # sizes of the axes of an array
+Arrays = Sequence[Floats]  # arrays in a fixed order, such as one for each input
 Labels = Mapping[str, str]  # labels, units or other texts by name
 StrPath = str | os.PathLike[str]  # path of a file or folder
 NamedArrays = dict[str, Floats]  # arrays by name
+ArraysByName = Mapping[str, Floats]  # arrays by name, which are only read
+NamedValues = Mapping[str, Any]  # values of any type by name, which are only read
+Names = tuple[str, ...]  # names or other texts, in a fixed order
+ArrayPair = tuple[Floats, Floats]  # two arrays, such as values and their weights
 ArrayFunction = Callable[[Floats], Floats]
 Function = Callable[..., Any]  # the user's response, or a part of it
 
@@ -58,6 +63,11 @@ def called(value: object) -> str:
 def wrong_type(value: object, name: str, expected: str) -> TypeError:
     """Return the error for an argument of another type."""
     return TypeError(f"{name}: got {type(value).__name__}, expected {expected}")
+
+
+def wrong_value(value: object, name: str, expected: str) -> TypeError:
+    """Return the error for an argument of a wrong type, which shows the start of its value."""
+    return TypeError(f"{name}: got {called(value)}, expected {expected}")
 
 
 def require_format(got: object) -> None:
@@ -81,6 +91,22 @@ def unmasked(values: Any) -> Any:
     if not np.ma.is_masked(values) or values.dtype.kind not in "biufcO":
         return np.ma.getdata(values)
     return np.ma.filled(values.astype(np.float64) if values.dtype.kind in "biu" else values, np.nan)
+
+
+def complete_rows(values: Floats) -> Bools:
+    """Return which rows of a matrix have finite numbers only, (n, m) -> (n,)."""
+    is_complete: Bools = np.isfinite(values).all(axis=1)
+    return is_complete
+
+
+def finite_or_nan(values: Floats) -> Floats:
+    """Return values with NaN in place of infinite ones."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def flat_rows[T: np.generic](values: NDArray[T]) -> NDArray[T]:
+    """Return the values of each specimen, or other row, as a vector, (n, ...) -> (n, m)."""
+    return values.reshape(len(values), -1)
 
 
 def real_array(values: ArrayLike, name: str) -> Floats:
@@ -281,7 +307,7 @@ def number(
     kinds = int | np.integer if whole else int | float | np.integer | np.floating
     if isinstance(value, bool) or not isinstance(value, kinds):
         advice = "; pass a model as model=" if hasattr(value, "free_RVs") else ""
-        raise TypeError(f"{name}: got {called(value)}, expected {expected}{advice}")
+        raise wrong_value(value, name, f"{expected}{advice}")
     is_inside = low <= value <= high if closed else low < value < high
     if not is_inside or not (whole or np.isfinite(value)):
         raise ValueError(f"{name}: got {value!r}, expected {expected}")
@@ -320,9 +346,8 @@ def seed_number(random_seed: object, name: str = "random_seed") -> int:
             pass
         case int() | np.integer():
             return positive_integer(random_seed, name, minimum=0)
-    raise TypeError(
-        f"{name}: got {called(random_seed)}, expected an integer >= 0, a sequence of them, a "
-        "numpy.random.Generator or None"
+    raise wrong_value(
+        random_seed, name, "an integer >= 0, a sequence of them, a numpy.random.Generator or None"
     )
 
 
@@ -332,14 +357,14 @@ def seed_number(random_seed: object, name: str = "random_seed") -> int:
 def flag(value: object, name: str) -> bool:
     """Return ``value``, or raise a `TypeError` if it is neither True nor False."""
     if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name}: got {called(value)}, expected True or False")
+        raise wrong_value(value, name, "True or False")
     return bool(value)
 
 
 def plain_text(value: object, name: str, *, empty: bool = False) -> str:
     """Return ``value``, or raise if it is no text, or if it is blank and not allowed to be."""
     if not isinstance(value, str):
-        raise TypeError(f"{name}: got {called(value)}, expected a text")
+        raise wrong_value(value, name, "a text")
     if not empty and not value.strip():
         raise ValueError(f"{name}: got {value!r}, expected a text that is not empty")
     return value
@@ -349,16 +374,15 @@ def texts(value: object, name: str) -> None:
     """Raise if ``value`` is no mapping of texts to texts."""
     pairs = list(value.items()) if isinstance(value, Mapping) else [(value, None)]
     if not all(isinstance(text, str) for pair in pairs for text in pair):
-        raise TypeError(
-            f"{name}: got {called(value)}, expected a mapping of names to texts, such as "
-            '{"mu": "mean stiffness"}'
+        raise wrong_value(
+            value, name, 'a mapping of names to texts, such as {"mu": "mean stiffness"}'
         )
 
 
 def stated_path(value: object, name: str, kind: str) -> Path:
     """Return ``value`` as the path of a file or folder, or raise if it is none."""
     if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
-        raise TypeError(f"{name}: got {called(value)}, expected the path of a {kind}")
+        raise wrong_value(value, name, f"the path of a {kind}")
     if not os.fspath(value):
         raise ValueError(f"{name}: got {value!r}, expected the path of a {kind}")
     return Path(value)
@@ -387,6 +411,4 @@ def executes(value: object) -> None:
     # A Dask client has futures of another kind, but can return an executor.
     is_dask = hasattr(value, "get_executor") and not isinstance(value, type)
     advice = "its get_executor(pure=False)" if is_dask else "ProcessPoolExecutor(4)"
-    raise TypeError(
-        f"executor: got {called(value)}, expected a concurrent.futures.Executor, such as {advice}"
-    )
+    raise wrong_value(value, "executor", f"a concurrent.futures.Executor, such as {advice}")

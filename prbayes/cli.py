@@ -173,7 +173,7 @@ def _opened(path: Path) -> xr.DataTree:
 
     try:
         with xr.open_datatree(path, engine="h5netcdf") as stored:
-            tree: xr.DataTree = stored.load()
+            tree = stored.load()
     except Exception as error:  # a reader may raise anything for a file that is no netCDF
         raise UserError(
             f"{path}: got no netCDF file that can be read ({_line(error):.100})"

@@ -19,6 +19,7 @@ from prbayes._stats import INTERVAL, positive_scale, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     ArrayFunction,
+    Arrays,
     Bools,
     Floats,
     Function,
@@ -214,7 +215,7 @@ def exceedance(
     # A probability is rough if two standard errors are about a factor of two, or would decide the
     # requirement.
     rough = [estimate for estimate in bounds if estimate.error > 0.3 * estimate.mean]
-    decision: dict[str, Any] = {}
+    decision = {}
     if requirement is not None:
         decision = {
             "requirement": requirement,
@@ -660,7 +661,7 @@ class _Points:
 
 def rare_event(
     transform: InverseTransform,
-    parents: Sequence[Floats],
+    parents: Arrays,
     respond: ArrayFunction,
     limit: float,
     size: int,
@@ -758,7 +759,7 @@ def weighted_share(weights: Floats, counts: Bools) -> tuple[Floats, float]:
 
 def _draw_points(
     transform: InverseTransform,
-    parents: Sequence[Floats],
+    parents: Arrays,
     respond: ArrayFunction,
     rng: np.random.Generator,
     proposals: list[_Proposal],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -14,7 +13,16 @@ import xarray as xr
 from prbayes._display import Table, View, percentage
 from prbayes._finding import as_json, report, sentences_of
 from prbayes._stats import ENVELOPED, INTERVAL, distribution_function, envelope, quantile
-from prbayes._validate import Floats, Function, StrPath, positive_integer, share
+from prbayes._validate import (
+    ArrayPair,
+    Arrays,
+    Floats,
+    Function,
+    StrPath,
+    complete_rows,
+    positive_integer,
+    share,
+)
 from prbayes.decision.populations import (
     CentralSpecimens,
     Populations,
@@ -155,13 +163,14 @@ def p_box(
 
     def tails(sample: ResponseSample) -> str:
         populations = sample.populations
-        functions = [_mean_function(replace(x, populations=populations), y) for x in samples]
+        at_populations = [replace(x, populations=populations) for x in samples]
+        functions = [_distribution_functions(x, y).mean(axis=0) for x in at_populations]
         low = min(_place(function, y, 0.01) for function in functions)
         high = max(_place(function, y, 0.99) for function in functions)
         return f"{low:.4g} and {high:.4g}"
 
     findings += answers_by_family(samples[0], "the 1% and 99% quantiles are", tails)
-    data: dict[str, Any] = {
+    data = {
         "lower": (["band", "y"], lowest),
         "upper": (["band", "y"], highest),
         "mean": ("y", np.min(means, axis=0)),
@@ -210,7 +219,7 @@ def _place(function: Floats, y: Floats, probability: float) -> float:
     return float(np.interp(probability, function, y, left=-np.inf, right=np.inf))
 
 
-def outermost(lower: Sequence[Floats], upper: Sequence[Floats]) -> tuple[Floats, Floats]:
+def outermost(lower: Arrays, upper: Arrays) -> ArrayPair:
     """Return the outermost of bands, (band, y): a bound of a distribution function holds beyond."""
     lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
     flipped = np.minimum.accumulate(np.flip(upper, -1), axis=-1)
@@ -248,15 +257,9 @@ def _bands(sample: ResponseSample, y: Floats, prob: float) -> tuple[Floats, ...]
     return lower, upper, mean, error
 
 
-def _mean_function(sample: ResponseSample, y: Floats) -> Floats:
-    """Return the distribution function of a new specimen at y, (m,)."""
-    functions = _distribution_functions(sample, y)
-    return np.asarray(functions.mean(axis=0))
-
-
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
     """Return the distribution functions of all valid populations at y, (k, m)."""
     functions = sample.evaluate(
         lambda values, weights: distribution_function(values, weights, y), sample.populations.thetas
     )
-    return functions[np.isfinite(functions).all(axis=1)]
+    return functions[complete_rows(functions)]

@@ -18,7 +18,18 @@ from scipy.stats import rankdata
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._stats import positive_scale, reached
-from prbayes._validate import Floats, Function, StrPath, called, positive_integer, positive_number
+from prbayes._validate import (
+    Arrays,
+    Floats,
+    Function,
+    StrPath,
+    called,
+    complete_rows,
+    flat_rows,
+    positive_integer,
+    positive_number,
+    wrong_value,
+)
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
@@ -73,9 +84,10 @@ class Condition:
         caller = "prb.decision.Condition"
         refuse_uncallable(caller, response, order="Condition(response, *inputs)")
         if metric is not None and not isinstance(metric, Metric):
-            raise TypeError(
-                f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "
-                "prb.ProbabilityResidual()"
+            raise wrong_value(
+                metric,
+                "prb.decision.Condition: metric",
+                "a metric, such as prb.ProbabilityResidual()",
             )
         self.response = response
         self.inputs = inputs
@@ -220,7 +232,7 @@ def plan(
         specimens.append(
             [forecast.needed(information, element, (max_sd or {}).get(element)) for element in now]
         )
-    variables: dict[str, Any] = {
+    variables = {
         "sd": (["candidate", "k", "name"], sd),
         "now": ("name", list(now.values())),
     }
@@ -242,14 +254,12 @@ def plan(
 
 def _with_findings_of(candidates: Mapping[str, Condition], findings: Findings) -> Findings:
     """Return findings and those of the candidates' responses, each once."""
-    of_candidates = [findings_of(condition.response) for condition in candidates.values()]
-    distinct = dict.fromkeys(findings)
-    for of_response in of_candidates:
-        distinct.update(dict.fromkeys(of_response))
-    return tuple(distinct)
+    responses = [condition.response for condition in candidates.values()]
+    of_candidates = [finding for response in responses for finding in findings_of(response)]
+    return tuple(dict.fromkeys([*findings, *of_candidates]))
 
 
-def _several_modes(populations: Populations, modes: Sequence[Floats]) -> Findings:
+def _several_modes(populations: Populations, modes: Arrays) -> Findings:
     """Report modes of the draws, and other optima of an optimum, which is one mode alone."""
     page = "likelihood_findings.md#several-modes"
     if isinstance(populations.result, Optimum):
@@ -336,7 +346,7 @@ class _Forecast:
     quantity: Quantity | None
     sample: ResponseSample | None  # responses that the quantity is computed from
 
-    def _thetas(self, information: Sequence[Floats]) -> Floats:
+    def _thetas(self, information: Arrays) -> Floats:
         """Return the draws of all modes after information, (d, d) of each mode."""
         pairs = zip(self.draws, information, strict=True)
         return np.concatenate([draws.with_information(a) for draws, a in pairs])
@@ -359,7 +369,7 @@ class _Forecast:
         assert self.sample is not None
         return standard_deviation(self.sample.evaluate(self.quantity.of, thetas))
 
-    def needed(self, information: Sequence[Floats], name: str, max_sd: float | None) -> float:
+    def needed(self, information: Arrays, name: str, max_sd: float | None) -> float:
         """Return the smallest sufficient number of specimens: inf if none, NaN without a limit."""
         if max_sd is None:
             return np.nan
@@ -409,7 +419,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     is_observable = observable(sample.outputs, node.target)
     values = sample.outputs[is_observable]
     mass = sample.masses(center[None])[0, is_observable]
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    order = np.argsort(flat_rows(values)[:, 0])
     rows = order[reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)]
     target = (metric or node.metric).against(values[rows])
     bound = design.copied(design.design.with_values(sample.outputs))
@@ -450,7 +460,7 @@ class ReadingErrors:
     """Errors, rounding and limits of the readings of a response."""
 
     readings: Readings  # readings whose errors and steps apply, and repeat if there are more points
-    unknown: Variable[Any, Any] | None  # model variable that is the error, if it is unknown
+    unknown: Variable | None  # model variable that is the error, if it is unknown
     limits: tuple[Any, Any]  # lower and upper limits, NaN without a limit
 
     @classmethod
@@ -534,7 +544,7 @@ def fisher_information(sample: ResponseSample, errors: ReadingErrors | None = No
     if sample.design.has_runs:
         is_observable = observable(outputs, evaluator.nodes[sample.k].target)
     else:
-        is_observable = np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+        is_observable = complete_rows(flat_rows(outputs))
     is_used = (weights[0] > 0) & is_observable
     weights = weights[:, is_used]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -610,9 +620,8 @@ def _refuse_candidates(candidates: object) -> None:
     """Raise if candidates are no mapping of names to conditions."""
     advice = 'such as {"later": prb.decision.Condition(response, x)}'
     if not isinstance(candidates, Mapping) or not candidates:
-        raise TypeError(
-            f"prb.plan: candidates: got {called(candidates)}, expected a mapping of names to "
-            f"conditions, {advice}"
+        raise wrong_value(
+            candidates, "prb.plan: candidates", f"a mapping of names to conditions, {advice}"
         )
     for name, condition in candidates.items():
         if not isinstance(name, str) or not isinstance(condition, Condition):
@@ -627,9 +636,8 @@ def _refuse_max_sd(max_sd: object, names: list[str]) -> None:
     if max_sd is None:
         return
     if not isinstance(max_sd, Mapping) or not max_sd:
-        raise TypeError(
-            f"prb.plan: max_sd: got {called(max_sd)}, expected a mapping of names to standard "
-            f"deviations, of {names}"
+        raise wrong_value(
+            max_sd, "prb.plan: max_sd", f"a mapping of names to standard deviations, of {names}"
         )
     for name, value in max_sd.items():
         if name not in names:

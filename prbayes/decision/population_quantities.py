@@ -12,7 +12,7 @@ import xarray as xr
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Findings
-from prbayes._validate import Floats, NamedArrays, called
+from prbayes._validate import Floats, NamedArrays, wrong_value
 from prbayes.decision.plan import Condition
 from prbayes.decision.populations import Populations, checked_quantity
 from prbayes.decision.quantities import Mean, Quantile, Quantity, StandardDeviation
@@ -73,8 +73,8 @@ class PopulationReader:
         if not isinstance(requested, list | tuple):
             requested = [requested]
         if not requested:
-            raise TypeError(f"{caller}: inputs: got {called(requested)}, expected one at least")
-        elements: list[Element] = []
+            raise wrong_value(requested, f"{caller}: inputs", "one at least")
+        elements = []
         for x in requested:
             if isinstance(x, xr.DataArray):
                 elements += self._predicted(x)
@@ -131,7 +131,7 @@ class PopulationReader:
         outputs = sample.responses.outputs or SINGLE_OUTPUT
         labels = outputs.names or tuple(map(str, range(sample.outputs.shape[-1] if several else 1)))
         response = condition.response
-        moments: list[Quantity] = [Mean(response), StandardDeviation(response)]
+        moments = [Mean(response), StandardDeviation(response)]
         by_level = [Quantile(response, probability=p) for p in self.levels.values()]
         elements = []
         for column, label in enumerate(labels):

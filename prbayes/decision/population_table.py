@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import Table, View, percentage
 from prbayes._finding import Findings, as_json, report, sentences_of
 from prbayes._stats import INTERVAL, tail_levels
-from prbayes._validate import Floats, StrPath, called, flag, positive_integer, share
+from prbayes._validate import Arrays, Floats, StrPath, called, flag, positive_integer, share
 from prbayes.decision.population_quantities import Element, PopulationReader
 from prbayes.decision.populations import NestedPopulations, Populations, quantiles_of
 from prbayes.model.locking import locked
@@ -192,9 +192,7 @@ def _dimension(groups: Groups) -> str:
     return f"{groups.dim}_group" if is_taken else groups.dim
 
 
-def _numbers(
-    values: Floats, populations: Populations, prob: float, bound: float | None
-) -> Sequence[Floats]:
+def _numbers(values: Floats, populations: Populations, prob: float, bound: float | None) -> Arrays:
     """Return estimate, lower and upper end, (groups,) each, of values, (groups, k).
 
     A tolerance bound, the quantile over populations at ``bound``, has no ends.

@@ -23,9 +23,11 @@ from prbayes._stats import INTERVAL, ascending_quantile, tail_levels
 from prbayes._validate import (
     AT_ONCE,
     ArrayFunction,
+    Arrays,
     Floats,
     Function,
     Indices,
+    NamedValues,
     StrPath,
     positive_integer,
     share,
@@ -39,7 +41,6 @@ from prbayes.inference.asymptotics import oriented
 from prbayes.model.emulated import (
     EmulatedSample,
     EmulatedSimulator,
-    PopulationSimulator,
     emulator_error,
     replaced_inputs,
 )
@@ -91,7 +92,7 @@ class Populations:
     caller: str  # name of the caller, for messages
     are_draws: bool  # whether thetas are random draws, and not Sobol points
     # settings of responses that are not the model's own: executor, store and version
-    calling: Mapping[str, Any] = field(default_factory=dict)
+    calling: NamedValues = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -168,8 +169,8 @@ class Populations:
         """
         responses = self.responses(response, inputs)
         population = responses.inputs
-        simulator: PopulationSimulator | None = serving(self.evaluator.simulators, responses)
-        replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+        simulator = serving(self.evaluator.simulators, responses)
+        replaced: dict[Variable, Variable] = {}
         if simulator is None:
             simulator, replaced = replaced_inputs(self.evaluator.emulated, responses)
             places = {new: old for old, new in replaced.items()}
@@ -178,12 +179,17 @@ class Populations:
             ]
             responses = self._responses(response, arguments)
         if simulator is None:
+            advice = "prb.exceedance takes all with n_points=1000, prb.predict also model variables"
+            if any(node.group for node in self.evaluator.nodes):
+                advice += (
+                    "; a metric has no specimens of a single group: leave metric= out of the "
+                    "simulator, for the log-likelihood by specimen"
+                )
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
                 "simulator of the model, expected the .dist() objects of one with "
                 "prb.Reweighted() or prb.LogLikelihood(), for the latter also others of the same "
-                "names, and constants; prb.exceedance takes all with n_points=1000, prb.predict "
-                "also model variables"
+                f"names, and constants; {advice}"
             )
         k = self.evaluator.simulators.index(simulator)
         key = (k, *replaced.values())
@@ -295,7 +301,7 @@ class ResponseSample:
         """The specimens, shapes (n, *event), by input."""
         return list(self.design.points_of(self.design.inputs))
 
-    def emulated(self, points: Sequence[Floats]) -> list[Floats]:
+    def emulated(self, points: Arrays) -> list[Floats]:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.
 
         The others differ from it by an estimate of its error: they lack a block of the runs each,
@@ -651,7 +657,7 @@ class InverseTransform:
         """Return the aleatory inputs, shapes (n, *event), of z (n, size)."""
         return self._of_populations(self.parents, z)
 
-    def _of_populations(self, parents: Sequence[Floats], z: Floats) -> list[Floats]:
+    def _of_populations(self, parents: Arrays, z: Floats) -> list[Floats]:
         """Return the aleatory inputs of k populations at z (n, size), shapes (k n, *event)."""
         shapes = self.inputs.event_shapes
         k = len(parents[0]) if parents else 1
@@ -665,7 +671,7 @@ class InverseTransform:
             for v, shape in zip(values, shapes, strict=True)
         ]
 
-    def has_support_of(self, parents: Sequence[Floats]) -> bool:
+    def has_support_of(self, parents: Arrays) -> bool:
         """Return whether the population has a density wherever the k populations of parents do.
 
         Their ends are compared, five standard deviations of z from the middle.

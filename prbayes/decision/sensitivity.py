@@ -19,7 +19,16 @@ from scipy.stats import rankdata
 
 from prbayes._display import Table, View
 from prbayes._finding import Finding, Findings, as_json, report, sentences_of
-from prbayes._validate import Floats, Seed, StrPath, flag, positive_integer, seed_number
+from prbayes._validate import (
+    ArrayPair,
+    Floats,
+    Seed,
+    StrPath,
+    finite_or_nan,
+    flag,
+    positive_integer,
+    seed_number,
+)
 from prbayes.decision.populations import (
     InverseTransform,
     Populations,
@@ -254,7 +263,7 @@ class SensitivityIndices:
         return cls(np.mean(indices, axis=-1).T, errors.T)
 
 
-def _paired_points(n: int, d: int, seed: int) -> tuple[Floats, Floats]:
+def _paired_points(n: int, d: int, seed: int) -> ArrayPair:
     """Return two independent sets of n normal vectors by replicate, (r, n, d) each."""
     seeds = [seed + 7919 * r for r in range(REPLICATES)]
     points = np.array([sobol(n, 2 * d, s) for s in seeds])
@@ -290,7 +299,7 @@ def _hyperparameter_indices(
             "populations, expected one in all but 1%; where specimens fail, ask for a smaller "
             "probability, or an Exceedance"
         )
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = finite_or_nan(values)
     indices = []
     sds = np.repeat([c.conditional_sd for c in copulas], REPLICATES // n_blocks, axis=0)
     for i, step in enumerate(np.eye(d) * _STEP / 2):
@@ -479,7 +488,7 @@ def derivative_bound(squares: Floats, values: Floats) -> Floats:
     return _ratio(np.nanmean(squares, axis=1), np.nanvar(values, axis=1))
 
 
-def _complete_pairs(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+def _complete_pairs(a: Floats, b: Floats) -> ArrayPair:
     """Return two arrays, NaN where either is not finite."""
     is_complete = np.isfinite(a) & np.isfinite(b)
     return np.where(is_complete, a, np.nan), np.where(is_complete, b, np.nan)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import ArrayPair, Bools, Floats, Indices, complete_rows, flat_rows
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.radial_basis import RadialBasis
 from prbayes.emulators.surfaces import FittedSurface, Surface
@@ -42,12 +41,12 @@ class Emulator:
     components: Floats | None
     surfaces: tuple[FittedSurface, ...]  # surface of each output, or of each principal component
 
-    def __call__(self, z: Floats, columns: Indices | None = None) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats, columns: Indices | None = None) -> ArrayPair:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d).
 
         With ``columns``, (k, c), they are those of the outputs listed in the row of each point.
         """
-        place: Any = slice(None) if columns is None else columns
+        place = slice(None) if columns is None else columns
         if columns is not None and self.components is None:
             values = np.empty(columns.shape)
             jacobian = np.empty((*columns.shape, z.shape[1]))
@@ -154,7 +153,7 @@ def fit_emulator(
             components = (sizes / np.sqrt(n))[:, None] * directions
     if start is not None and (start.components is None) != (components is None):
         start = None
-    surfaces: list[FittedSurface] = []
+    surfaces = []
     left_out, rest = np.zeros_like(y), scaled
     for k, output in enumerate(scores):
         earlier = start.surfaces[k] if start is not None and k < len(start.surfaces) else None
@@ -194,7 +193,7 @@ def with_failures(values: Floats, points: Floats, runs: Floats, outputs: Floats)
     Points (k, d) and runs (n, d) have common units. Outputs (n, ...) of runs that failed are not
     finite. The values are overwritten.
     """
-    has_failed = ~np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+    has_failed = ~complete_rows(flat_rows(outputs))
     if has_failed.any():
         from scipy.spatial import cKDTree
 

@@ -123,7 +123,7 @@ class GaussianProcess(KernelSurface):
         if getattr(start, "kernel", "") == self.kernel:
             first = np.log([*(start.lengths / spread), 1e-7])
         numerical = [1e-13, 1e-11, 1e-9] if n <= 512 else [1e-10]
-        best: Kriging | None = None
+        best = None
         for degree in degrees:
             terms = Polynomials.of(z[rows], degree)(z[rows])
             *scaled, nugget = np.exp(likeliest(self.kernel, x, y[rows], terms, first)).tolist()

@@ -32,7 +32,7 @@ from numpy.polynomial.legendre import legder, legval
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from prbayes._stats import positive_scale
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayPair, Bools, Floats, Indices
 
 # Largest number of runs of a surface, whose cost grows with the cube of this number.
 MOST_RUNS = 2000
@@ -43,14 +43,14 @@ MOST_TUNED = 256
 Kernel = Callable[[Floats], tuple[Floats, Floats]]
 
 
-def squared_exponential(square: Floats) -> tuple[Floats, Floats]:
+def squared_exponential(square: Floats) -> ArrayPair:
     """Return the kernel exp(-r^2 / 2) of squared distances, and minus twice its slope."""
     square *= -0.5
     kernel = np.exp(square, out=square)
     return kernel, kernel
 
 
-def matern(square: Floats) -> tuple[Floats, Floats]:
+def matern(square: Floats) -> ArrayPair:
     """Return the Matern kernel of smoothness 5/2, and minus twice its slope."""
     square *= 5
     r = np.sqrt(square)
@@ -66,7 +66,7 @@ def matern(square: Floats) -> tuple[Floats, Floats]:
     return square, slope
 
 
-def quintic(square: Floats) -> tuple[Floats, Floats]:
+def quintic(square: Floats) -> ArrayPair:
     """Return the kernel -r^5 of squared distances, and minus twice its slope."""
     slope = np.sqrt(square)
     slope *= square
@@ -75,7 +75,7 @@ def quintic(square: Floats) -> tuple[Floats, Floats]:
     return np.negative(square, out=square), slope
 
 
-def cubic(square: Floats) -> tuple[Floats, Floats]:
+def cubic(square: Floats) -> ArrayPair:
     """Return the kernel r^3 of squared distances, and minus twice its slope."""
     slope = np.sqrt(square)
     square *= slope
@@ -83,14 +83,14 @@ def cubic(square: Floats) -> tuple[Floats, Floats]:
     return square, slope
 
 
-def thin_plate_spline(square: Floats) -> tuple[Floats, Floats]:
+def thin_plate_spline(square: Floats) -> ArrayPair:
     """Return the kernel r^2 log r of squared distances, and minus twice its slope."""
     logs = np.log(np.maximum(square, 1e-300))
     square *= 0.5 * logs
     return square, -1 - logs
 
 
-def linear(square: Floats) -> tuple[Floats, Floats]:
+def linear(square: Floats) -> ArrayPair:
     """Return the kernel -r of squared distances, and minus twice its slope."""
     r = np.sqrt(square)
     return -r, 1 / np.maximum(r, 1e-12)
@@ -118,7 +118,7 @@ class Kriging:
     error: float  # weighted root mean square of the cross-validation errors
     scale: float  # variance of the output in units of the kernel
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats) -> ArrayPair:
         """Return values and Jacobian at points, (k, d) -> (k,), (k, d)."""
         if self._on_line is not None:
             series = self._on_line[1]
@@ -190,7 +190,7 @@ class Kriging:
         return Polynomials.of(self.z, self.degree)
 
     @cached_property
-    def _factors(self) -> tuple[Floats, Floats]:
+    def _factors(self) -> ArrayPair:
         """Factors of the runs in squared distances, (n, d + 2), and in slopes, (1 + d, n).
 
         The former are those of |a|^2 + |b|^2 - 2 a'b, the latter the weights of the runs, and their
@@ -243,7 +243,7 @@ class Kriging:
             yield rows, points, np.maximum(square, 0.0, out=square)
 
 
-def polynomial_trend(surface: Kriging, z: Floats) -> tuple[Floats, Floats]:
+def polynomial_trend(surface: Kriging, z: Floats) -> ArrayPair:
     """Return values, (k,), and slopes, (k, d), of the polynomial at points, (k, d)."""
     polynomials = surface.polynomials
     if surface.degree <= 2:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pytensor.graph.basic import Variable
 
-from prbayes._validate import Bools, Floats, Shape, real_array
+from prbayes._validate import Bools, Floats, Names, Shape, real_array
 from prbayes.numerics.points import sobol
 from prbayes.response.call import column_names
 from prbayes.response.compile import compile_batched
@@ -76,7 +76,7 @@ class Ranges:
         return tuple(r.name for r in self.inputs)
 
     @property
-    def column_names(self) -> tuple[str, ...]:
+    def column_names(self) -> Names:
         """Name of each column."""
         return column_names(self.names, self.sizes)
 
@@ -181,9 +181,9 @@ def read_ranges(
         )
     if isinstance(inputs, Mapping) and not all(isinstance(key, str) for key in inputs):
         raise TypeError(f"{name}: inputs: got {list(inputs)} as names, expected texts")
-    entries: dict[Any, Any] = dict(inputs if isinstance(inputs, Mapping) else enumerate(inputs, 1))
+    entries = dict(inputs if isinstance(inputs, Mapping) else enumerate(inputs, 1))
     random = {key: x for key, x in entries.items() if isinstance(x, Variable)}
-    draws: dict[Any, Floats] = {}
+    draws = {}
     if random:
         samples = predictive_inputs(name, list(random.values()), random_seed)
         draws = dict(zip(random, samples, strict=True))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, StrPath
+from prbayes._validate import Floats, StrPath, complete_rows, finite_or_nan
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate, values_inside, with_output_labels
 from prbayes.emulators.table import RunTable, read_csv, read_table
@@ -169,7 +169,7 @@ class Runs(Shown):
         In standard deviations of the data: the 90 % quantile at the runs within their range or half
         of it away. At a few runs at the ends of the ranges left-out errors are far larger.
         """
-        data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
+        data = finite_or_nan(observed).reshape(len(observed), -1)
         low = np.nanmin(data, axis=0)
         high = np.nanmax(data, axis=0)
         sd = np.nanstd(data, axis=0)
@@ -177,7 +177,7 @@ class Runs(Shown):
         values = self.responses.reshape(len(self), -1)
         is_inside = (values >= low - margin) & (values <= high + margin)
         is_near = is_inside.all(axis=1)
-        is_finite = np.isfinite(values).all(axis=1)
+        is_finite = complete_rows(values)
         rows = is_near if is_near.sum() >= 8 else is_finite
         residuals = self.error.residuals.reshape(values.shape)[rows]
         errors = np.quantile(np.abs(residuals), 0.9, axis=0)
@@ -255,7 +255,7 @@ def outlier_advice(runs: Runs) -> str:
     Without it the root mean square of the left-out errors of the others is less than a fifth.
     """
     values = runs.responses.reshape(len(runs), -1)
-    scale = positive_scale(np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0))
+    scale = positive_scale(np.nanstd(finite_or_nan(values), axis=0))
     errors = np.abs(runs.error.residuals.reshape(values.shape)) / scale
     row = int(np.nanargmax(errors.max(axis=1)))
     is_kept = np.arange(len(runs)) != row

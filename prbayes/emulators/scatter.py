@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from prbayes._stats import log_sum_exp, positive_scale
-from prbayes._validate import IN_CACHE, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayPair, Floats, Indices
 from prbayes.numerics.points import inside
 
 
@@ -61,7 +61,7 @@ class Scatter:
     factor: Floats  # (m, m): lower triangular factor of the residuals' correlation
     bandwidth: float  # standard deviation of the normal density at each residual
 
-    def moments(self, x: Floats) -> tuple[Floats, Floats]:
+    def moments(self, x: Floats) -> ArrayPair:
         """Return mean and standard deviation at inputs (..., d), both (..., m).
 
         Beyond the region they are those at its end.
@@ -93,7 +93,7 @@ class Scatter:
             first = rows[0]
             columns = np.flatnonzero(~np.isnan(values[first]))
             measured = values[np.ix_(rows, columns)]
-            at: Indices | slice = slice(None) if is_common else rows
+            at = slice(None) if is_common else rows
             result[rows] = self._of_kind(
                 mean[at][..., columns],
                 sd[at][..., columns],
@@ -136,7 +136,7 @@ class Scatter:
         return np.asarray(logs - constant)
 
     @cached_property
-    def _quantiles(self) -> tuple[Floats, Floats]:
+    def _quantiles(self) -> ArrayPair:
         """A grid of residuals, (G,), and their distribution functions there, (m, G)."""
         grid = np.linspace(-12.0, 12.0, 2401)
         shrinkage = np.sqrt(1 - self.bandwidth**2)

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from prbayes._display import without_constructor
 from prbayes._stats import positive_scale
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import Bools, Floats, Indices, complete_rows
 from prbayes.emulators.emulator import Emulator, fit_emulator, with_failures
 from prbayes.emulators.surfaces import FOLDS, Surface, as_surface
 
@@ -99,7 +99,7 @@ class TrainingRuns:
     @cached_property
     def good(self) -> Bools:
         """Which have outputs, shape (n,)."""
-        return np.isfinite(self.y).all(axis=1)
+        return complete_rows(self.y)
 
     @cached_property
     def rows(self) -> Indices:

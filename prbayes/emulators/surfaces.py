@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from prbayes._validate import ArrayFunction, Bools, Floats, positive_integer
+from prbayes._validate import ArrayFunction, ArrayPair, Bools, Floats, positive_integer
 from prbayes.emulators.kriging import Kriging, Polynomials, spread_of
 
 Predict = ArrayFunction
@@ -38,7 +38,7 @@ class FittedSurface(Protocol):
     def error(self) -> float:
         """Weighted root mean square of the left-out errors."""
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats) -> ArrayPair:
         """Return values and Jacobian at points, (k, d) -> (k,), (k, d)."""
 
     def values(self, z: Floats) -> Floats:
@@ -161,7 +161,7 @@ class Refitted:
         # Some regressors return a column, (k, 1).
         return np.asarray(self.predict(z), dtype=np.float64).reshape(len(z))
 
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+    def __call__(self, z: Floats) -> ArrayPair:
         """Return values and central differences at points, (k, d) -> (k,), (k, d)."""
         steps = 1e-4 * np.diag(spread_of(self.z))
         ends = [(self.values(z + step), self.values(z - step)) for step in steps]

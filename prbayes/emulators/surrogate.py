@@ -23,7 +23,9 @@ from prbayes._validate import (
     Seed,
     Shape,
     StrPath,
+    complete_rows,
     file_path,
+    finite_or_nan,
     flag,
     plain_text,
     positive_integer,
@@ -450,7 +452,7 @@ class Surrogate(RunRecord, Shown):
     def to_view(self) -> View:
         """Return what a reader sees."""
         values = self.responses.reshape(len(self.points), -1)
-        n_failed = int((~np.isfinite(values).all(axis=1)).sum())
+        n_failed = int((~complete_rows(values)).sum())
         ends = [*zip(self.domain.low, self.domain.high, strict=True)]
         finite = [column[np.isfinite(column)] for column in values.T]
         ends += [(column.min(), column.max()) for column in finite]
@@ -684,7 +686,7 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
 
 def _usable(responses: Floats) -> Bools:
     """Return whether all outputs of each run are finite, (n,)."""
-    return ~is_missing(np.where(np.isfinite(responses), responses, np.nan))
+    return ~is_missing(finite_or_nan(responses))
 
 
 def _spread(values: Floats) -> Any:

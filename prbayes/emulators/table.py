@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from prbayes._finding import counted
-from prbayes._validate import Floats, NamedArrays, StrPath, file_path, plain_text, real_array
+from prbayes._validate import (
+    Floats,
+    NamedArrays,
+    Names,
+    StrPath,
+    complete_rows,
+    file_path,
+    plain_text,
+    real_array,
+)
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
@@ -40,7 +49,7 @@ class RunTable(RunRecord):
 
     # Names of the outputs: "response" for a single unnamed output, "response[0]" for the first of
     # several.
-    outputs: tuple[str, ...]
+    outputs: Names
 
     @property
     def labels(self) -> Outputs | None:
@@ -192,7 +201,7 @@ def _refuse_length(label: str, column: Floats, n: int) -> None:
 def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
     """Raise for too few, too many or repeated runs, and for responses of -inf."""
     n, d = points.shape
-    usable = int((~is_missing(values) & np.isfinite(values).all(axis=1)).sum())
+    usable = int((~is_missing(values) & complete_rows(values)).sum())
     least = max(8, 4 * d)
     if usable < least:
         raise ValueError(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._stats import distribution_function, positive_scale, quantile, reached
-from prbayes._validate import AT_ONCE, Bools, Floats, Indices
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices, flat_rows
 from prbayes.inference.resampling import (
     SETS,
     DataSets,
@@ -240,7 +240,7 @@ class Information:
         # With several outputs half of them are drawn in proportion to the fourth power of their
         # distance from the middle, because these contribute most of the mean square of gradients.
         _, values, weights = self._sides
-        order = np.argsort(values.reshape(len(values), -1)[:, 0])
+        order = np.argsort(flat_rows(values)[:, 0])
         n, mass = 1000, weights
         if values.ndim > 1:
             n = 2000

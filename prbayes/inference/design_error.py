@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, complete_rows
 from prbayes.inference.refits import (
     BatchObjective,
     SamplingDistribution,
@@ -93,7 +93,7 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
             descent = descent_of(sampling, objective, is_rough=True)
         minima.append(_minimum(sampling, objective, descent))
     x = np.array(minima)
-    is_usable = np.isfinite(x).all(axis=1)
+    is_usable = complete_rows(x)
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     rate = 0.5

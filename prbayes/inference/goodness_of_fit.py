@@ -15,7 +15,7 @@ from scipy.special import bdtrc
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function, positive_scale
-from prbayes._validate import Bools, Floats
+from prbayes._validate import ArrayPair, Bools, Floats, complete_rows, flat_rows
 from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
@@ -60,7 +60,7 @@ class FittedSets:
     def without_rounding(self) -> FittedSets | None:
         """Return a copy with tied observations spread out, or None if there are no ties."""
         values = [
-            np.column_stack([spread_out(column) for column in y.reshape(len(y), -1).T])
+            np.column_stack([spread_out(column) for column in flat_rows(y).T])
             for y in self.observed.values
         ]
         values = [v.reshape(y.shape) for v, y in zip(values, self.observed.values, strict=True)]
@@ -101,7 +101,7 @@ def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -
 
     Each statistic is standardised by its own distribution. Rows with NaN are left out.
     """
-    rows = drawn[np.isfinite(drawn).all(axis=1)]
+    rows = drawn[complete_rows(drawn)]
     if not np.isfinite(observed).all() or len(rows) < 2:
         return 1.0
     spread = np.maximum(rows.std(axis=0), 1e-300)
@@ -169,9 +169,7 @@ def rounding(evaluator: Evaluator) -> str:
     phrases = []
     for node in evaluator.nodes:
         y = node.target.observed
-        for column, label in zip(
-            y.reshape(len(y), -1).T, node.outputs.labels or ("",), strict=True
-        ):
+        for column, label in zip(flat_rows(y).T, node.outputs.labels or ("",), strict=True):
             values = column[np.isfinite(column)]
             ties = len(values) - len(np.unique(values))
             if ties:
@@ -187,11 +185,11 @@ def unpredicted_failures(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     findings = []
     for k, node in enumerate(evaluator.nodes):
         y = node.target.observed
-        n, count = len(y), int(np.isposinf(y.reshape(len(y), -1)).any(axis=1).sum())
+        n, count = len(y), int(np.isposinf(flat_rows(y)).any(axis=1).sum())
         if not count:
             continue
         (values,), (weights,) = evaluator.populations(theta[None], k)
-        share = float(weights[np.isposinf(values.reshape(len(values), -1)).any(axis=1)].sum())
+        share = float(weights[np.isposinf(flat_rows(values)).any(axis=1)].sum())
         if bdtrc(count - 1, n, min(share, 1.0)) < UNLIKELY:
             text = (
                 f"{node.name}: {count} of {n} measured values are +inf, specimens that failed, but "
@@ -317,7 +315,7 @@ class _Outputs:
         observed = self.values[is_measured, j], self.weights[:, is_measured]
         return _fit_distances(self.simulated[:, j], self.masses, *observed)
 
-    def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
+    def correlations(self, i: int, j: int) -> ArrayPair:
         """Return the correlations of two outputs in data sets and in populations, (S,) each."""
         pair = [i, j]
         is_measured = ~np.isnan(self.values[:, pair]).any(axis=1)

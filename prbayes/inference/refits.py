@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._progress import progress
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, ArrayPair, Bools, Floats
 from prbayes.inference.asymptotics import (
     Information,
     Local,
@@ -400,7 +400,7 @@ def _cached_refits(
 _QUANTILES = (0.055, 0.5, 0.945)
 
 
-def principal_axes(points: Floats) -> tuple[Floats, Floats]:
+def principal_axes(points: Floats) -> ArrayPair:
     """Return principal axes of points, (n, d), as columns (d, d), and robust spreads along them.
 
     Spreads are those of the central 89 %, so that a few minimisers that ran away do not decide.
@@ -496,7 +496,7 @@ class BatchObjective:
     def _values(self, thetas: Floats, rows: Any) -> Floats:
         """Return the objectives of the data sets in ``rows``, each at its own thetas."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
-        total: Any = 0.0
+        total = 0.0
         for i, k in enumerate(self.simulators):
             _, weights = self.evaluator.populations(stacked, k)
             weights = weights.reshape(*thetas.shape[:-1], -1)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import AT_ONCE, Bools, Floats, Indices, NamedArrays
+from prbayes._validate import AT_ONCE, ArrayPair, Bools, Floats, Indices, NamedArrays
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
@@ -220,7 +220,7 @@ def sets_along(
 
 def simulated_points(
     evaluator: Evaluator,
-    populations: list[tuple[Floats, Floats]],
+    populations: list[ArrayPair],
     n_sets: int,
     seed: int,
     *,
@@ -310,7 +310,7 @@ def observable(responses: Floats, target: Discrepancy) -> Bools:
     return is_known if is_known.ndim == 1 else is_known.all(axis=1)
 
 
-def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
+def thinned(values: Floats, weights: Floats, node: Node) -> ArrayPair:
     """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
     if node.bound.stored or values.shape[1] <= _MAX_POINTS:
         return values, weights
@@ -366,8 +366,8 @@ def one_set(evaluator: Evaluator, sets: DataSets, i: int) -> tuple[NamedArrays, 
 
     Specimens of equal weights are repeated if a value occurs several times.
     """
-    data: NamedArrays = {}
-    data_weights: NamedArrays = {}
+    data = {}
+    data_weights = {}
     for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
         unit = node.target.weights
         rows = np.flatnonzero(weights[i])

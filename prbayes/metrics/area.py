@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, Floats, Indices
+from prbayes._validate import AT_ONCE, ArrayPair, Floats, Indices
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -289,7 +289,7 @@ def correction_table(n: int) -> Floats:
     return np.asarray(np.interp(levels, q, np.append(0.0, np.cumsum(pieces))))
 
 
-def bias_and_density(n: int, p: Floats) -> tuple[Floats, Floats]:
+def bias_and_density(n: int, p: Floats) -> ArrayPair:
     """Return the derivative of g_n at p, and the mean curvature in p of a corrected area.
 
     The derivative is the mean of sign(p - K / n) for a binomial K with n and p, the curvature is

@@ -24,6 +24,7 @@ from prbayes._validate import (
     AT_ONCE,
     Floats,
     Indices,
+    Names,
     Shape,
     observed_outputs,
     observed_sample,
@@ -167,7 +168,7 @@ class Discrepancy(ABC):
     observed: Floats
     weights: Floats
     # Names of the fields that have a row for each data set.
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights",)
+    _by_data_set: ClassVar[Names] = ("weights",)
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values (n,), for resampling.
@@ -327,7 +328,7 @@ class PartSum:
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the components times their shares, shape (..., K)."""
         size = len(features) // len(self.parts)
-        total: Any = 0.0
+        total = 0.0
         for k, part in enumerate(self.parts):
             value = part.target.outer(*features[k * size : (k + 1) * size], xp=xp)
             total = total + shares[..., k] * value

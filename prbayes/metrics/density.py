@@ -17,7 +17,15 @@ from typing import Any, ClassVar, Self, cast
 import numpy as np
 
 from prbayes._stats import finite_sample, positive_scale, quantile
-from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
+from prbayes._validate import (
+    AT_ONCE,
+    ArrayPair,
+    Floats,
+    Names,
+    positive_integer,
+    positive_number,
+    sample_weights,
+)
 from prbayes.metrics.base import (
     Basis,
     DenseBasis,
@@ -282,7 +290,7 @@ class DensityDiscrepancy(Discrepancy):
 
     cells: Cells
     density: Floats
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density")
+    _by_data_set: ClassVar[Names] = ("weights", "density")
 
     @classmethod
     def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
@@ -529,7 +537,7 @@ def _has_bandwidth_rule(target: Discrepancy) -> bool:
     return isinstance(target, DensityDiscrepancy) and target.metric.likelihood and has_rule
 
 
-def _pooled(targets: Sequence[Discrepancy]) -> tuple[Floats, Floats]:
+def _pooled(targets: Sequence[Discrepancy]) -> ArrayPair:
     """Return the finite observed values of all targets, with weights in units of specimens."""
     values = np.concatenate([target.observed for target in targets])
     counts = np.concatenate([target.weights * target.n_effective for target in targets])

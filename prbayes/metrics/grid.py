@@ -225,7 +225,7 @@ class BinCells(Cells):
 
 def compiled(loop: Callable[..., None]) -> Callable[..., None]:
     """Compile a loop with Numba at its first call, since Numba takes long to import."""
-    function: Callable[..., None] | None = None
+    function = None
 
     def call(*args: Any) -> None:
         nonlocal function

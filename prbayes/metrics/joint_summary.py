@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._validate import AT_ONCE, Bools, Floats, Indices, called
+from prbayes._validate import AT_ONCE, Bools, Floats, Indices, Names, called
 from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Metric, Minimum
 from prbayes.metrics.summary import Summary
 from prbayes.metrics.summary_likelihood import (
@@ -91,7 +91,7 @@ class JointSummaryLikelihood(Metric):
         correlation of outputs that are functions of each other: sheets have two or three digits.
     """
 
-    names: tuple[str, ...]
+    names: Names
     sheets: tuple[Summary, ...]
     rounding: float = 1e-3
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
@@ -207,8 +207,8 @@ class JointSummaryDiscrepancy(Discrepancy):
         """Return minus the log-likelihood over n."""
         (sums,) = features
         sizes, counts = self._sizes
-        log_l: Any = 0.0
-        scores: list[Any] = []
+        log_l = 0.0
+        scores = []
         start = 0
         for member, size in zip(self.members, sizes, strict=True):
             of_member = sums[..., start : start + size]

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._validate import Floats, Indices, Shape, flag, real_array
+from prbayes._validate import Floats, Indices, Names, Shape, flag, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import (
     CellwiseDiscrepancy,
@@ -112,7 +112,7 @@ class LogLikelihood(Metric):
 
     def __post_init__(self) -> None:
         flag(self.relative, "LogLikelihood: relative")
-        limits: Any = self.censored
+        limits = self.censored
         parts = [self.error, self.bias, self.rounded]
         parts += limits if isinstance(limits, tuple | list) else ()
         labelled = tuple(x for x in parts if hasattr(x, "iloc") or hasattr(x, "indexes"))
@@ -324,7 +324,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     # Weights of the cells, (m,) or (..., m): ``reading @ g`` is the mean at the observed values of
     # a function g of the cells.
     reading: Floats
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
+    _by_data_set: ClassVar[Names] = ("weights", "density", "reading")
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling."""

@@ -14,10 +14,12 @@ from prbayes._validate import (
     Bools,
     Floats,
     Indices,
-    called,
+    Names,
+    finite_or_nan,
     positive_integer,
     real_array,
     sample_weights,
+    wrong_value,
 )
 from prbayes.metrics.base import (
     Basis,
@@ -51,7 +53,7 @@ class CompositeDiscrepancy(Discrepancy):
     shares: Floats
     # Principal components of each set of outputs that is compared by them.
     components: tuple[Components, ...] = ()
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
+    _by_data_set: ClassVar[Names] = ("weights", "shares")
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -128,7 +130,7 @@ def components_of(target: Discrepancy) -> tuple[Components, ...]:
 
 def failure_caps(observed: Floats) -> Floats:
     """Return the value of a failure in each output: the largest observed one plus the range."""
-    finite = np.where(np.isfinite(observed), observed, np.nan)
+    finite = finite_or_nan(observed)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)
     return np.asarray(highest + (highest - lowest))
@@ -269,9 +271,8 @@ class Joint(Metric):
 
     def __post_init__(self) -> None:
         if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
-            raise TypeError(
-                f"metric: got {called(self.metric)}, expected a metric of one output, such as "
-                "prb.ProbabilityResidual()"
+            raise wrong_value(
+                self.metric, "metric", "a metric of one output, such as prb.ProbabilityResidual()"
             )
         for name in _DECLARED:
             object.__setattr__(self, name, getattr(self.metric, name))
@@ -325,8 +326,8 @@ class Joint(Metric):
     ) -> Discrepancy:
         """Return the mean discrepancy over projections, for each set of measured outputs."""
         caps = failure_caps(observed)
-        parts: list[Part] = []
-        components: list[Components] = []
+        parts = []
+        components = []
         for outputs, share in patterns(observed, weights):
             sample = observed[:, outputs]
             (center, axes), principal = self._white(

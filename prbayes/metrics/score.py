@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._stats import finite_sample, positive_scale, quantile
-from prbayes._validate import ArrayFunction, Floats
+from prbayes._validate import ArrayFunction, Floats, complete_rows, finite_or_nan, flat_rows
 from prbayes.metrics.base import Discrepancy, Part, is_additive
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
@@ -99,7 +99,7 @@ class ShiftedResponses:
         """Root mean squares of the derivatives, in standard deviations of the responses, (d,)."""
         steps = self.steps.reshape(-1, *[1] * self.responses.ndim)
         slopes = (self.upper - self.lower) / (2 * steps)
-        finite = np.where(np.isfinite(self.responses), self.responses, np.nan)
+        finite = finite_or_nan(self.responses)
         scale = np.nanstd(finite, axis=0)
         relative = np.where(np.isfinite(slopes), slopes, 0.0) / positive_scale(scale)
         squares = np.mean(relative**2, axis=1)
@@ -132,9 +132,9 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
     if isinstance(density, GaussianKDE) and callable(density.bandwidth):
         rule = partial(_bandwidth_of_fewer, rule=density.bandwidth, size=len(target.observed))
         inner = replace(inner, density=GaussianKDE(rule))
-    rows = responses.reshape(len(responses), -1)
+    rows = flat_rows(responses)
     # Leave out remote responses without weight, because they would stretch the grid.
-    is_used = np.isfinite(rows).all(axis=1) & (weights > 1e-8 * weights.max())
+    is_used = complete_rows(rows) & (weights > 1e-8 * weights.max())
     used_weights = weights[is_used] / weights[is_used].sum()
     prepared = metric.like(inner).against(responses[is_used], used_weights)
     return prepared.with_observed(target.observed)
@@ -197,7 +197,7 @@ def tabulated_scores(
         tables.append((part, CubicSpline(nodes, scores), failed[0]))
 
     def function(responses: Floats) -> Floats:
-        scores: Any = 0.0
+        scores = 0.0
         for part, spline, failed in tables:
             values = np.asarray(part.of(responses))
             first, last = spline.x[[0, -1]]

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from prbayes._validate import Floats, called, number, positive_integer, positive_number
+from prbayes._validate import (
+    ArrayPair,
+    Floats,
+    number,
+    positive_integer,
+    positive_number,
+    wrong_value,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +187,7 @@ class Summary:
                 "quantiles out"
             )
 
-    def _limits(self) -> tuple[Floats, Floats]:
+    def _limits(self) -> ArrayPair:
         """Return the smallest and the largest value of each specimen, sorted, both (n,).
 
         A quantile between two specimens has a rank that depends on its definition: n p + p or
@@ -235,9 +242,10 @@ def _range_of_sd(lower: Floats, upper: Floats, mean: float | None) -> tuple[floa
 def _checked_quantiles(quantiles: object) -> dict[float, float]:
     """Return quantiles by levels between 0 and 1, or raise."""
     if not isinstance(quantiles, Mapping) or not quantiles:
-        raise TypeError(
-            f"Summary: quantiles: got {called(quantiles)}, expected a mapping of levels to values, "
-            "such as {0.25: 310.0, 0.5: 330.0}"
+        raise wrong_value(
+            quantiles,
+            "Summary: quantiles",
+            "a mapping of levels to values, such as {0.25: 310.0, 0.5: 330.0}",
         )
     checked = {}
     for level, value in quantiles.items():

@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 
 from prbayes._finding import counted
 from prbayes._stats import quantile
-from prbayes._validate import Floats, Indices
+from prbayes._validate import ArrayPair, Floats, Indices, complete_rows
 from prbayes.metrics.density import spread
 
 # Largest number of outputs that are compared without principal components. Eight outputs need
@@ -56,7 +56,7 @@ class Components:
     def share_left_out(self, values: Floats, weights: Floats) -> float:
         """Return the share of the variance of a population, (n, m), that they leave out."""
         values = values[:, self.outputs]
-        is_usable = np.isfinite(values).all(axis=1) & (weights > 0)
+        is_usable = complete_rows(values) & (weights > 0)
         values = values[is_usable]
         weights = weights[is_usable]
         deviations = values - np.average(values, axis=0, weights=weights)
@@ -162,7 +162,7 @@ def principal_components(
 _DEGREES = (1.0, 3.0, np.inf)
 
 
-def whitening(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
+def whitening(sample: Floats, weights: Floats, outputs: Indices) -> ArrayPair:
     """Return center and axes of invariant coordinates ``(y - center) @ axes`` of a sample, (n, m).
 
     They are the same, to rounding, after any invertible affine map of the outputs: location and
@@ -247,7 +247,7 @@ def _shrunk(root: Floats, n: float) -> Floats:
     return axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean())
 
 
-def units(sample: Floats, weights: Floats, outputs: Indices) -> tuple[Floats, Floats]:
+def units(sample: Floats, weights: Floats, outputs: Indices) -> ArrayPair:
     """Return a median and a robust spread of each output, or raise for one without spread.
 
     Arguments are those of `whitening`.
@@ -301,7 +301,7 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
     return location, root, combinations[-1] if is_dependent else None
 
 
-def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def _singular(x: Floats, weights: Floats) -> ArrayPair:
     """Return square roots of the eigenvalues of a second moment, and eigenvectors as rows."""
     _, size, axes = np.linalg.svd(x * np.sqrt(weights)[:, None], full_matrices=False)
     return size, axes

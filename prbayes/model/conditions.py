@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Arrays, ArraysByName, Floats
 from prbayes.response.inputs import Inputs
 
 
-def stacked_values(values: Mapping[str, Floats]) -> Floats | None:
+def stacked_values(values: ArraysByName) -> Floats | None:
     """Return the values of conditions, (N,) by name, as an array (N, C); None without one."""
     return np.stack(list(values.values()), axis=1) if values else None
 
 
-def at_conditions(
-    inputs: Inputs, specimens: Sequence[Floats], conditions: Floats | None
-) -> list[Floats]:
+def at_conditions(inputs: Inputs, specimens: Arrays, conditions: Floats | None) -> list[Floats]:
     """Return inputs (..., n, *event) with the conditions, (N, C), of specimens in turn."""
     result = list(specimens)
     if conditions is not None:

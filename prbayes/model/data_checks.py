@@ -19,7 +19,16 @@ from scipy.special import bdtrc
 
 from prbayes._finding import Finding, Findings, any_of, report
 from prbayes._stats import adjusted_p_values, positive_scale
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import (
+    ArrayPair,
+    Arrays,
+    Bools,
+    Floats,
+    Indices,
+    complete_rows,
+    finite_or_nan,
+    flat_rows,
+)
 from prbayes.emulators.emulator import fit_emulator
 from prbayes.metrics.readings import (
     Readings,
@@ -45,8 +54,8 @@ def warn_out_of_range(
     """Warn if all observed values of an output lie outside all simulated responses."""
     if not responses.size:  # a user's own propagation may store no responses
         return
-    columns = observed.reshape(len(observed), -1).T
-    simulated = responses.reshape(len(responses), -1).T
+    columns = flat_rows(observed).T
+    simulated = flat_rows(responses).T
     if len(columns) != len(simulated):
         return
     triples = zip(output_labels(name, outputs), columns, simulated, strict=True)
@@ -86,9 +95,9 @@ def outlier_findings(
     (sigma = 1) .3 % have such a gap, of Student's t (3) .1 %. With gross errors in the likelihood
     only codes are reported.
     """
-    columns = observed.reshape(len(observed), -1).T
+    columns = flat_rows(observed).T
     # A user's own propagation may store no responses.
-    simulated = responses.reshape(len(responses), -1).T if responses.size else np.empty((0, 0))
+    simulated = flat_rows(responses).T if responses.size else np.empty((0, 0))
     labels = output_labels(name, outputs)
     findings = []
 
@@ -145,8 +154,8 @@ def check_constant(
     # may have failed.
     if not responses.size or np.isposinf(responses).any():
         return ()
-    values = responses.reshape(len(responses), -1)
-    finite = values[np.isfinite(values).all(axis=1)]
+    values = flat_rows(responses)
+    finite = values[complete_rows(values)]
     if len(finite) < (2 if is_stored else 8):
         return ()
     findings = []
@@ -173,7 +182,7 @@ def _constant(column: Floats) -> str:
 def check_failing_region(
     name: str,
     observed: Floats,
-    points: Sequence[Floats],
+    points: Arrays,
     responses: Floats,
     max_lost: float,
     remedy: str = "repair the response",
@@ -187,7 +196,7 @@ def check_failing_region(
     """
     if not responses.size or not points:  # a user's own propagation may store no responses
         return ()
-    values = responses.reshape(len(responses), -1)
+    values = flat_rows(responses)
     is_finite = np.isfinite(values)
     if is_finite.all():
         return ()
@@ -196,7 +205,7 @@ def check_failing_region(
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
     _, neighbours = cKDTree(scores).query(scores, k=4 * inputs.shape[1] + 5)
-    columns = observed.reshape(len(observed), -1)
+    columns = flat_rows(observed)
     is_apart = np.zeros(columns.shape, dtype=bool)
     for j, column in enumerate(columns.T):
         usable = is_finite[:, j]
@@ -235,7 +244,7 @@ def duplicate_findings(name: str, observed: Floats) -> Findings:
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
     """
-    rows = observed.reshape(len(observed), -1)
+    rows = flat_rows(observed)
     distinct, counts = np.unique(rows, axis=0, return_counts=True)
     # With six or more specimens it cannot be chance that every value occurs twice.
     if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
@@ -429,14 +438,14 @@ def data_findings(
     """
     options = DataCheckOptions() if options is None else options
     y = np.asarray(y, dtype=np.float64)
-    y = np.where(np.isfinite(y), y, np.nan).reshape(len(y), -1)
+    y = finite_or_nan(y).reshape(len(y), -1)
     m = y.shape[1]
     labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
     largest_step = options.step_at_turning_point if several_roots else options.step
     counted = _counted_once(y, rows)
-    findings: list[Finding] = []
+    findings = []
     # Label, step, and step in standard deviations.
-    rounded_outputs: list[tuple[str, float, float]] = []
+    rounded_outputs = []
     steps = np.zeros(m)
     exact = y.copy()  # NaN at a censoring limit, where specimens may be equal without being copies
     for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):
@@ -520,7 +529,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     Far is more than three widths of the range of the runs, outputs (n, m), over the populations of
     the prior. An output that is constant, as at time zero, is one of the error of its readings.
     """
-    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    finite = outputs[complete_rows(outputs)]
     if len(finite) < 2:
         return
     low, high = finite.min(axis=0), finite.max(axis=0)
@@ -554,7 +563,7 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
 
 def refuse_unreached(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the readings of most specimens are outside the range of the runs."""
-    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    finite = outputs[complete_rows(outputs)]
     if not len(finite):
         return
     with np.errstate(invalid="ignore"):
@@ -584,7 +593,7 @@ def _n_beyond(runs: Floats, readings: Floats) -> int:
     The direction is that of the linear discriminant between the runs and the readings.
     """
     scale = runs.std(axis=0)
-    readings = readings[np.isfinite(readings).all(axis=1)]
+    readings = readings[complete_rows(readings)]
     if not len(readings) or not (scale > 0).all():
         return 0
     runs, readings = runs / scale, readings / scale
@@ -600,7 +609,7 @@ def refuse_unused_inputs(name: str, z: Floats, outputs: Floats, inputs: Mapping[
     The influence is relative to the direction with the largest, at the median run. Responses whose
     inputs all matter have .05 and more, others 1e-4 and less.
     """
-    is_finite = np.isfinite(outputs).all(axis=1)
+    is_finite = complete_rows(outputs)
     d, m = len(inputs), outputs.shape[1]
     if d < 2 or m < d or is_finite.sum() < 4 * d:
         return
@@ -613,7 +622,7 @@ def refuse_unused_inputs(name: str, z: Floats, outputs: Floats, inputs: Mapping[
         raise _undetermined(name, m, directions, list(inputs.values()))
 
 
-def _singular_vectors(jacobian: Floats) -> tuple[Floats, Floats]:
+def _singular_vectors(jacobian: Floats) -> ArrayPair:
     """Return singular values (k, d) and right singular vectors (k, d, d) of finite Jacobians."""
     finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     if finite.shape[1] < finite.shape[2]:

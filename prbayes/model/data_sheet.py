@@ -50,7 +50,7 @@ def model_with_sheet(model: pm.Model, simulator: EmulatedSimulator, sheet: Summa
     """
     copy = clone_model(model)
     name = simulator.name
-    application: Any = copy[name].owner
+    application = copy[name].owner
     params = application.op.dist_params(application)
     _remove_observed(copy, name)
     responses = Responses(

@@ -18,7 +18,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes._validate import FORMAT
+from prbayes._validate import FORMAT, NamedValues
 from prbayes.model.evaluator import Evaluator, with_data
 from prbayes.model.random_variable import nodes, response_name
 from prbayes.model.simulator_with_data import SimulatorWithData
@@ -147,7 +147,7 @@ def as_attribute(model: pm.Model) -> dict[str, str]:
     return json_attribute("model", describe(model))
 
 
-def json_attribute(name: str, content: Mapping[str, Any]) -> dict[str, str]:
+def json_attribute(name: str, content: NamedValues) -> dict[str, str]:
     """Return JSON as an attribute of an HDF5 file; none where it is too long, near 64 KiB."""
     # JSON escapes letters beyond ASCII, so that its length in characters is the length in bytes.
     text = json.dumps(content)
@@ -166,7 +166,7 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         return None
 
 
-def _stored_simulator(stored: Mapping[str, Any]) -> dict[str, Any]:
+def _stored_simulator(stored: NamedValues) -> dict[str, Any]:
     texts = {key: str(stored[key]) for key in _SIMULATOR}
     rows = [[str(name), str(unit), str(text)] for name, unit, text in stored["inputs"]]
     return {**texts, "inputs": rows}
@@ -253,7 +253,7 @@ def arviz_attributes() -> dict[str, str]:
 def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
     """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
     model = evaluator.model
-    coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
+    coords = {name: np.arange(size) for name, size in leading.items()}
     variables = {}
     for name, value in values.items():
         array = np.asarray(value)

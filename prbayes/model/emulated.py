@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from scipy.special import logsumexp, ndtr
 
-from prbayes._validate import AT_ONCE, ArrayFunction, Bools, Floats, Indices, Shape
+from prbayes._validate import (
+    AT_ONCE,
+    ArrayFunction,
+    Arrays,
+    Bools,
+    Floats,
+    Indices,
+    Shape,
+    complete_rows,
+)
 from prbayes.emulators.emulator import fit_emulator, with_failures
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.conditions import at_conditions
@@ -79,7 +88,7 @@ class EmulatedResponse:
     # Whether responses beyond the runs' range are those at its end, or NaN.
     is_continued: bool = True
 
-    def __call__(self, inputs: Sequence[Floats]) -> Floats:
+    def __call__(self, inputs: Arrays) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
         Beyond the runs' range an input has the response at the end of the range, or NaN. Where
@@ -92,7 +101,7 @@ class EmulatedResponse:
             values[(np.abs(z - ends) > 1e-9).any(axis=1)] = np.nan
         return values.reshape(len(z), *self.event)
 
-    def steepened(self, inputs: Sequence[Floats]) -> Floats:
+    def steepened(self, inputs: Arrays) -> Floats:
         """Return responses that have twice the end slope of the runs' range beyond it.
 
         Their difference from the constant response there estimates its error.
@@ -110,7 +119,7 @@ class EmulatedResponse:
         change = 2 * difference / share.reshape(-1, *(1,) * len(self.event))
         return np.where(np.isfinite(values + change), values + change, values)
 
-    def share_beyond(self, inputs: Sequence[Floats], values: Floats) -> float:
+    def share_beyond(self, inputs: Arrays, values: Floats) -> float:
         """Return the share of specimens, with responses (n, *event), beyond the runs' range.
 
         It counts those that twice the end slope would move by a tenth of the standard deviation.
@@ -120,7 +129,7 @@ class EmulatedResponse:
         if not self.is_continued or not rows.size:
             return 0.0
         columns = values.reshape(len(z), -1)
-        finite = columns[np.isfinite(columns).all(axis=1)]
+        finite = columns[complete_rows(columns)]
         steeper = self.steepened([x[rows] for x in inputs]).reshape(len(rows), -1)
         with np.errstate(invalid="ignore"):  # Infinite outputs, of failed specimens, stay.
             change = np.abs(steeper - columns[rows])
@@ -143,10 +152,10 @@ class EmulatedResponse:
 
 
 def values_of_inputs(
-    values: Sequence[Floats],
+    values: Arrays,
     inputs: Inputs,
     subset: Inputs,
-    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]] = MappingProxyType({}),
+    replaced: Mapping[Variable, Variable] = MappingProxyType({}),
 ) -> list[Floats]:
     """Return the values of a subset of the inputs, from those of all inputs of a response.
 
@@ -250,7 +259,7 @@ class EmulatedSimulator:
 
 
 def draw_specimens(
-    simulator: EmulatedSimulator, inputs: Inputs, parents: Sequence[Floats], n: int
+    simulator: EmulatedSimulator, inputs: Inputs, parents: Arrays, n: int
 ) -> list[Floats]:
     """Return n specimens of each of k populations, (k n, *event) by input."""
     rng = np.random.default_rng(0)
@@ -259,9 +268,7 @@ def draw_specimens(
     return [x.reshape(-1, *x.shape[2:]) for x in specimens]
 
 
-def _at_conditions(
-    simulator: EmulatedSimulator, inputs: Inputs, specimens: Sequence[Floats]
-) -> list[Floats]:
+def _at_conditions(simulator: EmulatedSimulator, inputs: Inputs, specimens: Arrays) -> list[Floats]:
     """Return inputs of specimens with the conditions of those of the simulator in turn."""
     conditions = simulator.measurement.conditions
     rows = None if conditions is None else conditions[simulator.rows]
@@ -269,7 +276,7 @@ def _at_conditions(
 
 
 def emulator_of(
-    simulator: EmulatedSimulator, responses: Responses, specimens: Sequence[Floats]
+    simulator: EmulatedSimulator, responses: Responses, specimens: Arrays
 ) -> EmulatedResponse:
     """Return a response of a simulator's inputs as a function of them.
 
@@ -291,7 +298,7 @@ def emulator_of(
     coordinates = Coordinates.of_prior(responses.inputs)
     z = coordinates.of(points, 1)
     y = values.reshape(len(z), -1)
-    is_finite = np.isfinite(y).all(axis=1)
+    is_finite = complete_rows(y)
     if is_finite.sum() < 8:
         raise DesignError(
             f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
@@ -346,7 +353,7 @@ def _emulator_through(
     coordinates: Coordinates, z: Floats, y: Floats, is_near: Bools, event: Shape
 ) -> EmulatedResponse:
     """Return the emulator of the finite ones of the runs y at z; errors are those of near runs."""
-    is_finite = np.isfinite(y).all(axis=1)
+    is_finite = complete_rows(y)
     _, distinct = np.unique(z[is_finite], axis=0, return_index=True)
     rows = np.flatnonzero(is_finite)[distinct]
     near = is_near[rows]
@@ -360,7 +367,7 @@ def _emulator_through(
 
 def replaced_inputs(
     simulators: Sequence[EmulatedSimulator], responses: Responses
-) -> tuple[EmulatedSimulator | None, dict[Variable[Any, Any], Variable[Any, Any]]]:
+) -> tuple[EmulatedSimulator | None, dict[Variable, Variable]]:
     """Return a simulator whose inputs a response has from another population, and which are which.
 
     The response of the simulator has its inputs in the same places. Another response has inputs of
@@ -378,9 +385,7 @@ def replaced_inputs(
     return None, {}
 
 
-def _replaced(
-    simulator: EmulatedSimulator, responses: Responses
-) -> dict[Variable[Any, Any], Variable[Any, Any]]:
+def _replaced(simulator: EmulatedSimulator, responses: Responses) -> dict[Variable, Variable]:
     """Return the inputs of a response by the simulator's inputs in whose place they are."""
     model_inputs, inputs = simulator.inputs, responses.inputs
     if responses.function is not simulator.responses.function:
@@ -389,7 +394,7 @@ def _replaced(
         names = aleatory_names(inputs, responses.function)
         pairs = zip(names, inputs.aleatory, strict=True)
         return {by_name[name]: x for name, x in pairs if name in by_name}
-    replaced: dict[Variable[Any, Any], Variable[Any, Any]] = {}
+    replaced = {}
     for x, y in zip(model_inputs.sources, inputs.sources, strict=True):
         if isinstance(x, Variable) and isinstance(y, Variable):
             replaced[x] = y
@@ -406,7 +411,7 @@ def emulated_simulators(model: pm.Model) -> list[EmulatedSimulator]:
     result = []
     likelihoods = specimen_likelihoods(model)
     for rv, measurement in measurements_of(model).items():
-        places: list[int | None] = [None]
+        places = [None]
         if measurement.groups is not None:
             places = np.unique(measurement.groups).tolist()
         result += [EmulatedSimulator(likelihoods[rv], measurement, place) for place in places]
@@ -434,7 +439,7 @@ class EmulatedSample:
     inputs: Inputs  # inputs of the simulator, or of another population
     n_points: int  # number of specimens
     # inputs of the simulator that are those of another population here
-    replaced: Mapping[Variable[Any, Any], Variable[Any, Any]]
+    replaced: Mapping[Variable, Variable]
     density: PopulationDensity
     # Whether the points are spread evenly over the tails, by inverse distribution functions.
     has_tails: bool
@@ -452,7 +457,7 @@ class EmulatedSample:
         simulator: EmulatedSimulator,
         parents: Sequence[Floats],
         inputs: Inputs,
-        replaced: Mapping[Variable[Any, Any], Variable[Any, Any]],
+        replaced: Mapping[Variable, Variable],
     ) -> EmulatedSample:
         """Draw specimens of inputs from populations at parents, shapes (k, *shape)."""
         places = np.linspace(0, len(parents[0]) - 1, _SIZES.populations)
@@ -493,7 +498,7 @@ class EmulatedSample:
         """Return a response of the specimens, (n,) or (n, m)."""
         return _emulator(self, responses)(self.points_of(responses.inputs))
 
-    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+    def emulated(self, responses: Responses, points: Arrays) -> list[Floats]:
         """Return a response at any points, (n,) or (n, m), and with two errors of it.
 
         The errors are that at left-out runs, and that beyond the range of the runs.
@@ -514,7 +519,7 @@ class EmulatedSample:
         with np.errstate(invalid="ignore"):
             return None, normalised_weights(log_p)
 
-    def refuse_unsupported(self, name: str, parents: Sequence[Floats]) -> None:
+    def refuse_unsupported(self, name: str, parents: Arrays) -> None:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(parents)
         size = float(np.median(effective_sample_size(weights)))
@@ -527,7 +532,7 @@ class EmulatedSample:
             )
 
 
-def _squared_scores(inputs: Inputs, scores: Sequence[Floats]) -> Floats:
+def _squared_scores(inputs: Inputs, scores: Arrays) -> Floats:
     """Return the squared lengths of normal scores, (k, n, *event) by input -> (k, n)."""
     total: Any = 0.0
     for dist, z in zip(inputs.aleatory, scores, strict=True):

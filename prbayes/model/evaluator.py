@@ -15,7 +15,15 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.traversal import ancestors
 
-from prbayes._validate import AT_ONCE, IN_CACHE, Bools, Floats, Function, NamedArrays, called
+from prbayes._validate import (
+    AT_ONCE,
+    IN_CACHE,
+    Bools,
+    Floats,
+    Function,
+    NamedArrays,
+    wrong_value,
+)
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
@@ -377,9 +385,11 @@ def read_inputs_of_copy(
     if function is not None and repeats_of(function) > 1:
         noises = [r.inputs.aleatory[-1] for r in records if r.function is function]
         if not noises:
-            raise TypeError(
-                f"{name}: got {called(function)}, expected the random response of a simulator of "
-                "the model, whose distribution is emulated; pass that very object"
+            raise wrong_value(
+                function,
+                name,
+                "the random response of a simulator of the model, whose distribution is "
+                "emulated; pass that very object",
             )
         inputs = [*(x for x in inputs if x is not noises[0]), noises[0]]
     return read_inputs(name, inputs, model, fixed=fixed, originals=originals)
@@ -485,8 +495,8 @@ def is_current(evaluator: Evaluator) -> bool:
     """Return whether the model still has the evaluator's data; `pymc.set_data` changes them."""
     model = evaluator.model
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
-    now: list[object] = [*nodes(model).values(), *likelihoods]
-    previous: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
+    now = [*nodes(model).values(), *likelihoods]
+    previous = [*evaluator.nodes, *evaluator.likelihoods]
     return now == previous
 
 

@@ -11,7 +11,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -22,7 +22,7 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Shape, require_format
+from prbayes._validate import Arrays, Floats, Names, Shape, flat_rows, require_format
 from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
@@ -80,7 +80,7 @@ class SimulatorIdentity:
     points: tuple[tuple[float, ...], ...] = ()
     # Digests of data, weights and labels as a metric of distributions would have them; only for a
     # log-likelihood by specimen.
-    with_metric: tuple[str, ...] = ()
+    with_metric: Names = ()
     # Digests of the response's code and of variables that it reads; empty in older results.
     code: dict[str, str] = field(default_factory=dict)
 
@@ -91,7 +91,7 @@ class Identity:
 
     shapes: dict[str, Shape]  # shapes of value variables by name, such as 'sigma_log__'
     priors: dict[str, str]  # distributions of free variables, as PyMC prints them
-    terms: tuple[str, ...]  # other observed variables, and names of potentials
+    terms: Names  # other observed variables, and names of potentials
     simulators: tuple[SimulatorIdentity, ...]
     # Whether the prior was minimised; None if nothing was minimised.
     prior_minimised: bool | None = None
@@ -203,7 +203,7 @@ def _simulator_identity(
 
 def _in_fixed_order(observed: Floats, weights: Floats, labels: Any) -> tuple[Floats, Floats, Any]:
     """Return data in sorted order, because a metric does not depend on the order of specimens."""
-    order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
+    order = np.lexsort((weights, *flat_rows(observed).T[::-1]))
     return observed[order], weights[order], None if labels is None else labels[order]
 
 
@@ -221,7 +221,7 @@ def _first_runs(
     Designs grow at their ends, so that the first runs do not change. A likelihood by specimen has
     none before its first use, and a user's own propagation may store no points.
     """
-    points: Sequence[Floats] = ()
+    points: Arrays = ()
     values = np.empty(0)
     if isinstance(simulator, Node):
         values = simulator.bound.first_responses

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import called
+from prbayes._validate import wrong_value
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import element_name, variable_of
 from prbayes.response.condition import is_condition
@@ -76,11 +76,10 @@ def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> lis
         inputs = [inputs]
     names = [margin.name for margin in available]
     if not isinstance(inputs, list | tuple) or not inputs:
-        raise TypeError(
-            f"inputs: got {called(inputs)}, expected a list of names or .dist() objects, such as "
-            f"{names[:2]}"
+        raise wrong_value(
+            inputs, "inputs", f"a list of names or .dist() objects, such as {names[:2]}"
         )
-    selected: list[Margin] = []
+    selected = []
     for x in inputs:
         if isinstance(x, str):
             matches = [m for m in available if x in (m.name, variable_of(m.name))]

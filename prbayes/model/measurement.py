@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, Indices, Shape
+from prbayes._validate import ArraysByName, Floats, Indices, NamedValues, Shape, flat_rows
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
@@ -54,7 +54,7 @@ class Measurement:
     outputs: Outputs
     groups: Indices | None = None  # (N,): index of each specimen's group
     # Conditions on which the population of a specimen depends, as values (N,) by name.
-    covariates: Mapping[str, Floats] = field(default_factory=dict)
+    covariates: ArraysByName = field(default_factory=dict)
     conditions: Floats | None = None  # (N, C): values of conditions that are inputs
     # Whether outputs are readings at values of a vector condition, or of functions by specimen.
     at_conditions: bool = False
@@ -71,7 +71,7 @@ class Measurement:
     @property
     def rows(self) -> Floats:
         """Observed values, (N, m)."""
-        return self.observed.reshape(len(self.observed), -1)
+        return flat_rows(self.observed)
 
     @property
     def gross_errors(self) -> Any:
@@ -144,7 +144,7 @@ def selection_of(measurements: Sequence[Measurement]) -> Selection | None:
     """Return the limits within which specimens were measured; None without limits."""
     if all(m.metric.selected is None for m in measurements):
         return None
-    parts: list[list[Floats]] = []
+    parts = []
     for m in measurements:
         ends = m.metric.selected or (None, None)
         defaults = zip(ends, (-np.inf, np.inf), strict=True)
@@ -401,9 +401,7 @@ class SpecimenLikelihood:
         """The index of each group, None without groups, and its specimens."""
         return rows_by_group(self.stacked.groups, len(self.readings))
 
-    def parents(
-        self, values: Mapping[str, Floats], group: int | None, specimens: Indices
-    ) -> list[Floats]:
+    def parents(self, values: ArraysByName, group: int | None, specimens: Indices) -> list[Floats]:
         """Return the parents of the inputs of specimens in a group, (P, *shape).
 
         Values are those of the model's variables by name, (P, *shape). The covariates of specimens,
@@ -435,7 +433,7 @@ class SpecimenLikelihood:
         vars(result).update(density=self.density, coordinates=self.coordinates)
         return result
 
-    def observing(self, data: Mapping[str, Any], model: Any = None) -> SpecimenLikelihood:
+    def observing(self, data: NamedValues, model: Any = None) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.
 
         ``model`` is a copy of the model. The likelihood is the same object if the values are the
@@ -489,7 +487,7 @@ def own_columns(likelihood: SpecimenLikelihood) -> Indices | None:
 
 def rows_by_context(likelihood: SpecimenLikelihood) -> list[tuple[int | None, Indices]]:
     """Return the group, and the specimens, of each combination of group and covariates."""
-    contexts: list[tuple[int | None, Indices]] = []
+    contexts = []
     for group, rows in likelihood.by_group:
         covariates = likelihood.stacked.covariates[:, rows]
         _, number = np.unique(covariates, axis=1, return_inverse=True)

@@ -16,7 +16,17 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, Indices, NamedArrays, Shape, called, real_array, sample_labels
+from prbayes._validate import (
+    Floats,
+    Indices,
+    NamedArrays,
+    Names,
+    Shape,
+    called,
+    real_array,
+    sample_labels,
+    wrong_value,
+)
 from prbayes.metrics.base import Metric
 from prbayes.metrics.likelihood import LogLikelihood, mapped_metric
 from prbayes.model.random_variable import known_value
@@ -48,7 +58,7 @@ class ObservedData:
     # (N,): observed row of each specimen if the weights are frequencies, else None
     rows: Indices | None
     n_rows: int  # number of observed rows
-    dims: tuple[str, ...] | None  # names of the observed dimensions
+    dims: Names | None  # names of the observed dimensions
     # (N,): labels in the index or the coordinate of the specimens; None if these only count them
     index: list[str] | None = None
 
@@ -162,11 +172,11 @@ def _report_whole_weights(name: str, weights: Any) -> None:
     report(Finding("whole-weights", text))
 
 
-def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> tuple[str, ...]:
+def _checked_dims(name: str, dims: object, shape: Shape, model: pm.Model) -> Names:
     """Return names of the observed dimensions; raise if their lengths in the model differ."""
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
-        raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
+        raise wrong_value(dims, f"{name}: dims", "the name of one dimension")
     if len(names) != len(shape):
         raise ValueError(
             f"{name}: dims: got {names}, expected {len(shape)} names, one for each dimension of "

@@ -22,13 +22,16 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._validate import (
     ArrayFunction,
+    Arrays,
+    ArraysByName,
     Floats,
     Indices,
     NamedArrays,
+    NamedValues,
     Shape,
-    called,
     real_array,
     refuse_single_precision,
+    wrong_value,
 )
 from prbayes.model.random_variable import ObservedRV, building, known_value
 from prbayes.numerics.points import sobol
@@ -66,8 +69,8 @@ class Hyperparameters:
         shapes = value_shapes(self)
         values = [np.ravel(self.point[name]) for name in shapes]
         initial = np.concatenate([np.empty(0), *values])
-        names: list[str] = []
-        readable_names: list[str] = []
+        names = []
+        readable_names = []
         for v in self.model.value_vars:
             variable = str(self.model.values_to_rvs[v].name)
             labels = coordinates(self.model, variable)
@@ -134,7 +137,7 @@ class Hyperparameters:
         with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
         terms = [values_of(term) for term in terms]
-        jacobian: Any = np.float64(0.0)
+        jacobian = np.float64(0.0)
         for rv in model.free_RVs:
             transform = model.rvs_to_transforms[rv]
             if transform is not None:
@@ -185,7 +188,7 @@ class Hyperparameters:
         graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
         return compiled(batched, [graph], allow_input_downcast=True)
 
-    def thetas_of(self, draws: Sequence[Floats]) -> Floats:
+    def thetas_of(self, draws: Arrays) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
         (thetas,) = self._transform(*draws)
         return np.asarray(thetas)
@@ -241,16 +244,14 @@ def in_support(hyperparameters: Hyperparameters, thetas: Floats) -> Any:
     return np.isfinite(hyperparameters.log_prior(thetas))
 
 
-def unconstrained(hyperparameters: Hyperparameters, point: Mapping[str, Any]) -> Floats:
+def unconstrained(hyperparameters: Hyperparameters, point: NamedValues) -> Floats:
     """Return theta, shape (d,), of a point given in the user's own units.
 
     Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
     value is outside its support.
     """
     if not isinstance(point, Mapping):
-        raise TypeError(
-            f"start: got {called(point)}, expected a dict with a value for each free variable"
-        )
+        raise wrong_value(point, "start", "a dict with a value for each free variable")
     free = {rv.name: rv for rv in hyperparameters.model.free_RVs}
     if set(point) != set(free):
         raise KeyError(
@@ -343,7 +344,7 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, I
 
 
 def parent_values(
-    values: Mapping[str, Floats], inputs: Inputs, group: int | None, covariates: Sequence[Floats]
+    values: ArraysByName, inputs: Inputs, group: int | None, covariates: Arrays
 ) -> list[Floats]:
     """Return the parents of inputs, in the group with this index, shapes (P, *shape).
 
@@ -378,7 +379,7 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
     """
     if len(labels) != len(shape):
         labels = [None] * len(shape)
-    axes: list[Sequence[object]] = []
+    axes = []
     for size, coordinate in zip(shape, labels, strict=True):
         texts = [] if coordinate is None else list(map(str, np.asarray(coordinate).tolist()))
         axes.append(texts if len(set(texts)) == len(texts) == size else range(size))

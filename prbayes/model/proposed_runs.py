@@ -11,7 +11,7 @@ import pymc as pm
 from prbayes._display import Shown, View
 from prbayes._finding import counted
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes._validate import Floats, Seed, finite_or_nan, positive_integer, seed_number
 from prbayes.emulators.ranges import predictive_inputs
 from prbayes.emulators.runs import Runs, continued
 from prbayes.model.measurement import SpecimenLikelihood
@@ -157,7 +157,7 @@ def _near_data(
     columns, batch = runs.surrogate.domain.columns(arguments)
     values, _ = checked(continued(runs, *arguments), batch, arguments, responses.outputs)
     values = values.reshape(len(columns), -1)
-    data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
+    data = finite_or_nan(observed).reshape(len(observed), -1)
     spread = np.nanstd(data, axis=0)
     unit = positive_scale(spread)
     rows = []

@@ -38,7 +38,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
-from prbayes._validate import Floats, called
+from prbayes._validate import Floats, wrong_value
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
@@ -628,7 +628,7 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
     In a clone they are copies with their own design, count and epsilon, which the first call makes.
     """
     if not isinstance(model, pm.Model):
-        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
+        raise wrong_value(model, "model", "a pm.Model")
     by_variable = {}
     for rv in model.observed_RVs:
         apply = rv.owner
@@ -728,10 +728,7 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
 
     def __init__(self, metric: Metric) -> None:
         if not isinstance(metric, Metric):
-            raise TypeError(
-                f"abc_distance: got {called(metric)}, expected a metric object "
-                "such as prb.AreaMetric()"
-            )
+            raise wrong_value(metric, "abc_distance", "a metric object such as prb.AreaMetric()")
         self.metric = metric
         self._prepared: tuple[Floats, Discrepancy] | None = None
 

@@ -6,8 +6,6 @@ specimen is about as near to a run as the runs are to each other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -79,7 +77,7 @@ def coverage_findings(
 
 def _columns(likelihood: SpecimenLikelihood, m: Measurement, domain: Ranges, z: Floats) -> Floats:
     """Return the inputs of a surrogate at coordinates, (k, d) -> (k, columns)."""
-    inputs: Sequence[Floats] = m.responses.inputs.fill(likelihood.coordinates.inputs(z), [])
+    inputs = m.responses.inputs.fill(likelihood.coordinates.inputs(z), [])
     return domain.columns(inputs)[0]
 
 

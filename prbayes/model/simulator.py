@@ -21,8 +21,11 @@ from prbayes._validate import (
     Floats,
     Function,
     Labels,
+    Names,
     called,
+    finite_or_nan,
     flag,
+    flat_rows,
     observed_sample,
     plain_text,
     positive_number,
@@ -30,6 +33,7 @@ from prbayes._validate import (
     refuse_single_precision,
     sample_weights,
     texts,
+    wrong_value,
 )
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.area import AreaMetric
@@ -225,9 +229,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     variables = _read_inputs(name, response, inputs, model)
     settings = Reweighted() if propagation is None else propagation
     if not isinstance(settings, Propagation):
-        raise TypeError(
-            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
-            "prb.Resimulated(n) or prb.Fresh(n)"
+        raise wrong_value(
+            propagation,
+            f"{name}: propagation",
+            "prb.Reweighted(n), prb.Resimulated(n) or prb.Fresh(n)",
         )
     if has_data_sheets(observed):
         unused = [metric, epsilon, weights, specimens, dims, variables.groups]
@@ -288,7 +293,7 @@ class _Arguments:
 
     def responses(self, name: str, inputs: Inputs, scatter: float | None) -> Responses:
         """Return the response of inputs, and how the propagation calls it."""
-        calls: dict[str, Any] = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
+        calls = {key: getattr(self.propagation, key) for key in _CALL_SETTINGS}
         calls |= {"outputs": self.data.outputs, "caller": self.name, "scatter": scatter}
         calls["times"] = self.times
         return Responses(name, self.response, inputs, **calls)
@@ -545,7 +550,7 @@ def _measurement_variables(
 
     Simulators with the same specimens use the same share of gross errors.
     """
-    extras: dict[str, TensorVariable] = {}
+    extras = {}
     for role, value in (metric.roles | {"gross_errors": metric.gross_errors}).items():
         if role == "gross_errors" and value is True:
             value = partners[0].measurements[0].extras.get(role) if partners else None
@@ -623,7 +628,7 @@ def _checked_specimens(arguments: _Arguments) -> Floats:
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
             f"2 specimens; {NO_POPULATION}"
         )
-    rows = values.reshape(len(values), -1)
+    rows = flat_rows(values)
     if np.isnan(rows).all(axis=1).any():
         row = int(np.flatnonzero(np.isnan(rows).all(axis=1))[0])
         raise ValueError(
@@ -655,11 +660,7 @@ def _add_by_metric(
     """Add an observed variable with a metric of distributions, or one for each group."""
     name, model, data, inputs = arguments.name, arguments.model, arguments.data, arguments.inputs
     if repeats_of(arguments.response) > 1:
-        raise TypeError(
-            f"{name}: metric: got {called(metric)} for a random response "
-            "(prb.response.Stochastic), expected prb.LogLikelihood(); leave metric= out, or pass "
-            "the function itself with prb.AreaMetric() and propagation=prb.Fresh()"
-        )
+        arguments = replace(arguments, propagation=_of_random_runs(name, arguments.propagation))
     if inputs.covariates:
         text = (
             f"{name}: inputs: got a population that depends on {inputs.covariates[0].name}, "
@@ -700,12 +701,27 @@ def _add_by_metric(
     return tuple(variables) if inputs.groups is not None else variables[0]
 
 
+def _of_random_runs(name: str, propagation: Propagation) -> Propagation:
+    """Return the propagation of a random response, whose runs are a sample of its distribution."""
+    # An emulator would interpolate between runs whose differences are noise.
+    if propagation.is_random:
+        return propagation
+    emulator = getattr(propagation, "emulator", propagation)
+    if emulator is None or isinstance(emulator, str):
+        return replace(cast(Reweighted, propagation), emulator=None)
+    raise TypeError(
+        f"{name}: propagation: got {called(propagation)} for a random response "
+        "(prb.response.Stochastic) and a metric, expected prb.Reweighted(n) without an emulator, "
+        "whose runs are kept, or prb.Fresh(n)"
+    )
+
+
 def _add_specification(
     model: pm.Model,
     specification: Specification,
     place: int,
     observed: Any,
-    dims: tuple[str, ...] | None,
+    dims: Names | None,
 ) -> TensorVariable:
     """Add an observed variable with a metric of distributions; ``place`` is its group's index."""
     name, target, labels = specification.name, specification.target, specification.specimens
@@ -774,10 +790,11 @@ def _prepared_metric(
 ) -> Discrepancy:
     """Return the metric, prepared for the observed responses; errors begin with the name."""
     if not isinstance(metric, Metric):
-        raise TypeError(
-            f"{name}: metric: got {called(metric)}, expected a metric object such as "
-            "prb.ProbabilityResidual() or prb.AreaMetric(); wrap a function of your own in "
-            "prb.FunctionMetric(f)"
+        raise wrong_value(
+            metric,
+            f"{name}: metric",
+            "a metric object such as prb.ProbabilityResidual() or prb.AreaMetric(); wrap a "
+            "function of your own in prb.FunctionMetric(f)",
         )
     try:
         if np.ndim(observed) != 2:
@@ -802,7 +819,7 @@ def _prepared_metric(
 
 def try_function(target: Discrepancy) -> None:
     """Call a user's function before any run, for two populations in the range of the data."""
-    finite = np.where(np.isfinite(target.observed), target.observed, np.nan)
+    finite = finite_or_nan(target.observed)
     low, high = np.nanmin(finite, axis=0), np.nanmax(finite, axis=0)
     trial = np.linspace(low, high, 2 * len(finite)).reshape(2, *finite.shape)
     with np.errstate(all="ignore"):

@@ -64,7 +64,7 @@ def number_specimens(
     numbers: dict[object, int] = {}
     by_simulator = []
     for k, simulator in enumerate(simulators):
-        labels: list[object] = [(k, row) for row in range(len(simulator.observed))]
+        labels = [(k, row) for row in range(len(simulator.observed))]
         if simulator.specimens is not None:
             labels = simulator.specimens.tolist()
         rows = [numbers.setdefault(label, len(numbers)) for label in labels]
@@ -182,7 +182,7 @@ def _labels(specimens: NDArray[Any] | None, index: Sequence[str] | None) -> list
 
 def _index_of(variable: Any) -> Sequence[str] | None:
     """Return the labels in the index of the observed values of a variable."""
-    labels: Sequence[str] | None = getattr(variable.tag, "specimen_index", None)
+    labels = getattr(variable.tag, "specimen_index", None)
     return labels
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from prbayes._finding import Finding, any_of, report
-from prbayes._validate import Floats, Indices
+from prbayes._validate import Floats, Indices, complete_rows
 from prbayes.metrics.readings import relative_error
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
@@ -148,7 +148,7 @@ def _likely_inputs(likelihood: SpecimenLikelihood, thetas: Floats) -> Floats:
     inputs, is_gross = draw_inputs(likelihood, rng, values, as_read=True)
     of_specimens = [x.reshape(-1, *x.shape[2:]) for x in inputs]
     z = likelihood.coordinates.of(of_specimens, 1)
-    is_regular = np.isfinite(z).all(axis=1)
+    is_regular = complete_rows(z)
     if is_gross is not None:
         # Readings with gross errors do not determine the population.
         is_regular &= is_gross.ravel() < 0.5

@@ -25,7 +25,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import log_sum_exp
-from prbayes._validate import Bools, Floats, Indices, called
+from prbayes._validate import Arrays, ArraysByName, Bools, Floats, Indices, flat_rows, wrong_value
 from prbayes.metrics.readings import Readings, add_errors
 from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
@@ -90,7 +90,7 @@ def points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     return last[1]
 
 
-def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+def log_likelihoods(likelihood: SpecimenLikelihood, values: ArraysByName) -> Floats:
     """Return the log-likelihoods of the specimens in populations, (P, S), without a graph.
 
     Values are those of the model's variables by name, (P, *shape).
@@ -128,7 +128,7 @@ def emulator_factors(likelihood: SpecimenLikelihood) -> Any:
 
 
 @one_thread()
-def _over_emulators(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+def _over_emulators(likelihood: SpecimenLikelihood, values: ArraysByName) -> Floats:
     """Return log-likelihoods of specimens, (P, S), whose sum is that of their mean over draws."""
     factors = emulator_factors(likelihood).get_value(borrow=True)
     size = len(next(iter(values.values())))
@@ -183,7 +183,7 @@ def mean_over_emulators(logs: Any, factors: Any, weights: Floats | None, xp: Any
 
 
 def _with_gross_errors(
-    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], logs: Floats, rows: Any
+    likelihood: SpecimenLikelihood, values: ArraysByName, logs: Floats, rows: Any
 ) -> Floats:
     """Return log-likelihoods of specimens, (P, n), as mixtures with gross errors."""
     share = _gross_share(likelihood.measurements[0], values)
@@ -195,7 +195,7 @@ def _with_gross_errors(
         return np.asarray(np.logaddexp(np.log1p(-share) + logs, gross))
 
 
-def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+def monte_carlo_error(likelihood: SpecimenLikelihood, values: ArraysByName) -> Floats:
     """Return the error of the log-likelihood of populations by finitely many points, (P,), in nats.
 
     It is that of the difference between two independent halves of the points of each specimen. A
@@ -225,7 +225,7 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     return np.sqrt(variance)
 
 
-def _unknown_of(measurements: Sequence[Measurement], values: Mapping[str, Floats]) -> Floats:
+def _unknown_of(measurements: Sequence[Measurement], values: ArraysByName) -> Floats:
     """Return the unknown parameters of the readings, (P, 3, M); one, or zero, if known."""
     size = len(next(iter(values.values())))
     blocks = []
@@ -238,7 +238,7 @@ def _unknown_of(measurements: Sequence[Measurement], values: Mapping[str, Floats
     return np.concatenate(blocks, axis=2)
 
 
-def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
+def _gross_share(measurement: Measurement, values: ArraysByName) -> Any:
     """Return the share of specimens with a gross error, a number or (P,); False without them."""
     share = measurement.gross_errors
     return values[str(share.name)] if isinstance(share, TensorVariable) else share
@@ -248,7 +248,7 @@ def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
 def _of_points(
     likelihood: SpecimenLikelihood,
     errors: Floats,
-    parents: Sequence[Floats],
+    parents: Arrays,
     points: WeightedPoints,
     rows: Indices,
     columns: slice = slice(None),
@@ -260,7 +260,7 @@ def _of_points(
     if likelihood.error_is_known:
         return points.log_likelihoods(parents)
     result = np.empty((len(errors), len(rows)))
-    order = np.lexsort(errors.reshape(len(errors), -1).T)
+    order = np.lexsort(flat_rows(errors).T)
     of_readings = _reading_density(likelihood).at_errors(errors[order])
     of_points = points.log_densities([p[order] for p in parents])
     for k, log_p, of_error in zip(order, of_points, of_readings, strict=True):
@@ -391,7 +391,7 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
 def draw_inputs(
     likelihood: SpecimenLikelihood,
     rng: np.random.Generator,
-    values: Mapping[str, Floats],
+    values: ArraysByName,
     *,
     as_read: bool = False,
 ) -> tuple[list[Floats], Floats | None]:
@@ -441,7 +441,7 @@ def draw_inputs(
 def draw_readings(
     likelihood: SpecimenLikelihood,
     rng: np.random.Generator,
-    values: Mapping[str, Floats],
+    values: ArraysByName,
     n: int,
     measurement: Measurement | None = None,
 ) -> Floats:
@@ -467,7 +467,7 @@ def draw_readings(
         columns, measurements = output_columns(likelihood, measurement), (measurement,)
         like_read = unit_readings(measurement)
 
-    def draw_outputs(part: Mapping[str, Floats]) -> Floats:
+    def draw_outputs(part: ArraysByName) -> Floats:
         inputs = population_inputs(likelihood, part, like, rng)
         return response_at(likelihood, [x[:, specimens] for x in inputs])
 
@@ -486,8 +486,8 @@ def draw_readings(
 
 
 def _drawn_again(
-    draw: Callable[[Mapping[str, Floats]], Floats],
-    values: Mapping[str, Floats],
+    draw: Callable[[ArraysByName], Floats],
+    values: ArraysByName,
     is_refused: Callable[[Floats], Bools],
     tries: int,
 ) -> Floats:
@@ -510,7 +510,7 @@ def _drawn_again(
 
 def population_inputs(
     likelihood: SpecimenLikelihood,
-    values: Mapping[str, Floats],
+    values: ArraysByName,
     like: Indices,
     rng: np.random.Generator,
 ) -> list[Floats]:
@@ -532,7 +532,7 @@ def population_inputs(
     )
 
 
-def response_at(likelihood: SpecimenLikelihood, inputs: Sequence[Floats]) -> Floats:
+def response_at(likelihood: SpecimenLikelihood, inputs: Arrays) -> Floats:
     """Return the emulated outputs of all simulators at inputs (P, n, *event), (P, n, M).
 
     Beyond the range of the runs the response is that at the end of the range.
@@ -548,7 +548,7 @@ def read_outputs(
     outputs: Floats,
     readings: Readings,
     measurements: Sequence[Measurement],
-    values: Mapping[str, Floats],
+    values: ArraysByName,
 ) -> Floats:
     """Return readings of outputs, (P, n, m), with reading errors, rounding and gross errors."""
     size, n, _ = outputs.shape
@@ -632,7 +632,7 @@ def _log_density_of_vector(
         v: p if is_known(v) else p[(0,) * (p.ndim - v.type.ndim)]
         for v, p in zip(variables, params, strict=False)
     }
-    measurements: Sequence[Measurement] = op.measurements
+    measurements = op.measurements
     data = []
     for param, m in zip(params[len(variables) :], measurements[:-1], strict=True):
         first = param[(0,) * (param.ndim - m.observed.ndim)]
@@ -669,7 +669,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     Simulators with common specimens have the same one.
     """
     if not isinstance(model, pm.Model):
-        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
+        raise wrong_value(model, "model", "a pm.Model")
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
     result = {rv: rv.owner.op.record for rv in rvs}

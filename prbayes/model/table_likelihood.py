@@ -8,14 +8,13 @@ cross-validated error at the runs nearest to the roots of the specimens.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Function
+from prbayes._validate import Bools, Floats, Function, complete_rows
 from prbayes.emulators.runs import Runs, continued, left_out_nearby
 from prbayes.metrics.readings import robust_spread
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
@@ -124,7 +123,7 @@ def _surface(data: SpecimenData, likelihood: SpecimenLikelihood) -> tuple[Emulat
             "expected ranges that overlap; check the units, and the order of the inputs"
         )
     z = np.unique(np.concatenate(runs), axis=0)
-    z = z[np.isfinite(z).all(axis=1)]
+    z = z[complete_rows(z)]
     y = OfTables.of(likelihood, Runs.__call__)(z)
     near = z[near_readings(y, data.readings)]
     residuals = OfTables.of(likelihood, left_out_nearby)(near)
@@ -206,7 +205,7 @@ def _table(measurement: Measurement) -> Runs:
 def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
     """Return the name of each aleatory number in the table."""
     m = likelihood.measurements[0]
-    names: list[str] = []
+    names = []
     table = _table(m)
     for a in range(len(m.inputs.aleatory)):
         r = table.surrogate.domain.inputs[m.responses.inputs.arguments.index(a)]
@@ -216,5 +215,5 @@ def _column_names(likelihood: SpecimenLikelihood) -> list[str]:
 
 def _as_inputs(coordinates: Coordinates, z: Floats) -> Floats:
     """Return the inputs at coordinates z, as columns (k, d)."""
-    parts: Sequence[Floats] = coordinates.inputs(z)
+    parts = coordinates.inputs(z)
     return np.concatenate([x.reshape(len(z), -1) for x in parts], axis=1)

@@ -108,7 +108,7 @@ class ReadingDensity:
 
     def __call__(self, parameters: Any, xp: Any) -> Any:
         """Return the log-density, (S, K), as an array or a graph."""
-        total: Any = self.constant
+        total = self.constant
         for column, squares, count, variance in self.sums:
             v = parameters[0][column] ** 2 + variance
             total = total - 0.5 * (squares / v + count * xp.log(2 * np.pi * v))
@@ -141,7 +141,7 @@ class ReadingDensity:
             for error in errors:
                 yield self(error, np)
             return
-        at_nodes: dict[int, Floats] = {}
+        at_nodes = {}
         for place, cell in zip(places, cells, strict=True):
             # Interpolate by Lagrange's polynomial through two nodes on each side.
             nodes = range(cell - 1, cell + 3)

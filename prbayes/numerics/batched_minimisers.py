@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import ArrayPair, Bools, Floats, Indices
 
 # function of points, (A, s, r), and of the rows of the functions there, (A,), that returns values,
 # (A, s)
@@ -139,7 +139,7 @@ def _by_differences(value: Values, step: float, curvature: Floats, is_central: b
     # bias of one-sided differences of a function with typical curvature
     bias = step * mean_curvature / 2
 
-    def problem(x: Floats, rows: Indices) -> tuple[Floats, Floats]:
+    def problem(x: Floats, rows: Indices) -> ArrayPair:
         values = value(x[:, None] + stencil, rows)
         center, up, down = np.split(values, [1, 1 + r], axis=1)
         with np.errstate(invalid="ignore"):
@@ -214,7 +214,7 @@ def descend_by_simplex(value: Values, start: Floats, *, sizes: Sequence[float]) 
     return Minima(x, values, converged)
 
 
-def _best_first(points: Floats, values: Floats) -> tuple[Floats, Floats]:
+def _best_first(points: Floats, values: Floats) -> ArrayPair:
     """Return simplices with their best point first."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
@@ -226,7 +226,7 @@ def _step(
     points: Floats,
     values: Floats,
     rows: Indices,
-) -> tuple[Floats, Floats]:
+) -> ArrayPair:
     """Replace the worst point of each sorted simplex, or shrink it towards the best."""
     # The factors are those of Gao and Han (2012) for r parameters, at least two.
     n = max(points.shape[-1], 2)

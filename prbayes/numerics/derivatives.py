@@ -24,7 +24,7 @@ def slopes(values: Floats, step: Floats) -> Floats:
         backward = (center - down) / step
         central = (up - down) / (2 * step)
     upwards = np.where(np.isfinite(down), central, forward)
-    derivatives: Floats = np.where(np.isfinite(up), upwards, backward)
+    derivatives = np.where(np.isfinite(up), upwards, backward)
     return derivatives
 
 

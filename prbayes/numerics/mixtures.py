@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._stats import reached
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats, complete_rows
 from prbayes.numerics.points import sobol
 
 
@@ -23,7 +23,7 @@ def effective_sample_size(weights: Floats) -> Floats:
     return 1 / (weights**2).sum(axis=-1)
 
 
-def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
+def pareto_smoothed(log_w: Floats) -> ArrayPair:
     """Return log weights (P, n) so that rows are smooth and sum to one, and tail shapes k, (P,).
 
     The largest weights are replaced by quantiles of a generalised Pareto distribution [1]_, which
@@ -66,7 +66,7 @@ def pareto_smoothed(log_w: Floats) -> tuple[Floats, Floats]:
         quantiles = np.expm1(-k * log_p) / k
         smoothed = np.log(cutoff + sigma * quantiles)
     k[quarter <= tail[:, :1]] = np.nan
-    is_smoothed = np.isfinite(smoothed).all(axis=1)
+    is_smoothed = complete_rows(smoothed)
     is_smoothed &= np.isfinite(k[:, 0])
     rows = np.flatnonzero(is_smoothed)
     result[rows[:, None], order[rows]] = np.minimum(smoothed[rows], 0.0)
@@ -107,7 +107,7 @@ class StudentMixture:
         # Begin with centers that are far from each other (k-means++).
         standard = np.linalg.solve(root, deviations.T)
         squares = (standard**2).sum(axis=0)
-        first: list[int] = []
+        first = []
         for _ in range(m):
             chances = weights * squares
             first.append(int(rng.choice(len(points), p=chances / chances.sum())))

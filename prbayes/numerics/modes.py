@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import Arrays, Bools, Floats, Indices
 from prbayes.numerics.derivatives import central_derivatives
 from prbayes.numerics.points import farthest_rows
 
@@ -122,9 +122,7 @@ def distinct_modes(modes: list[Laplace]) -> list[Laplace]:
     return distinct
 
 
-def modes_each(
-    log_density: RowDensity, starts: Sequence[Floats], scale: Floats
-) -> list[list[Laplace]]:
+def modes_each(log_density: RowDensity, starts: Arrays, scale: Floats) -> list[list[Laplace]]:
     """Return distinct modes of each density from its starts, (M, d), the largest masses first.
 
     All densities have one start, or all have several. Modes with less than e^-10 of the largest
@@ -147,7 +145,7 @@ def modes_each(
 
 
 def _laplace_from(
-    log_density: RowDensity, starts: Sequence[Floats], scale: Floats, steps: int
+    log_density: RowDensity, starts: Arrays, scale: Floats, steps: int
 ) -> list[list[Laplace]]:
     """Return the modes near the starts of each density."""
     sizes = [len(of_density) for of_density in starts]

@@ -15,7 +15,7 @@ import numpy as np
 from pytensor.gradient import NullTypeGradError
 
 from prbayes._progress import progress
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
@@ -127,8 +127,8 @@ class Search:
         if random and method.gradient and isinstance(method.method, str):
             raise TypeError(
                 f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-                f"{method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
-                "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
+                f"{method.method} has no gradient to follow; call "
+                "prb.sample_smc(adjustment=None), use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
         has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
@@ -496,9 +496,7 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     return np.asarray(thetas[np.argmin(values)])
 
 
-def overlapping_populations(
-    evaluator: Evaluator, thetas: Floats
-) -> tuple[list[tuple[Floats, Floats]], Floats]:
+def overlapping_populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[ArrayPair], Floats]:
     """Return responses and weights by simulator, and their overlaps with the data, (K, P)."""
     populations = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
     pairs = zip(evaluator.nodes, populations, strict=True)

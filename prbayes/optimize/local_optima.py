@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Arrays, Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
@@ -70,7 +69,7 @@ class Reference:
             values = values + self.ridge(stacked, self.local.prior_sd)
         return values.reshape(thetas.shape[:-1])
 
-    def descend(self, shifts: Floats, curvature: Floats) -> tuple[Floats, Floats]:
+    def descend(self, shifts: Floats, curvature: Floats) -> ArrayPair:
         """Return the minima that descents from shifts, (n, d), reach, and their values.
 
         Shifts and curvature, (d, d), are in units of the prior's spread.
@@ -85,7 +84,7 @@ class Reference:
         )
         return ends, values
 
-    def polish(self, thetas: Floats) -> tuple[Floats, Floats]:
+    def polish(self, thetas: Floats) -> ArrayPair:
         """Return the minima near thetas, (n, d), and values, by the Hessian of the reference."""
         local = self.local
         covariance = local.identified @ local.covariance @ local.identified.T
@@ -161,7 +160,7 @@ def find_local_optima(search: Search, fit: Fit, starts: int) -> list[LocalOptimu
 
 
 def optima_from_prior(
-    reference: Reference, starts: int, seed: int, candidates: Sequence[Floats] = ()
+    reference: Reference, starts: int, seed: int, candidates: Arrays = ()
 ) -> list[LocalOptimum]:
     """Descend from points of the prior and candidates; return the optima that barriers separate.
 

@@ -8,7 +8,7 @@ cost no run: these are the observed specimens with other weights, or simulated s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,7 +19,16 @@ import pytensor.tensor as pt
 
 from prbayes._finding import Finding, counted, report
 from prbayes._stats import positive_scale
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices, NamedArrays
+from prbayes._validate import (
+    IN_CACHE,
+    ArrayPair,
+    Arrays,
+    ArraysByName,
+    Bools,
+    Floats,
+    Indices,
+    NamedArrays,
+)
 from prbayes.inference.checks.one_sided import end_and_bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -680,7 +689,7 @@ class _Copies:
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    values: Mapping[str, Floats],
+    values: ArraysByName,
     rng: np.random.Generator,
     size: int = 2000,
 ) -> Callable[[np.random.Generator], SpecimenData]:
@@ -799,7 +808,7 @@ class SpecimenRefits:
         root = self._root
         function = self._function(same_specimens=not data)
 
-        def problem(u: Floats, rows: Indices) -> tuple[Floats, Floats]:
+        def problem(u: Floats, rows: Indices) -> ArrayPair:
             arguments = [array[rows] for array in (*weights, *data)]
             with np.errstate(over="ignore", invalid="ignore"):  # far from the data
                 values, gradients = function(self.theta + u @ root.T, *arguments)
@@ -844,7 +853,7 @@ class SpecimenRefits:
             thetas, converged = self.fit(weights, stacked)
             yield from zip(thetas, converged, data, strict=True)
 
-    def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, Bools]:
+    def reweighted(self, weights: Arrays) -> tuple[Floats, Bools]:
         """Return estimates of weighted data sets, (S, d), and which converged.
 
         ``weights``, (S, n_k), are of the specimens of each of `Evaluator.emulated`, with any sum.

@@ -20,6 +20,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
     Function,
+    Names,
     Seed,
     flag,
     positive_integer,
@@ -482,7 +483,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     n_starts = settings.starts
     if n_starts is None:
         n_starts = _starts_by_cost(problem.search, fit)
-    optima: list[LocalOptimum] = []
+    optima = []
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
             return fit, []
@@ -554,8 +555,8 @@ def _report(
     """
     search = problem.search
     evaluator = search.evaluator
-    at_edge: tuple[str, ...] = ()
-    at_jump: tuple[str, ...] = ()
+    at_edge: Names = ()
+    at_jump: Names = ()
     if fit.sampling is not None and not stopped:
         at_edge = elements_at_edge(
             evaluator,
@@ -615,7 +616,7 @@ def _report(
     )
 
 
-def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
+def _details(search: Search, fit: Fit, at_edge: Names) -> list[str]:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
     sentences = [f"{', '.join(at_edge)} reached the edge of the support."] if at_edge else []
@@ -648,7 +649,7 @@ def optimum_findings(
     design_error: float,
 ) -> Findings:
     """Report few specimens, the design's error, other optima, and identification."""
-    findings: list[Finding] = []
+    findings = []
     for node in evaluator.nodes:
         findings += few_for_whitening(node.name, node.target)
     findings += design_error_findings(evaluator, design_error)

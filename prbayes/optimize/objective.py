@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import Floats
+from prbayes._validate import Floats, NamedValues
 from prbayes.model.evaluator import Evaluator, epsilons, has_other_terms
 
 # function of theta, (d,), that returns value, gradient (d,) or None, and number of evaluations
@@ -157,7 +157,7 @@ class Method:
 
     method: str | Callable[..., Any] = "BFGS"
     # options that replace those of `settings`
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: NamedValues = field(default_factory=dict)
     gradient: bool = field(init=False)  # whether the method uses gradients
 
     def __post_init__(self) -> None:

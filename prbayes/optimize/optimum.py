@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._display import view, without_constructor
 from prbayes._finding import Findings, as_json
-from prbayes._validate import Floats, NamedArrays
+from prbayes._validate import Floats, NamedArrays, Names
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.identification import breakdown_findings, no_information
 from prbayes.inference.checks.population import failing_share
@@ -116,8 +116,8 @@ class SearchRecord:
     seconds: float = 0.0
     trace: NamedArrays = field(default_factory=dict)
     stopped: str = ""
-    at_edge: tuple[str, ...] = ()
-    at_jump: tuple[str, ...] = ()
+    at_edge: Names = ()
+    at_jump: Names = ()
     support: dict[str, dict[str, float]] = field(default_factory=dict)
     identity: Identity | None = None
 
@@ -658,7 +658,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     return figures.assign(variables)
 
 
-def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
+def compared_in(calibration: xr.Dataset) -> Names:
     """Return how simulators compare several outputs together."""
     if "compared" not in calibration:
         return ()

@@ -6,13 +6,20 @@ Plotting libraries are imported when a figure is made.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from prbayes._validate import Floats, Labels, called, positive_integer, texts
+from prbayes._validate import (
+    Floats,
+    Labels,
+    NamedValues,
+    positive_integer,
+    texts,
+    wrong_value,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
@@ -33,15 +40,16 @@ GREY, PALE = "#707070", "#949494"
 Limits = tuple[float, float]
 
 
-def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: bool = False) -> None:
+def check_options(labels: object, pc_kwargs: NamedValues, *, by_arviz: bool = False) -> None:
     """Raise if labels are not texts by name, or an option of the figure is wrong."""
     if labels is not None:
         texts(labels, "labels")
     unknown = set(pc_kwargs) - {"figsize", "col_wrap", "figure_kwargs"}
     if unknown and not by_arviz:
-        raise TypeError(
-            f"{min(unknown)}: got {called(pc_kwargs[min(unknown)])}, expected figsize, col_wrap or "
-            "figure_kwargs: Matplotlib draws this picture"
+        raise wrong_value(
+            pc_kwargs[min(unknown)],
+            min(unknown),
+            "figsize, col_wrap or figure_kwargs: Matplotlib draws this picture",
         )
     if "col_wrap" in pc_kwargs:
         positive_integer(pc_kwargs["col_wrap"], "col_wrap")
@@ -57,9 +65,7 @@ def check_options(labels: object, pc_kwargs: Mapping[str, Any], *, by_arviz: boo
         )
 
 
-def layout(
-    n: int, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
-) -> tuple[int, dict[str, Any]]:
+def layout(n: int, size: tuple[float, float], pc_kwargs: NamedValues) -> tuple[int, dict[str, Any]]:
     """Return the number of columns of n panels of a size, and the options of their figure."""
     # A row has three panels, but four panels make a square.
     columns = min(n, pc_kwargs.get("col_wrap", 2 if n == 4 else 3))
@@ -70,7 +76,7 @@ def layout(
 
 
 def panels(
-    names: Sequence[str], *, size: tuple[float, float], pc_kwargs: Mapping[str, Any]
+    names: Sequence[str], *, size: tuple[float, float], pc_kwargs: NamedValues
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure of pyplot, and its panels by name; a panel has the name as its label."""
     from matplotlib import pyplot as plt  # heavy, and only needed for pictures
@@ -224,7 +230,7 @@ def refuse_labels(
     if not labels:
         return
     names = list(dict.fromkeys(shown))
-    inputs: set[str] = set()
+    inputs = set()
     allowed = {*names, *map(variable_of, names), *STATISTIC_LABELS, *METRIC_LABELS}
     if evaluator is not None:
         allowed |= set(map(str, evaluator.model.named_vars))

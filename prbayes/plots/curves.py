@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import import_module
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from prbayes._stats import cumulated, positive_scale, quantile
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Arrays, Floats
 from prbayes.metrics.density import GaussianKDE, silverman
 
 # number of points of a curve; a step is one or two pixels of a panel
 GRID_POINTS = 257
 
 
-def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
+def _finite_samples(values: Floats, weights: Floats) -> Iterator[ArrayPair]:
     """Yield finite values with positive weight, and weights of sum one, of each sample, (P, n)."""
     rows = np.broadcast_to(values, weights.shape)
     for row, w in zip(rows, weights, strict=True):
@@ -71,12 +70,12 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
     """Return ArviZ's kernel density of draws, (n,), on a grid; NaN if all draws are equal."""
     if not np.ptp(draws) > 0:
         return np.full(grid.shape, np.nan)
-    stats: Any = import_module("arviz_stats")  # heavy, and only needed for pictures
+    stats = import_module("arviz_stats")  # heavy, and only needed for pictures
     x, density, _ = stats.base.array_stats.kde(draws)
     return np.asarray(np.interp(grid, x, density, left=0.0, right=0.0))
 
 
-def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:
+def pointwise_band(curves: Floats, prob: float) -> ArrayPair:
     """Return the sides between which the share ``prob`` of curves, (P, g), lies at each point."""
     low, high = np.quantile(curves, central_levels(prob), axis=0)
     return low, high
@@ -121,7 +120,7 @@ def axis_range(
     return low - width, high + width
 
 
-def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+def staircase(observed: Floats, weights: Floats, low: float, high: float) -> ArrayPair:
     """Return the corners of the distribution function of weighted values from low to high."""
     order = np.argsort(observed, kind="stable")
     values = observed[order]
@@ -185,7 +184,7 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     return joined
 
 
-def with_gaps(lines: Sequence[Floats]) -> Floats:
+def with_gaps(lines: Arrays) -> Floats:
     """Join lines, (k, 2) each, into one, (2, k), with NaN between them."""
     gap = np.full((1, 2), np.nan)
     parts = [part for line in lines for part in (line, gap)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pymc as pm
@@ -12,7 +12,15 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Bools, Floats, positive_integer, wrong_type
+from prbayes._validate import (
+    AT_ONCE,
+    Bools,
+    Floats,
+    NamedValues,
+    complete_rows,
+    positive_integer,
+    wrong_type,
+)
 from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.model.parameters import in_support, unconstrained
@@ -105,7 +113,7 @@ def read_result(
 def supported(evaluator: Evaluator, thetas: Floats) -> Bools:
     """Return which populations stored responses support well enough to be drawn, shape (P,)."""
     out = np.zeros(len(thetas), dtype=bool)
-    indices = np.flatnonzero(np.isfinite(thetas).all(axis=1))
+    indices = np.flatnonzero(complete_rows(thetas))
     if indices.size:
         indices = indices[in_support(evaluator.hyperparameters, thetas[indices])]
     if not indices.size:
@@ -121,7 +129,7 @@ def supported(evaluator: Evaluator, thetas: Floats) -> Bools:
 def read_before(
     result: Optimum | xr.DataTree,
     evaluator: Evaluator,
-    before: Mapping[str, Any] | bool | None,
+    before: NamedValues | bool | None,
     caller: str,
 ) -> tuple[Floats, str]:
     """Return theta before a calibration, shape (1, d) or (0, d) for none, and its name.

@@ -9,7 +9,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, NamedArrays, called, share
+from prbayes._validate import Floats, Labels, NamedArrays, share, wrong_value
 from prbayes.model.parameters import split_elements, stacked_draws
 from prbayes.plots.canvas import (
     BLUE,
@@ -119,10 +119,7 @@ def specimen_groups(individuals: object, coords: Coords | None) -> dict[str, xr.
     draws = groups.get("posterior", xr.Dataset())
     has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
     if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
-        raise TypeError(
-            f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
-            "returns"
-        )
+        raise wrong_value(individuals, "individuals", "the DataTree that prb.individuals returns")
     if "product" in draws.dims:
         raise ValueError(
             f"individuals: got the specimens of {draws.sizes['product']} products, expected those "

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Floats, Labels, NamedArrays, positive_integer, wrong_type
+from prbayes._validate import (
+    Floats,
+    Labels,
+    NamedArrays,
+    complete_rows,
+    positive_integer,
+    wrong_type,
+)
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -330,7 +337,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
             # of 32 steps that is inside.
             steps = np.linspace(middle, end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
-            ok = np.isfinite(thetas).all(axis=1)
+            ok = complete_rows(thetas)
             ok[ok] = in_support(evaluator.hyperparameters, thetas[ok])
             if ok.all():
                 ends.append(end)

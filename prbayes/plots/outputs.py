@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels
+from prbayes._validate import ArrayPair, Floats, Labels, complete_rows
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
@@ -223,7 +223,7 @@ def _shown_outputs(
     return k, columns
 
 
-def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> tuple[Floats, Floats]:
+def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> ArrayPair:
     """Return specimens of the k-th simulator's mixture of populations: (n, m), weights (n,)."""
     values, weights = evaluator.populations(thetas, k)
     if evaluator.simulators[k].reweighted is not None:
@@ -236,22 +236,20 @@ def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> tuple[Floats, Floa
     return values[has_response], weights[has_response]
 
 
-def _range(output: Output, population: tuple[Floats, Floats], tail: float) -> Limits:
+def _range(output: Output, population: ArrayPair, tail: float) -> Limits:
     """Return the range of all but the outermost values of an output."""
     values, weights = population
     return central_range(output.of(values)[None], weights[None], tail=tail)
 
 
-def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> ArrayPair:
     """Return the points, (n, 2), that have two outputs, and their weights."""
     points = np.column_stack([x.of(values), y.of(values)])
-    finite = np.isfinite(points).all(axis=1)
+    finite = complete_rows(points)
     return points[finite], weights[finite]
 
 
-def _draw_outputs(
-    axis: Axes, x: Output, y: Output, populations: Mapping[str, tuple[Floats, Floats]]
-) -> None:
+def _draw_outputs(axis: Axes, x: Output, y: Output, populations: Mapping[str, ArrayPair]) -> None:
     """Draw measured specimens, and outlines of regions of populations; the last is calibrated."""
     *_, calibrated = populations
     probs = (0.5, INTERVAL)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, share
+from prbayes._validate import ArrayPair, Floats, Labels, complete_rows, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.margins import Margin, margins
@@ -126,7 +126,7 @@ def plot_population(
 def _coordinates(evaluator: Evaluator, margin: Margin) -> dict[str, Any]:
     """Return the coordinates of a margin: its group, and its index in a multivariate input."""
     variable = variable_of(margin.name)
-    places: dict[str, Any] = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
+    places = {f"{variable}_dim_{i}": x for i, x in enumerate(margin.index)}
     groups = evaluator.simulators[margin.node].inputs.groups
     if groups is not None and margin.group:
         places[groups.dim] = groups.labels[groups.names.index(margin.group)]
@@ -150,7 +150,7 @@ def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float
     n = max(2, 200_000 // len(ensemble.mixture))
     draws = _draws(ensemble.evaluator, x.node, ensemble.mixture, n, seed=0)
     points = np.column_stack([_values(draws, margin).ravel() for margin in (x, y)])
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[complete_rows(points)]
     weights = np.full(len(points), 1 / len(points))
     half, region = outlines(points, weights, (0.5, prob))
     for gid, p, line, style in (("half", 0.5, half, "--"), ("region", prob, region, "-")):
@@ -165,7 +165,7 @@ def _draw_pair(axis: Axes, ensemble: Ensemble, x: Margin, y: Margin, prob: float
 
 def margin_densities(
     evaluator: Evaluator, shown: list[Margin], thetas: Floats
-) -> dict[str, tuple[Floats, Floats]]:
+) -> dict[str, ArrayPair]:
     """Return by margin a grid, shape (g,), and densities at thetas, shape (P, g); or probabilities.
 
     They are exact where the input has an elementwise density or is a multivariate normal, otherwise
@@ -184,7 +184,7 @@ def margin_densities(
         ranges[margin.axis] = min(low, first), max(high, last)
 
     # Specimens of all populations, by simulator. They are drawn for kernel densities alone.
-    many: dict[int, Any] = {}
+    many = {}
     densities = {}
     for margin in shown:
         k = margin.node
@@ -223,7 +223,7 @@ def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) 
         return None
     symbols = inputs.placeholders()
     dists, *_ = inputs.rebuilt(symbols)
-    dist: Any = dists[margin.position]
+    dist = dists[margin.position]
     x = pt.lvector("x") if margin.discrete else pt.dvector("x")
     if isinstance(dist.owner.op, MVNORMAL):
         mean, covariance = dist.owner.op.dist_params(dist.owner)

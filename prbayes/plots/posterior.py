@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from prbayes._display import percentage
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, NamedArrays, share, wrong_type
+from prbayes._validate import Floats, Labels, share, wrong_type
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
@@ -146,7 +146,7 @@ def plot_posterior(
         best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
         errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
         shared &= set(best)
-    prior: NamedArrays = {}
+    prior = {}
     if evaluator is not None:
         # With 4000 draws the peak of a normal density has an error of 2%.
         thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
@@ -248,7 +248,7 @@ def _draw(
         "linestyle": list(styles),
         "marker": list(markers),
     }
-    drawn: Any = az.plot_dist(
+    drawn = az.plot_dist(
         by_name("draws"),
         kind="kde",
         sample_dims="sample",
@@ -272,7 +272,7 @@ def _draw(
         },
         **(settings | rest | {"figure_kwargs": options}),
     )
-    look: dict[str, Any] = {"loc": "outside lower center", "ncols": len(shown), "frameon": False}
+    look = {"loc": "outside lower center", "ncols": len(shown), "frameon": False}
     drawn.add_legend(
         "distribution",
         aes=["color", "linestyle"],

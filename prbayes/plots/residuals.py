@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Labels, called
+from prbayes._validate import Labels, wrong_value
 from prbayes.plots.canvas import (
     BLUE,
     GREY,
@@ -81,9 +81,7 @@ def plot_residuals(
     check_options(labels, pc_kwargs)
     trees = residuals.children if isinstance(residuals, xr.DataTree) else {}
     if not trees or not all("CWRES" in tree for tree in trees.values()):
-        raise TypeError(
-            f"residuals: got {called(residuals)}, expected the DataTree that prb.residuals returns"
-        )
+        raise wrong_value(residuals, "residuals", "the DataTree that prb.residuals returns")
     datasets = {name: tree.to_dataset() for name, tree in trees.items()}
     dims = {dim for data in datasets.values() for dim in data.dims} - {"input"}
     datasets = {name: subset(data, coords, dims) for name, data in datasets.items()}

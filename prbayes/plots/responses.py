@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL, distribution_function, positive_scale
-from prbayes._validate import Floats, Labels, flag, share
+from prbayes._validate import ArrayPair, Floats, Labels, finite_or_nan, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import variable_of
@@ -199,8 +199,8 @@ class _Drawing:
     def distribution(
         self,
         output: Output,
-        population: tuple[Floats, Floats],
-        earlier: tuple[Floats, Floats] | None,
+        population: ArrayPair,
+        earlier: ArrayPair | None,
         limits: Limits,
         *,
         ecdf: bool,
@@ -245,8 +245,8 @@ class _Drawing:
     def lines(
         self,
         output: Output,
-        population: tuple[Floats, Floats],
-        earlier: tuple[Floats, Floats] | None,
+        population: ArrayPair,
+        earlier: ArrayPair | None,
     ) -> None:
         """Draw a line over all outputs for each specimen; median and most of the population."""
         axis = self.axis
@@ -258,7 +258,7 @@ class _Drawing:
             center, unit = np.zeros(places.size), np.ones(places.size)
         else:  # Outputs with names have different units: each is divided by its spread.
             places = np.arange(len(outputs.labels), dtype=np.float64)
-            finite = np.where(np.isfinite(observed), observed, np.nan)
+            finite = finite_or_nan(observed)
             spread = np.nanstd(finite, axis=0)
             center, unit = np.nanmean(finite, axis=0), positive_scale(spread)
             _name_ticks(axis, places, outputs.names)
@@ -384,7 +384,7 @@ class Output:
         """Return the values of this output among those of all, (..., m) -> (...)."""
         return values if self.column is None else values[..., self.column]
 
-    def measured(self) -> tuple[Floats, Floats]:
+    def measured(self) -> ArrayPair:
         """Return the measured values of one output, without NaN, and weights that sum to one."""
         values = self.of(self.node.observed)
         weights = self.node.weights
@@ -409,7 +409,7 @@ def panels_of(
     alone = len(nodes) == 1
     by_node = {node.name: displayed_outputs(node, alone=alone) for node in nodes}
     available = {x.name: x for outputs in by_node.values() for x in outputs}
-    shown: dict[str, Output] = {}
+    shown = {}
     names = select(output_elements(available.values()), var_names, filter_vars, coords)
     for name in names:
         output = available[name]

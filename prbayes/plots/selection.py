@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import called
+from prbayes._validate import wrong_value
 from prbayes.model.parameters import split_elements, variable_of
 
 VarNames = str | Sequence[str]
@@ -78,9 +78,7 @@ def _select_names(
         return list(elements)
     requested = [var_names] if isinstance(var_names, str) else var_names
     if not isinstance(requested, Sequence) or not all(isinstance(x, str) for x in requested):
-        raise TypeError(
-            f"var_names: got {called(var_names)}, expected names, some of {list(elements)}"
-        )
+        raise wrong_value(var_names, "var_names", f"names, some of {list(elements)}")
 
     def matches(text: str) -> list[str]:
         """Return the elements that a text selects, or leaves out."""
@@ -108,7 +106,7 @@ def _items(coords: Coords | None, dims: set[str]) -> list[tuple[str, Any]]:
     if coords is None:
         return []
     if not isinstance(coords, Mapping):
-        raise TypeError(f"coords: got {called(coords)}, expected values by dimension")
+        raise wrong_value(coords, "coords", "values by dimension")
     unknown = [dim for dim in coords if dim not in dims]
     if unknown:
         raise KeyError(f"coords: got {unknown}, expected some of the dimensions {sorted(dims)}")

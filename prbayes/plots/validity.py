@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
-from prbayes._validate import Bools, Floats
+from prbayes._validate import Arrays, Bools, Floats
 from prbayes.plots.canvas import (
     BLUE,
     PALE,
@@ -148,7 +148,7 @@ def _is_of_direction(test: ValidityTest) -> Bools:
     return np.array([DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
 
 
-def _ecdf(samples: Sequence[Floats]) -> Floats:
+def _ecdf(samples: Arrays) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
     curves = []
     for values in samples:

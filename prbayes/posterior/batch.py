@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from prbayes._validate import Floats, Indices
+from prbayes._validate import ArrayPair, Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import variables_at
@@ -45,7 +45,7 @@ class ProductPosteriors:
             return None
         return cls(evaluator, likelihood, ProductPoints.of(points, sizes))
 
-    def log_densities(self, thetas: Floats, products: Indices) -> tuple[Floats, Floats]:
+    def log_densities(self, thetas: Floats, products: Indices) -> ArrayPair:
         """Return log-densities of the posteriors of products (A,), and of the prior, (A, n).
 
         Thetas are (A, n, d).

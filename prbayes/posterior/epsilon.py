@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pymc as pm
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, positive_number
+from prbayes._validate import Floats, positive_number, wrong_value
 from prbayes.inference.asymptotics import (
     Information,
     first_order_shifts,
@@ -28,7 +28,10 @@ from prbayes.model.locking import locked
 from prbayes.model.random_variable import AnySimulator, simulators
 from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.numerics.mixtures import normalised_weights
+from prbayes.optimize.minimize import find_optimum, require_finished
+from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
+from prbayes.propagation.reweighted import Reweighted
 
 _log = logging.getLogger("prbayes")
 
@@ -55,7 +58,8 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     ratio of the variance of their common minimiser to its variance with different specimens (not
     with a metric whose minimum is undeclared).
 
-    No response is computed under `Reweighted`.
+    No response is computed under `Reweighted`. Under `Fresh`, whose discrepancy is random, another
+    optimum is estimated from runs that are kept, as under `Reweighted`, and epsilon there.
 
     Parameters
     ----------
@@ -70,8 +74,8 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     Raises
     ------
     TypeError
-        For simulators with `Fresh`, or with `Resimulated` and a metric of undeclared minimum: pass
-        their epsilon.
+        For simulators with `Resimulated` and a metric of undeclared minimum, or with `Fresh` and a
+        metric or inputs that `Reweighted` does not take: pass their epsilon.
     ValueError
         If the optimum is at an edge or a jump (``search.at_edge``, ``search.at_jump``), or
         nothing is identified; if the prior was part of it, its model has changed since, or no
@@ -103,6 +107,10 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     refuse_without_epsilon(optimum.model, "calibrate_epsilon")
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     require_minimiser(optimum, "calibrate_epsilon")
+    identity, kept = optimum.search.identity, with_kept_runs(evaluator)
+    if kept is not evaluator:
+        optimum = find_optimum(kept, Minimisation(start=optimum.point))
+        evaluator = require_sampling(require_finished(optimum), "calibrate_epsilon").evaluator
     nodes = evaluator.nodes
     information = [Information(evaluator, k, optimum.theta) for k in range(len(nodes))]
     epsilons = np.array([_epsilon_of(item) for item in information])
@@ -110,7 +118,30 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         ratio = _variance_ratio([information[k] for k in group], epsilons[group])
         epsilons[group] *= ratio
     by_name = {node.name: float(value) for node, value in zip(nodes, epsilons, strict=True)}
-    return Epsilon(by_name, optimum.search.identity)
+    return Epsilon(by_name, identity)
+
+
+def with_kept_runs(evaluator: Evaluator) -> Evaluator:
+    """Return an evaluator whose simulators with `Fresh` keep their runs, as under `Reweighted`.
+
+    Then their discrepancies are smooth functions of the hyperparameters, so that their minimiser
+    has a sampling distribution. It is the same evaluator without such simulators.
+    """
+    changed = []
+    for node in evaluator.nodes:
+        if node.bound.random:
+            stored = Reweighted(max(node.bound.n_per_theta, 1024), emulator=None)
+            try:
+                stored.check_simulator(node.name, node.inputs, node.target)
+            except TypeError as error:
+                text = f"epsilon cannot be calibrated: {error}; pass epsilon= to prb.Simulator"
+                raise TypeError(text) from None
+            bound = stored.bind(node.name, node.inputs, node.target, node.responses)
+            node = replace(node, bound=bound, propagation=stored)
+        changed.append(node)
+    if changed == list(evaluator.nodes):
+        return evaluator
+    return replace(evaluator, nodes=tuple(changed), functions={})
 
 
 def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
@@ -216,7 +247,7 @@ def _by_coverage(information: Information) -> float | None:
     # the posteriors of all data sets.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
-    distances: Any = 0  # (n_sets, M): discrepancies of the data sets at the thetas
+    distances = 0  # (n_sets, M): discrepancies of the data sets at the thetas
     for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
@@ -249,9 +280,10 @@ def checked_epsilon(
 ) -> dict[str, float]:
     """Return positive numbers by the names of simulators; raise if they are no such numbers."""
     if not isinstance(epsilon, Mapping):
-        raise TypeError(
-            f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
-            'positive numbers, such as {"y": 0.1}'
+        raise wrong_value(
+            epsilon,
+            "epsilon",
+            'a mapping of names of simulators to positive numbers, such as {"y": 0.1}',
         )
     names = [simulator.name for simulator in simulators]
     unknown = sorted(map(str, set(epsilon) - set(names)))

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from prbayes._stats import reached
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Floats
 from prbayes.numerics.mixtures import (
     StudentMixture,
     effective_sample_size,
@@ -188,7 +188,7 @@ def _resampled(
 
 
 def importance_samples(
-    log_density: Callable[[Floats], tuple[Floats, Floats]],
+    log_density: Callable[[Floats], ArrayPair],
     modes: Sequence[Laplace],
     prior_points: Floats,
     size: int,

@@ -25,11 +25,12 @@ from prbayes._validate import (
     Floats,
     NamedArrays,
     StrPath,
-    called,
+    complete_rows,
     positive_integer,
     real_array,
     require_format,
     share,
+    wrong_value,
 )
 from prbayes.model.evaluator import Evaluator, epsilons
 from prbayes.model.fingerprint import Identity, Level, as_text, from_text, problem_differences
@@ -293,9 +294,10 @@ def correlation(start: Floats, end: Floats) -> float:
 def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) -> Floats:
     """Return thetas, (draws, d), of particles by names of variables or of transformed values."""
     if not isinstance(start, Mapping):
-        raise TypeError(
-            f"start: got {called(start)}, expected a dict of arrays by the names of variables, or "
-            "a list of these, one for each chain"
+        raise wrong_value(
+            start,
+            "start",
+            "a dict of arrays by the names of variables, or a list of these, one for each chain",
         )
     free_rvs = hyperparameters.model.free_RVs
     rv_shapes = {str(rv.name): event_shape(rv) for rv in free_rvs}
@@ -329,7 +331,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
         if rv_names[name] not in start:
             thetas[:, first : first + size] = values[name].reshape(draws, size)
         first += size
-    finite = np.isfinite(thetas).all(axis=1)
+    finite = complete_rows(thetas)
     outside = ~(finite & in_support(hyperparameters, np.where(finite[:, None], thetas, 0.0)))
     if outside.any():
         raise ValueError(

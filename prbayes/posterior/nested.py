@@ -37,9 +37,9 @@ class NestedFamily:
         Parameters that are no scalar variables of the model do not restrict a family.
         """
         names = evaluator.hyperparameters.readable_names
-        families: dict[str, tuple[str, str]] = {}
+        families = {}
         fixed: dict[str, float] = {}
-        all_labels: set[str] = set()
+        all_labels = set()
         for simulator in evaluator.simulators:
             inputs = simulator.inputs
             labels = aleatory_names(inputs, simulator.responses.function)

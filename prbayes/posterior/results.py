@@ -12,7 +12,16 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import Findings
-from prbayes._validate import AT_ONCE, IN_CACHE, Floats, Indices, NamedArrays, called, flag
+from prbayes._validate import (
+    AT_ONCE,
+    IN_CACHE,
+    Floats,
+    Indices,
+    NamedArrays,
+    NamedValues,
+    flag,
+    wrong_value,
+)
 from prbayes.inference.checks.population import failing_share
 from prbayes.model.description import (
     arviz_attributes,
@@ -46,7 +55,7 @@ class Chains:
     """Chains of draws with the diagnostics of their sampler."""
 
     thetas: Floats  # (chains, draws, d): draws in unconstrained space
-    sampler: Mapping[str, Any]  # attributes of the result: name of the sampler, and diagnostics
+    sampler: NamedValues  # attributes of the result: name of the sampler, and diagnostics
     sample_stats: xr.Dataset
     # (chains, draws): log-likelihood up to a constant; None for log-likelihoods by specimen
     log_likelihood: Floats | None = None
@@ -63,7 +72,7 @@ class Chains:
 def posterior_tree(
     evaluator: Evaluator,
     chains: Chains,
-    attrs: Mapping[str, Any],
+    attrs: NamedValues,
     groups: Mapping[str, xr.Dataset],
 ) -> xr.DataTree:
     """Return the DataTree of a sampler's chains with groups of `arviz_groups`."""
@@ -83,7 +92,7 @@ def posterior_tree(
     return xr.DataTree.from_dict(tree)
 
 
-def posterior_group(evaluator: Evaluator, thetas: Floats, attrs: Mapping[str, Any]) -> xr.Dataset:
+def posterior_group(evaluator: Evaluator, thetas: Floats, attrs: NamedValues) -> xr.Dataset:
     """Return the draws, (chains, draws, d), with attributes of the run and of the model."""
     return _variables(evaluator, thetas).assign_attrs(
         {
@@ -252,7 +261,7 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, chains: Chains) -> xr.Data
     thetas = chains.thetas[:, thinned]
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)
-    coords: dict[str, Any] = {"chain": np.arange(n_chains), "draw": thinned}
+    coords = {"chain": np.arange(n_chains), "draw": thinned}
     variables = {}
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name
@@ -352,7 +361,7 @@ def require_selection(
     if var_names is not None:
         names = [var_names] if isinstance(var_names, str) else var_names  # type: ignore[assignment]
         if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
-            raise TypeError(f"var_names: got {called(var_names)}, expected names of variables")
+            raise wrong_value(var_names, "var_names", "names of variables")
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         unknown = [name for name in names if name not in variables]
         if unknown or not names:
@@ -360,7 +369,7 @@ def require_selection(
     if idata_kwargs is None:
         return names, {}
     if not isinstance(idata_kwargs, Mapping):
-        raise TypeError(f"idata_kwargs: got {called(idata_kwargs)}, expected a dict")
+        raise wrong_value(idata_kwargs, "idata_kwargs", "a dict")
     expected = ["coords", "dims", "log_likelihood", "log_prior"]
     unknown = sorted(map(str, set(idata_kwargs) - set(expected)))
     if unknown:
@@ -372,7 +381,7 @@ def require_selection(
         if name.startswith("log"):
             flag(value, f"idata_kwargs: {name}")
         elif not isinstance(value, Mapping):
-            raise TypeError(f"idata_kwargs: {name}: got {called(value)}, expected a dict")
+            raise wrong_value(value, f"idata_kwargs: {name}", "a dict")
     return names, dict(idata_kwargs)
 
 

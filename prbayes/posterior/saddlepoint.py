@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from prbayes._validate import IN_CACHE, ArrayFunction, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, ArrayFunction, Arrays, Bools, Floats, Indices
 from prbayes.inference.resampling import SETS, aligned, groups, observable
 from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
@@ -482,7 +482,7 @@ class Cumulants(NamedTuple):
 CumulantFunction = Callable[[Floats, Indices], Cumulants]
 
 
-def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
+def cumulants(log_weights: Arrays, scores: Sequence[Scores], tilts: Floats) -> Cumulants:
     """Return the sum of N_j K_j(a) over simulators at tilts, (S, r), given log weights (S, M_j)."""
     count, r = tilts.shape
     values = np.zeros(count)

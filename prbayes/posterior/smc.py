@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from prbayes._finding import Finding, Findings, as_json, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
+    Arrays,
     Floats,
     Seed,
     StrPath,
@@ -53,7 +54,7 @@ from prbayes.optimize.maximum_likelihood import determined_modes, is_known_at
 from prbayes.optimize.minimize import find_optimum, require_finished
 from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
-from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
+from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon, with_kept_runs
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.mode_masses import bridged_modes, modes_finding
 from prbayes.posterior.results import (
@@ -498,7 +499,8 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
     if not unset:
         return optimum
     if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
+        search = Minimisation(refine=settings.refine)
+        optimum = require_finished(find_optimum(with_kept_runs(evaluator), search))
     require_sampling(optimum, "sample_smc")
     calibrated = calibrate_epsilon(optimum)
     for node in unset:
@@ -557,10 +559,10 @@ def _chains_on_designs(
     """Return chains that the designs support, after refinements, or raise."""
     starts = None if settings.start is None else _starts(evaluator, settings)
     checkpoint = None
-    entropy: int | None = settings.random_seed
+    entropy = settings.random_seed
     if settings.checkpoint is not None:
         names = ("draws", "chains", "threshold", "adjustment", "refine")
-        stored: dict[str, Any] = {name: getattr(settings, name) for name in names}
+        stored = {name: getattr(settings, name) for name in names}
         stored["entropy"] = None if entropy is None else str(entropy)
         if starts is not None:
             content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
@@ -569,7 +571,7 @@ def _chains_on_designs(
         # A run without a seed has the seed of the run that it continues.
         entropy = int(checkpoint.settings["entropy"])
     seeds = np.random.SeedSequence(entropy)
-    refinements: list[Floats] = []
+    refinements = []
     for round_ in range(MAX_ROUNDS + 1):
         children = seeds.spawn(settings.chains)
         if checkpoint is not None and round_ < checkpoint.note.get("round", 0):
@@ -640,9 +642,9 @@ def run_chains(
     settings: SamplingSettings,
     seeds: Sequence[np.random.SeedSequence],
     log_likelihood: LogDensity | None = None,
-    starts: Sequence[Floats] | None = None,
+    starts: Arrays | None = None,
     checkpoint: Checkpoint | None = None,
-    refinements: Sequence[Floats] = (),
+    refinements: Arrays = (),
 ) -> Chains:
     """Run a chain for each seed on the designs as they are, or as many as a budget allows.
 
@@ -709,7 +711,7 @@ def _saved_states(checkpoint: Checkpoint, round_: int) -> list[State]:
     return states
 
 
-def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence[Floats]) -> None:
+def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Arrays) -> None:
     """Save the states of the kernels that have begun, and refinements."""
     arrays = {f"refined{i}_thetas": thetas for i, thetas in enumerate(refinements)}
     for i, (particles, _) in enumerate(states):

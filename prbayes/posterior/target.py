@@ -23,7 +23,7 @@ from scipy.special import ndtri
 
 from prbayes._finding import Findings
 from prbayes._stats import log_sum_exp
-from prbayes._validate import IN_CACHE, Bools, Floats, Indices
+from prbayes._validate import IN_CACHE, Bools, Floats, Indices, complete_rows
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import (
@@ -164,7 +164,7 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    blocks: list[LogDensity] = []
+    blocks = []
     if isinstance(likelihood, RefitLikelihood) and likelihood.counts:
         blocks = [likelihood.without_block(block, 8).log_likelihood for block in range(8)]
     return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale, blocks)
@@ -186,16 +186,16 @@ def require_density(evaluator: Evaluator) -> None:
     for node in evaluator.nodes:
         if node.bound.random:
             reason = "its discrepancy is random"
-            expected, scale = "prb.Reweighted() or prb.Resimulated()", " and epsilon="
+            expected = "prb.Reweighted() or prb.Resimulated()"
         elif obstacle is not None and not node.bound.stored:
             reason = obstacle
-            expected, scale = "prb.Reweighted(), whose stored responses can be refitted", ""
+            expected = "prb.Reweighted(), whose stored responses can be refitted"
         else:
             continue
         raise ValueError(
             f"{node.name}: propagation: got {type(node.propagation).__name__}, with which the "
             f"distribution of the estimate is not known ({reason}); expected {expected}, or "
-            f"prb.sample_smc with adjustment=None{scale}, whose draws are as wide as epsilon "
+            "prb.sample_smc with adjustment=None, whose draws are as wide as epsilon "
             "makes them"
         )
 
@@ -480,7 +480,7 @@ def near_statistics(statistics: Floats, r: int, noise: float) -> tuple[Floats, B
     Without it populations at another optimum would count like those at the best, however much worse
     they fit.
     """
-    is_near = np.isfinite(statistics).all(axis=1)
+    is_near = complete_rows(statistics)
     estimates, differences = np.split(statistics[is_near], [r], axis=1)
     spread = differences.std(axis=0)
     # A difference below a tenth of the noise comes from the stored responses.

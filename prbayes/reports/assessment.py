@@ -379,7 +379,7 @@ def data(m: Material) -> list[Section]:
     """Return a summary of the measured responses."""
     if not (m.observed or m.sheets):
         return []
-    rows: list[dict[str, Any]] = []
+    rows = []
     text = [f"{named(name, m.labels)}: a data sheet, {x}." for name, x in m.sheets.items()]
     for simulator in m.description["simulators"]:
         if simulator["specimens"]:

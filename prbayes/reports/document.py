@@ -18,6 +18,7 @@ from prbayes._display import percentage
 from prbayes._stats import INTERVAL
 from prbayes._validate import (
     Labels,
+    NamedValues,
     StrPath,
     called,
     file_path,
@@ -25,6 +26,7 @@ from prbayes._validate import (
     folder_path,
     plain_text,
     wrong_type,
+    wrong_value,
 )
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.fleet import fleet_sections
@@ -152,9 +154,7 @@ class Report:
         plain_text(note or "", "Report: note", empty=True)
         flag(pictures, "Report: pictures")
         if not isinstance(sections, Sequence):
-            raise TypeError(
-                f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
-            )
+            raise wrong_value(sections, "Report: sections", "prb.reports.Section objects")
         contents = tuple(sections)
         fleet: Any = posterior
         if not contents and is_fleet(fleet):
@@ -207,7 +207,7 @@ class Report:
             If no section has that title.
         """
         if not isinstance(section, Section):
-            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
+            raise wrong_value(section, "section", "a prb.reports.Section")
         place = len(self.sections)
         if after is not None:
             titles = [section.title for section in self.sections]
@@ -265,7 +265,7 @@ class Report:
             If a file cannot be written.
         """
         folder = folder_path(folder, "folder")
-        files: list[str | None] = []
+        files = []
         for i, section in enumerate(self.sections, 1):
             slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:40] or "picture"
             has_picture = section.picture is not None
@@ -311,7 +311,7 @@ class Report:
         return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
 
 
-def _refuse_beside_fleet(results: Mapping[str, Any]) -> None:
+def _refuse_beside_fleet(results: NamedValues) -> None:
     """Raise if a report of a whole fleet has results, by name, that belong to one product."""
     for name, result in results.items():
         if result is not None:

@@ -130,7 +130,7 @@ def requests(m: Material) -> dict[str, Request]:
     # Pictures of the model refuse labels of conditions and constants, which it has not.
     elsewhere = {*m.validation, *constants_of(m.description)}
     of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
-    common: dict[str, Any] = {"model": m.model, "labels": of_model}
+    common = {"model": m.model, "labels": of_model}
     prob = {"prob": m.prob}
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
@@ -191,7 +191,7 @@ def pictures_of(m: Material) -> dict[str, list[Section]]:
     The one of measured values beside predicted ones, or else beside the calibrated population, is
     called "front".
     """
-    drawn: dict[str, list[Section]] = {}
+    drawn = {}
     missing = []
     for name, request in requests(m).items():
         picture = picture_of(ILLUSTRATIONS[name], request)
@@ -243,7 +243,7 @@ def _graph(model: pm.Model) -> bytes | None:
         _log.info("report: without the graph of the model, as PyMC would compute responses for it")
         return None
     try:
-        graphviz: Any = import_module("graphviz")  # a package that users may lack
+        graphviz = import_module("graphviz")  # a package that users may lack
     except ImportError:
         _log.info("report: without the graph of the model; pip install graphviz adds it")
         return None

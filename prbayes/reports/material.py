@@ -13,7 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, Labels, called, texts, wrong_type
+from prbayes._validate import Floats, Labels, NamedValues, Names, called, texts, wrong_type
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
@@ -154,13 +154,13 @@ def metrics_of(m: Material) -> dict[str, str]:
     }
 
 
-def constants_of(description: Mapping[str, Any]) -> set[str]:
+def constants_of(description: NamedValues) -> set[str]:
     """Return the names of inputs that are numbers."""
     inputs = [x for s in description["simulators"] for x in s["inputs"]]
     return {name for name, _, text in inputs if text.startswith("=")}
 
 
-def names_in(description: Mapping[str, Any]) -> set[str]:
+def names_in(description: NamedValues) -> set[str]:
     """Return the names of variables, and of inputs that are numbers."""
     return {v["name"] for v in description["variables"]} | constants_of(description)
 
@@ -232,7 +232,7 @@ def gather(
         names = names.union(*(simulator.outputs.names for simulator in observed.values()))
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
-    diagnoses: dict[str, Diagnosis | None] = {}
+    diagnoses = {}
     for label, result in (results | live_optima).items():
         can_diagnose, own_model = _model_of_diagnosis(result, model)
         diagnoses[label] = diagnose(result, model=own_model) if can_diagnose else None
@@ -253,7 +253,7 @@ def gather(
     )
 
 
-def _tests_of(posteriors: Mapping[str, Any]) -> dict[str, ValidityTest]:
+def _tests_of(posteriors: NamedValues) -> dict[str, ValidityTest]:
     """Return the validity tests that posteriors of products have."""
     tests: dict[str, ValidityTest] = {}
     for result in posteriors.values():
@@ -327,7 +327,7 @@ def _validations(validation: Any) -> dict[str, Validation]:
     return validations
 
 
-def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
+def _require_group(label: str, tree: Any, group: str, dims: Names, origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
         expected = f"a DataTree with the group {group}, from {origin}"
         raise wrong_type(tree, f"Report: {label}", expected)
@@ -357,7 +357,7 @@ def _require_tested(
     validation: Mapping[str, Validation], tests: Mapping[str, ValidityTest]
 ) -> None:
     """Raise if there are tests, and validation data are not those of a test."""
-    tested: list[Floats] = []
+    tested = []
     for test in tests.values():
         tested.append(test.u_values)
         tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]

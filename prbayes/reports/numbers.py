@@ -13,7 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from prbayes._display import View
-from prbayes._validate import wrong_type
+from prbayes._validate import Names, wrong_type
 
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
@@ -146,11 +146,11 @@ _NUMBER = re.compile(r"-?\d*\.?\d+(e[-+]?\d+)?%?|-?∞")  # all that `number` an
 class Cells:
     """A table as text."""
 
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    header: Names
+    rows: tuple[Names, ...]
     numeric: tuple[bool, ...]  # whether a column consists of numbers
 
-    def aligned(self) -> tuple[tuple[str, ...], ...]:
+    def aligned(self) -> tuple[Names, ...]:
         """Return the rows with spaces after numbers that align decimal points."""
         # A figure space is as wide as a digit, a punctuation space as a point (Unicode, 6.2).
         digit, point = "\u2007", "\u2008"

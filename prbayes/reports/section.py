@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from prbayes._validate import plain_text, wrong_type
+from prbayes._validate import Names, plain_text, wrong_type
 from prbayes.reports.numbers import cells
 
 # signs in front of the titles of verdicts, so that not only colour distinguishes them
@@ -67,7 +67,7 @@ class Section:
     """
 
     title: str
-    text: tuple[str, ...]
+    text: Names
     table: Any
     picture: bytes | None
     alt: str

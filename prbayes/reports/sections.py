@@ -12,9 +12,9 @@ import pandas as pd
 import xarray as xr
 
 from prbayes._display import p_digits, percentage
-from prbayes._finding import counted, from_json
+from prbayes._finding import counted, sentences_of
 from prbayes._stats import INTERVAL
-from prbayes._validate import Labels
+from prbayes._validate import Labels, NamedValues, Names, finite_or_nan
 from prbayes.model.description import labelled
 from prbayes.model.parameters import (
     element_name,
@@ -68,7 +68,7 @@ from prbayes.validation.pit import DIRECTION, u_values
 def sections_of(m: Material, *, pictures: bool) -> tuple[Section, ...]:
     """Return the sections for which there are results, with or without pictures."""
     drawn = pictures_of(m) if pictures else {}
-    sections: list[Section] = []
+    sections = []
     for title, parts in _CHAPTERS.items():
         chapter: list[Section] = []
         for part in parts:
@@ -206,8 +206,8 @@ def diagnostics(m: Material) -> list[Section]:
         for sentence in (*diagnosis.notes, *diagnosis.untested):
             remarks.setdefault(sentence, []).append(label)
     for label, table in m.decisions.items():
-        for finding in from_json(str(table.attrs.get("findings", "[]"))):
-            problems.setdefault(str(finding), []).append(label)
+        for sentence in sentences_of(table.attrs):
+            problems.setdefault(sentence, []).append(label)
     if not problems:
         return []
     sections = [Section("Diagnostics", _with_labels(problems))]
@@ -227,7 +227,7 @@ def _with_labels(sentences: Mapping[str, list[str]]) -> list[str]:
 
 def failures(m: Material) -> list[Section]:
     """Return the failed responses with the reasons, at most a page."""
-    rows: dict[tuple[str, ...], dict[str, Any]] = {}
+    rows: dict[Names, dict[str, Any]] = {}
     for tree in m.results.values():
         if "failures" in tree.children:
             table = tree["failures"].to_dataset()
@@ -303,11 +303,11 @@ def optima(m: Material) -> list[Section]:
     return sections
 
 
-def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
+def _titled(title: str, label: str, results: NamedValues) -> str:
     return title if len(results) == 1 else f"{title}: {label}"
 
 
-def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+def _other_optimum(mode: NamedValues, point: Mapping[Any, Any], names: Sequence[str]) -> str:
     """Return a sentence on another optimum; of many elements it names scalar variables alone."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
@@ -406,7 +406,7 @@ def comparison(m: Material) -> list[Section]:
 
 def support(m: Material) -> list[Section]:
     """Return the support of the results by stored responses, and the statistics of samplers."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     for label, diagnosis in m.diagnoses.items():
         table = None if diagnosis is None else diagnosis.support
         if table is None or "weight_ess" not in table:
@@ -576,7 +576,7 @@ def measured_values(m: Material) -> list[Section]:
 
 def _correlations(name: str, y: Observed) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    columns = {output: np.where(np.isfinite(x), x, np.nan) for output, _, x in shown_columns(y)}
+    columns = {output: finite_or_nan(x) for output, _, x in shown_columns(y)}
     r = pd.DataFrame(columns).corr(min_periods=3).values
     about = "Each of the specimens that have both outputs, without those that failed."
     table = correlation_table(list(columns), r, 3)

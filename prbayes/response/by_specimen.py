@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from prbayes._validate import Function, Indices, called
+from prbayes._validate import Function, Indices, called, wrong_value
 from prbayes.response.call import scalar, unwrapped
 
 
@@ -80,7 +80,7 @@ class BySpecimen:
     @property
     def __signature__(self) -> inspect.Signature:
         """The signature of the first function, without its record."""
-        function: Any = unwrapped(self.functions[0])
+        function = unwrapped(self.functions[0])
         if not isinstance(function, _Recorded):
             return inspect.signature(function)
         signature = inspect.signature(function.function)
@@ -89,7 +89,7 @@ class BySpecimen:
     @property
     def __name__(self) -> str:
         """The name of the first function."""
-        inner: Any = unwrapped(self.functions[0])
+        inner = unwrapped(self.functions[0])
         inner = getattr(inner, "function", inner)
         return str(getattr(inner, "__name__", type(inner).__name__))
 
@@ -149,9 +149,10 @@ def by_specimen(
     else:
         is_table = isinstance(records, Mapping | str | bytes) or hasattr(records, "columns")
         if is_table or not hasattr(records, "__len__"):
-            raise TypeError(
-                f"{caller}: records: got {called(records)}, expected a list with the record of "
-                "each specimen, beside one function"
+            raise wrong_value(
+                records,
+                f"{caller}: records",
+                "a list with the record of each specimen, beside one function",
             )
         objects = list(cast(Sequence[Any], records))
         separate = [_with_record(functions, record) for record in objects]
@@ -189,7 +190,7 @@ class _Recorded:
 
 def of_specimens(function: Any) -> BySpecimen | None:
     """Return the functions by specimen of a response, which may be in `scalar`; None without."""
-    inner: Any = unwrapped(function)
+    inner = unwrapped(function)
     return inner if isinstance(inner, BySpecimen) else None
 
 

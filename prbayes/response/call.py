@@ -22,7 +22,17 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
 from prbayes._stats import positive_scale
-from prbayes._validate import NO_POPULATION, Bools, Floats, Function, Indices, Shape, unmasked
+from prbayes._validate import (
+    NO_POPULATION,
+    Bools,
+    Floats,
+    Function,
+    Indices,
+    Names,
+    Shape,
+    complete_rows,
+    unmasked,
+)
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -81,7 +91,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         A function that returns a mapping or labels gives a mapping of arrays.
         """
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
-        outputs: Outputs | None = None
+        outputs = None
         values = []
         for specimen in zip(*(array.ravel() for array in arrays), strict=True):
             try:
@@ -362,7 +372,7 @@ def shapes(arguments: Sequence[Any]) -> str:
     return ", ".join(str(np.shape(a)) for a in arguments)
 
 
-def column_names(names: Sequence[str], sizes: Sequence[int]) -> tuple[str, ...]:
+def column_names(names: Sequence[str], sizes: Sequence[int]) -> Names:
     """Return a name for each number of a point, from the names and sizes of the inputs."""
     pairs = zip(names, sizes, strict=True)
     return tuple(f"{x}[{i}]" if k > 1 else x for x, k in pairs for i in range(k))
@@ -423,7 +433,7 @@ class CallSettings:
     retry_failed: bool = False  # whether points stored as failed, or NaN, are computed again
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # stated outputs; None takes those of the first run
-    columns: tuple[str, ...] = ()  # names of the numbers of a point
+    columns: Names = ()  # names of the numbers of a point
     takes_policy: bool = True  # whether the caller of the public function can pass on_failure
 
 
@@ -508,7 +518,7 @@ def _respond(
     event = () if settings.outputs is None else settings.outputs.event
     values = np.full((len(points), *event), np.nan)
     missing = np.arange(len(points))
-    failed: dict[int, str] = {}
+    failed = {}
     raised: dict[int, str] = {}
     if settings.store is not None:
         keys = points.keys()
@@ -559,7 +569,7 @@ def _verify_store(settings: CallSettings, store: Store, points: Points, tally: T
     if settings.retry_failed:  # a stored NaN is computed again in any case
         is_comparable &= ~is_missing(values)
     usable = np.flatnonzero(is_comparable)
-    reasons: dict[int, str] = {}
+    reasons = {}
 
     def compute(selected: Indices) -> Floats:
         again, raised = computed_again(settings, stored_points.at(usable[selected]), tally)
@@ -640,7 +650,7 @@ def revealing_rows(values: Floats) -> Indices:
 
 def finite_runs(values: Floats) -> Indices:
     """Return the rows of responses, (n,) or (n, m), all outputs of which are finite."""
-    return np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
+    return np.flatnonzero(complete_rows(by_output(values)))
 
 
 def tolerance_of(values: Floats, share: float = 0.0) -> Any:

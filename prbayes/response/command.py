@@ -18,7 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import StrPath, called, flag, folder_path, positive_number, unmasked
+from prbayes._validate import (
+    Names,
+    StrPath,
+    called,
+    flag,
+    folder_path,
+    positive_number,
+    unmasked,
+    wrong_value,
+)
 from prbayes.response.call import scalar
 from prbayes.response.outputs import relabelled
 
@@ -91,9 +100,8 @@ def command(
     array([4., 2.])
     """
     if not callable(read):
-        raise TypeError(
-            f"command: read: got {called(read)}, expected a function of the run's folder that "
-            "returns numbers"
+        raise wrong_value(
+            read, "command: read", "a function of the run's folder that returns numbers"
         )
     program = Program(
         arguments=_checked_arguments(arguments),
@@ -114,12 +122,13 @@ def command(
     return scalar(program)
 
 
-def _checked_arguments(arguments: object) -> tuple[str, ...]:
+def _checked_arguments(arguments: object) -> Names:
     """Return the path of the program, and its arguments."""
     if isinstance(arguments, str) or not isinstance(arguments, Sequence) or not arguments:
-        raise TypeError(
-            f"command: arguments: got {called(arguments)}, expected a list of the program and its "
-            'arguments, such as ["solver", "input.txt"]'
+        raise wrong_value(
+            arguments,
+            "command: arguments",
+            'a list of the program and its arguments, such as ["solver", "input.txt"]',
         )
     for argument in arguments:
         if not isinstance(argument, str | PathLike):
@@ -136,11 +145,12 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
     return (os.path.abspath(path), *rest)  # absolute, because it runs in another folder
 
 
-def _checked_names(inputs: object) -> tuple[str, ...]:
+def _checked_names(inputs: object) -> Names:
     if isinstance(inputs, str) or not isinstance(inputs, Sequence):
-        raise TypeError(
-            f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
-            'such as ["modulus", "force"]'
+        raise wrong_value(
+            inputs,
+            "command: inputs",
+            'a list of the simulator\'s inputs, such as ["modulus", "force"]',
         )
     for name in inputs:
         if not isinstance(name, str) or not name.isidentifier() or inputs.count(name) > 1:
@@ -153,10 +163,8 @@ def _checked_names(inputs: object) -> tuple[str, ...]:
 def _read_templates(write: object) -> dict[str, str]:
     """Return the texts of the templates by the name of their file."""
     if not isinstance(write, Mapping):
-        raise TypeError(
-            f"command: write: got {called(write)}, expected templates by the name of their file"
-        )
-    texts: dict[str, str] = {}
+        raise wrong_value(write, "command: write", "templates by the name of their file")
+    texts = {}
     for name, template in write.items():
         path = Path(name) if isinstance(name, str) else Path()
         if not path.parts or path.is_absolute() or ".." in path.parts:
@@ -178,8 +186,8 @@ def _read_templates(write: object) -> dict[str, str]:
 class Program:
     """A program as a function of one specimen's inputs."""
 
-    arguments: tuple[str, ...]
-    inputs: tuple[str, ...]
+    arguments: Names
+    inputs: Names
     templates: dict[str, str]  # templates of the files to write, by the name of the file
     read: Callable[[Path], Any]
     timeout: float | None

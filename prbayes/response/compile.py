@@ -46,7 +46,7 @@ def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
         return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
     if isinstance(op.scalar_op, Composite):  # PyTensor would loop over numbers in Python
         graph = op.scalar_op.fgraph
-        values: dict[Any, Any] = dict(zip(graph.inputs, terms, strict=True))
+        values = dict(zip(graph.inputs, terms, strict=True))
         for inner in graph.toposort():
             arguments = [values[x] if x in values else pt.constant(x.data) for x in inner.inputs]
             values[inner.outputs[0]] = Elemwise(inner.op)(*arguments)
@@ -141,7 +141,7 @@ def compiled(
     with _cache_lock:
         cached = None if key is None else _cache.get(key)
     if cached is None:
-        empty: dict[Any, Any] = {}
+        empty = {}
         for variable in shared if key is not None else ():
             shape = variable.type.shape
             values = np.zeros([size or 0 for size in shape], dtype=variable.dtype)
@@ -175,13 +175,13 @@ def _structure(
     Graphs with random numbers, operations outside PyTensor or many constants have no key (None).
     """
     number: dict[Variable, int] = {}
-    structure: list[Hashable] = [*options]
+    structure = [*options]
     n_bytes = 0  # size of all constants
     for variable in inputs:
         number.setdefault(variable, len(number))
         structure.append(variable.type)
     nodes = toposort(list(outputs), blockers=list(inputs))
-    operations: list[Any] = [(node.op, node.inputs, node.outputs) for node in nodes]
+    operations = [(node.op, node.inputs, node.outputs) for node in nodes]
     for op, arguments, results in [*operations, ("outputs", outputs, ())]:
         if isinstance(op, Op) and not _is_stateless(op):
             return None
@@ -216,7 +216,7 @@ def _is_stateless(op: Op) -> bool:
 
 def with_shared_arrays(graph: TensorVariable) -> TensorVariable:
     """Replace constant arrays by shared variables, so that other data give the same structure."""
-    arrays: dict[Any, Any] = {}
+    arrays = {}
     for variable in ancestors([graph]):
         if not isinstance(variable, TensorConstant):
             continue
@@ -235,7 +235,7 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
     """Replace PyMC's parameter checks by -inf, so that one invalid theta spoils no batch."""
     from pymc.logprob.utils import CheckParameterValue
 
-    switches: dict[Variable, Variable] = {}
+    switches = {}
     for v in ancestors(graphs):
         if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
             value, *conditions = v.owner.inputs
@@ -258,7 +258,7 @@ def expanded(graphs: list[TensorVariable]) -> list[TensorVariable]:
 
     PyTensor would loop over the rows of a batch of such an operation.
     """
-    parts: dict[Variable, Variable] = {}
+    parts = {}
     for v in ancestors(graphs):
         if v.owner is None or not isinstance(v.owner.op, OpFromGraph):
             continue
@@ -293,7 +293,7 @@ def vectorize_distributions(
     outputs: Sequence[TensorVariable], replace: Mapping[Any, Variable]
 ) -> list[Any]:
     """Vectorize a graph as PyTensor does, also distributions that PyMC makes of others."""
-    vectors: dict[Variable, Any] = dict(replace)
+    vectors = dict(replace)
     for node in toposort(outputs, blockers=list(replace)):
         batched = [vectors.get(v, v) for v in node.inputs]
         if all(old is new for old, new in zip(node.inputs, batched, strict=True)):

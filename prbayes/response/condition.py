@@ -174,7 +174,7 @@ def known_covariates(
 
     With frequencies, ``rows`` is the row of the observed values that each specimen comes from.
     """
-    result: NamedArrays = {}
+    result = {}
     for variable in covariates:
         label = str(variable.name)
         values = np.array(variable.owner.op.values)

@@ -14,11 +14,11 @@ from prbayes._finding import Finding, Findings
 from prbayes._validate import (
     Floats,
     Function,
-    called,
     number,
     positive_number,
     real_array,
     unmasked,
+    wrong_value,
 )
 from prbayes.response.call import scalar, unwrapped
 from prbayes.response.outputs import relabelled
@@ -195,9 +195,10 @@ class ModelDiscrepancy(ABC):
                 "conditions, such as [20.0, 1000.0]"
             )
         if shape is not None and not callable(shape) and not isinstance(shape, Smooth):
-            raise TypeError(
-                f"{label}: shape: got {called(shape)}, expected a function of the condition, such "
-                "as np.log, or prb.response.Smooth(zero_at=0.0)"
+            raise wrong_value(
+                shape,
+                f"{label}: shape",
+                "a function of the condition, such as np.log, or prb.response.Smooth(zero_at=0.0)",
             )
         self.low = float(conditions.min())
         self.high = float(conditions.max())
@@ -286,9 +287,7 @@ class ModelDiscrepancy(ABC):
         """
         label = f"prb.response.{type(self).__name__}.of"
         if not callable(response) or isinstance(response, type):
-            raise TypeError(
-                f"{label}: response: got {called(response)}, expected a function of the inputs"
-            )
+            raise wrong_value(response, f"{label}: response", "a function of the inputs")
         at = real_array(condition, f"{label}: condition")
         if at.ndim > 1 or np.isinf(at).any() or np.isnan(at).all():
             raise ValueError(

@@ -20,7 +20,7 @@ from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import Floats
+from prbayes._validate import Arrays, Floats
 from prbayes.response.compile import (
     PLAIN,
     compile_batched,
@@ -48,7 +48,7 @@ def log_density(
 
     ``instead`` has functions that replace the log-density of inputs at some positions.
     """
-    total: Any = 0.0
+    total = 0.0
     triples = zip(aleatory, values, inputs.event_shapes, strict=True)
     for i, (dist, x, shape) in enumerate(triples):
         if i in inputs.conditions:
@@ -87,7 +87,7 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     for i in range(size):
         sum_before = sum(root[i][j] * z[j] for j in range(i))
         z.append((x[..., i] - mean[..., i] - sum_before) / root[i][i])
-    logp: Any = 0
+    logp = 0
     if freedom:
         (nu,) = freedom
         power = (nu + size) / 2
@@ -121,7 +121,7 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
     return rows
 
 
-def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
+def refuse_lopsided(name: str, inputs: Inputs, params: Arrays) -> None:
     """Raise if a covariance is not symmetric, at values of the parents, (k, *shape)."""
     # Densities and draws would read one triangle of the matrix and ignore the other.
     symbols = inputs.placeholders()
@@ -149,7 +149,7 @@ def fixed_ends(dist: TensorVariable) -> tuple[Floats, Floats, bool]:
     """
     transform = _default_transform(dist.owner.op, dist)
     kind = "" if transform is None else transform.name
-    ends: tuple[Any, ...] = (None, None)
+    ends = (None, None)
     if kind == "interval":
         ends = transform.args_fn(*dist.owner.inputs)
     elif kind in ("log", "logodds"):
@@ -376,7 +376,7 @@ class PopulationSampler:
         # Draw n specimens for each theta. Distributions that depend on no parent do not get these
         # axes from their parameters, and are resized.
         size = (batched[0].shape[0], n)
-        per_specimen: dict[Variable, Variable] = {}
+        per_specimen = {}
         for symbol, batch in zip(symbols, batched, strict=True):
             if symbol in covariates:
                 per_specimen[symbol] = batch

@@ -234,7 +234,7 @@ class Pool:
             return
         # The standard library and loky store the arguments of their constructors as attributes.
         parameters = signature(kind).parameters
-        arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
+        arguments = {"max_workers": getattr(self.original, "_max_workers", None)}
         for attribute in ("_mp_context", "_context", "_initializer", "_initargs"):
             value = getattr(self.original, attribute, None)
             if attribute[1:] in parameters and value is not None:

@@ -6,7 +6,7 @@ from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
-from prbayes._validate import Floats, called, flag, positive_integer
+from prbayes._validate import Floats, flag, positive_integer, wrong_value
 
 
 class ResponseError(RuntimeError):
@@ -89,7 +89,7 @@ class Replace(OnFailure):
     def __post_init__(self) -> None:
         number = isinstance(self.value, int | float | np.number)
         if isinstance(self.value, bool | complex) or not number:
-            raise TypeError(f"Replace: value: got {called(self.value)}, expected a number")
+            raise wrong_value(self.value, "Replace: value", "a number")
         if np.isneginf(self.value):
             raise ValueError(
                 "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "

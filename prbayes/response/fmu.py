@@ -39,6 +39,7 @@ from prbayes._validate import (
     flag,
     positive_number,
     real_array,
+    wrong_value,
 )
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
@@ -169,7 +170,7 @@ def fmu(
 
 def _names(argument: str, value: object) -> dict[str, str]:
     """Return variables of the unit by the user's names, which in a list are the same."""
-    pairs: list[tuple[Any, Any]] = []
+    pairs = []
     expected = 'a list of the unit\'s variables, each once, such as ["stiffness", "damping"]'
     if isinstance(value, Mapping) and argument == "outputs":
         pairs = list(value.items())
@@ -178,7 +179,7 @@ def _names(argument: str, value: object) -> dict[str, str]:
         pairs = [(name, name) for name in value]
     are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
     if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
-        raise TypeError(f"fmu: {argument}: got {called(value)}, expected {expected}")
+        raise wrong_value(value, f"fmu: {argument}", expected)
     return dict(pairs)
 
 
@@ -186,9 +187,10 @@ def _parameter_values(parameters: object) -> dict[str, Value]:
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
-        raise TypeError(
-            f"fmu: parameters: got {called(parameters)}, expected a mapping of the unit's "
-            'variables to their values, such as {"mass.m": 2.0}'
+        raise wrong_value(
+            parameters,
+            "fmu: parameters",
+            'a mapping of the unit\'s variables to their values, such as {"mass.m": 2.0}',
         )
     values = {name: v.item() if isinstance(v, np.generic) else v for name, v in parameters.items()}
     for name, value in values.items():

@@ -24,6 +24,7 @@ from prbayes._validate import (
     Indices,
     Labels,
     Shape,
+    flat_rows,
     plain_text,
     real_array,
 )
@@ -87,7 +88,7 @@ class Inputs:
 
     def parents_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
         """Return the model variables on which the arguments at some positions depend."""
-        ends: set[Variable] = set(self.parents)
+        ends = set(self.parents)
         parents: dict[TensorVariable, None] = {}
         for position in positions:
             x = self.sources[position]
@@ -110,7 +111,7 @@ class Inputs:
         symbols = [r.type() for r in self.parents]
         values = dict(zip(symbols, map(pt.as_tensor, params), strict=True))
         vectors = {s: v for s, v in values.items() if v.type.ndim > s.type.ndim}
-        new: Any = [*self.aleatory, *self.epistemic]
+        new = [*self.aleatory, *self.epistemic]
         new = graph_replace(new, dict(zip(self.parents, symbols, strict=True)), strict=False)
         if vectors:
             new = vectorize_distributions(new, vectors)
@@ -127,7 +128,7 @@ class Inputs:
         Covariates, (k,) or (k, m), are repeated cyclically to (k, n).
         """
         return [
-            p.reshape(len(p), -1)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
+            flat_rows(p)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
             for r, p in zip(self.parents, params, strict=True)
         ]
 
@@ -175,10 +176,10 @@ def read_inputs(
     are the variables of its original, on which inputs may depend as well.
     """
     tensors = {v: values_of(v) for v in (*model.basic_RVs, *originals)}
-    model_variables: set[Variable] = {*tensors, *tensors.values()}
-    arguments: list[Any] = []
-    aleatory: list[TensorVariable] = []
-    parents: dict[TensorVariable, None] = {}
+    model_variables = {*tensors, *tensors.values()}
+    arguments = []
+    aleatory = []
+    parents = {}
     is_nested = False
     for i, argument in enumerate(inputs):
         label = f"{name}: input {i + 1}"
@@ -321,7 +322,7 @@ def event_shape(dist: TensorVariable) -> Shape:
 
 def argument_names(inputs: Inputs, function: Function) -> list[str]:
     """Return a name for each input: that of its variable, or of the response's argument."""
-    inner: Any = getattr(function, "function", function)  # the function inside prb.scalar
+    inner = getattr(function, "function", function)  # the function inside prb.scalar
     declared = getattr(inner, "inputs", ())  # programs and units declare their inputs
     arguments = [x if isinstance(x, str) else getattr(x, "name", "") for x in declared]
     if not all(arguments) or len(arguments) != len(inputs.arguments):

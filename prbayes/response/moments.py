@@ -11,7 +11,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from scipy.special import ndtr
 
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Arrays, Floats, finite_or_nan
 from prbayes.response.compile import PLAIN, compile_batched, interpreted
 from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, quantiles
@@ -56,7 +56,7 @@ class InputMoments:
             outputs = [quantiles(label, dist, columns)]
         return compile_batched(symbols, outputs, extra=[u])
 
-    def numbers(self, parents: Sequence[Floats]) -> Floats:
+    def numbers(self, parents: Arrays) -> Floats:
         """Return mean, sd, quantiles, and correlations with earlier elements, (k, q, elements)."""
         k = len(parents[0]) if parents else 1
         n = self.n_drawn if self._inverse is None else self.z.size + self.levels.size
@@ -67,7 +67,7 @@ class InputMoments:
             parts.append(self._drawn(chunk) if self._inverse is None else self._exact(chunk))
         return np.concatenate(parts)
 
-    def _exact(self, parents: Sequence[Floats]) -> Floats:
+    def _exact(self, parents: Arrays) -> Floats:
         """Return the numbers from inverse distribution functions."""
         values = [
             p[:, 0] if is_condition(r) else p
@@ -101,7 +101,7 @@ class InputMoments:
             correlation = c / (scale[:, :, None] * scale[:, None])
         return self._stacked(moments, levels, correlation)
 
-    def _drawn(self, parents: Sequence[Floats]) -> Floats:
+    def _drawn(self, parents: Arrays) -> Floats:
         """Return the numbers estimated from random draws."""
         (dist,) = self.inputs.aleatory
         if self._sampler is None:
@@ -121,13 +121,11 @@ class InputMoments:
             correlation = np.swapaxes(z, 1, 2) @ z / self.n_drawn
         return self._stacked([mean, sd], levels, correlation)
 
-    def _stacked(
-        self, moments: Sequence[Floats], levels: Floats, correlation: Floats | None
-    ) -> Floats:
+    def _stacked(self, moments: Arrays, levels: Floats, correlation: Floats | None) -> Floats:
         """Return all numbers, (k, q, elements); NaN for populations that do not exist."""
         numbers = np.concatenate([np.stack(moments, axis=1), levels], axis=1)
         if correlation is not None:
             below = np.tril(np.ones(correlation.shape[1:], dtype=bool), -1)
             rows = np.where(below, correlation, np.nan)  # a column for each earlier element
             numbers = np.concatenate([numbers, np.swapaxes(rows, 1, 2)[:, :-1]], axis=1)
-        return np.where(np.isfinite(numbers), numbers, np.nan)
+        return finite_or_nan(numbers)

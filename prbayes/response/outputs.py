@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Bools, Floats, Indices, Shape, first_text, real_array, unmasked
+from prbayes._validate import (
+    Bools,
+    Floats,
+    Indices,
+    NamedValues,
+    Names,
+    Shape,
+    first_text,
+    real_array,
+    unmasked,
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +32,7 @@ class Outputs:
     # Keys of a response that returns a mapping, with the number of outputs of each key; None is one
     # number without an axis. Outputs without names have no keys.
     keys: tuple[tuple[str, int | None], ...] = ()
-    units: tuple[str, ...] = ()  # unit of each output, or of the one number; empty if unknown
+    units: Names = ()  # unit of each output, or of the one number; empty if unknown
 
     @property
     def event(self) -> Shape:
@@ -57,7 +67,7 @@ class Outputs:
             start = stop
         return arrays
 
-    def assembled(self, result: Mapping[str, Any]) -> Any:
+    def assembled(self, result: NamedValues) -> Any:
         """Concatenate a mapping's arrays along the last axis; raise KeyError for other keys."""
         if not self.keys:
             raise KeyError(
@@ -190,7 +200,7 @@ def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
             return None
         dim = str(result.dims[axis]) if hasattr(result, "dims") else "output"
         return Outputs(labels, dim, _keys_of(labels))
-    keys: list[tuple[str, int | None]] = []
+    keys = []
     for key, column in result.items():
         array = np.asarray(column)
         keys.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
@@ -253,7 +263,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     return values, Outputs(units=unit) if unit else SINGLE_OUTPUT
 
 
-def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
+def _units_in(observed: Any, labels: Sequence[Any]) -> Names:
     """Return the unit of each output, from the attributes of a labelled array.
 
     A text is the unit of all outputs. A mapping has units by label, a list in the order of outputs.
@@ -270,7 +280,7 @@ def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
 def _labelled_columns(observed: Any, m: int) -> Outputs:
     """Return the outputs of an array, DataFrame or DataArray of m columns."""
     labels: tuple[Any, ...] = tuple(range(m))
-    units: tuple[str, ...] = ()
+    units: Names = ()
     dim = "output"
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])
@@ -312,7 +322,7 @@ def refuse_other_order(values: Any, observed: Any, name: str) -> None:
     """Raise a ValueError if a labelled array has specimens or outputs in another order."""
     is_table = np.ndim(values) > 1
     labels = labels_along(values, 1 if is_table else 0)
-    outputs: tuple[Any, ...] = ()
+    outputs = ()
     if isinstance(observed, Mapping) or hasattr(observed, "columns"):
         outputs = tuple(observed)
     elif np.ndim(observed) > 1 and hasattr(observed, "coords"):

@@ -18,7 +18,16 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
-from prbayes._validate import Floats, Function, Indices, Shape, called, executes, folder_path
+from prbayes._validate import (
+    Arrays,
+    Floats,
+    Function,
+    Indices,
+    Shape,
+    executes,
+    folder_path,
+    wrong_value,
+)
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
@@ -66,9 +75,10 @@ def refuse_uncallable(
     ``order`` is that of the arguments of the function that was called.
     """
     if not callable(function) or isinstance(function, type):
-        raise TypeError(
-            f"{name}: {argument}: got {called(function)}, expected a function of the inputs, such "
-            f"as lambda x: x**2; the order is {order}"
+        raise wrong_value(
+            function,
+            f"{name}: {argument}",
+            f"a function of the inputs, such as lambda x: x**2; the order is {order}",
         )
 
 
@@ -76,7 +86,7 @@ def refuse_misfit(
     name: str, function: Any, sizes: Sequence[int], outputs: Outputs | None = None
 ) -> None:
     """Raise if a function takes other arguments than inputs of these sizes, or other outputs."""
-    inner: Any = unwrapped(function)
+    inner = unwrapped(function)
     try:
         # The signature of a decorated function is that of its wrapper, which is what is called.
         signature = inspect.signature(inner, follow_wrapped=False)
@@ -108,14 +118,16 @@ def check_call_settings(
     if store is not None:
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
-        raise TypeError(
-            f"version: got {called(version)}, expected a text that names the response as it is, "
-            "such as '2' or 'mesh 3, solver 1.4'"
+        raise wrong_value(
+            version,
+            "version",
+            "a text that names the response as it is, such as '2' or 'mesh 3, solver 1.4'",
         )
     if not isinstance(on_failure, OnFailure):
-        raise TypeError(
-            f"on_failure: got {called(on_failure)}, expected prb.response.Abort(), "
-            "prb.response.Replace() or prb.response.Retry()"
+        raise wrong_value(
+            on_failure,
+            "on_failure",
+            "prb.response.Abort(), prb.response.Replace() or prb.response.Retry()",
         )
 
 
@@ -137,7 +149,7 @@ class StoredRuns:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "last": None, "is_repeated": False}
 
-    def at(self, points: Sequence[Floats]) -> Floats | None:
+    def at(self, points: Arrays) -> Floats | None:
         """Return the responses of a stored batch, (n,) or (n, m), None if it is not stored."""
         for stored_points, values in self.stored:
             if _equal(stored_points, points):
@@ -277,7 +289,7 @@ class Responses:
             for x, y in zip(sources, other_sources, strict=True)
         )
 
-    def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
+    def __call__(self, aleatory: Arrays, epistemic: Arrays) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         batch, full = broadcast_batch(values, self.inputs.event_ndims)
@@ -339,7 +351,7 @@ class Responses:
                 self.runs.version = self.watched.version
             yield
 
-    def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
+    def refuse_change(self, points: Arrays, values: Floats, stored: Responses) -> None:
         """Raise if stored runs differ when a part of them is computed again.
 
         ``points`` are those of this response's aleatory inputs, ``values`` their runs, (n,) or
@@ -389,7 +401,7 @@ class Responses:
         self.count += size
         self._n_reused += size
 
-    def _points(self, full: Sequence[Floats], batch: Shape) -> Points:
+    def _points(self, full: Arrays, batch: Shape) -> Points:
         """Return the points of a batch, each a row, from values of all inputs."""
         n = math.prod(batch)
         k = len(self.inputs.aleatory)
@@ -397,7 +409,7 @@ class Responses:
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
         return Points(self.inputs.fill(rows[:k], rows[k:]), varying)
 
-    def _called(self, values: Sequence[Floats], batch: Shape, *, is_run: bool = True) -> Floats:
+    def _called(self, values: Arrays, batch: Shape, *, is_run: bool = True) -> Floats:
         """Call the function once for a batch of any shape."""
         k = len(self.inputs.aleatory)
         arguments = self.inputs.fill(values[:k], values[k:])
@@ -419,7 +431,7 @@ class Responses:
             raise ResponseError(f"{self.name}: {error}") from None
         return responses
 
-    def _again(self, values: Sequence[Floats], rows: Indices) -> Floats:
+    def _again(self, values: Arrays, rows: Indices) -> Floats:
         """Compute some specimens, (n, *event) by input, again; NaN where the response raises.
 
         The calls are not counted as runs, and are not stored.
@@ -433,7 +445,7 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(selected, batch), self._tally.copied())[0]
 
-    def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
+    def _refuse_state(self, specimens: Arrays, values: Floats) -> None:
         """Raise if one of a few specimens differs when it is computed again, by itself.
 
         They are the last one, on which a state that passes from specimen to specimen has the most
@@ -497,7 +509,7 @@ class Responses:
                 "state from one specimen to the next, or write it for one specimen, in prb.scalar"
             )
 
-    def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
+    def _refuse_late_change(self, specimens: Arrays, values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
         is_unchanged = written_form(self.function) == self._written_form
         is_random = self.scatter is None or self.repeats > 1
@@ -522,7 +534,7 @@ class Responses:
             )
 
 
-def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int) -> str:
+def _place_of_specimen(responses: Responses, points: Arrays, row: int) -> str:
     """Return the aleatory inputs of a specimen as a text, with their names."""
     inputs = responses.inputs
     sizes = [math.prod(shape) for shape in inputs.event_shapes]
@@ -530,9 +542,7 @@ def _place_of_specimen(responses: Responses, points: Sequence[Floats], row: int)
     return f"at {named_numbers(names, np.concatenate([np.ravel(x[row]) for x in points]))}"
 
 
-def _refuse_one_size(
-    responses: Responses, specimens: Sequence[Floats], error: ResponseError
-) -> None:
+def _refuse_one_size(responses: Responses, specimens: Arrays, error: ResponseError) -> None:
     """Raise if the response takes no other number of specimens than that of its batch.
 
     Such a response contains an array with a value for each specimen, whose values would be
@@ -549,7 +559,7 @@ def _refuse_one_size(
         ) from None
 
 
-def _refuse_other_times(responses: Responses, specimens: Sequence[Floats], values: Floats) -> None:
+def _refuse_other_times(responses: Responses, specimens: Arrays, values: Floats) -> None:
     """Raise if outputs of the last specimen change where the times of other outputs do.
 
     Every second time, the last one among them, moves halfway to the time before it.
@@ -605,13 +615,13 @@ def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, ta
         )
 
 
-def _equal(first: Sequence[Floats], second: Sequence[Floats]) -> bool:
+def _equal(first: Arrays, second: Arrays) -> bool:
     pairs = zip(first, second, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def deduplicated_responses(
-    responses: Responses, points: Sequence[Floats], stored: tuple[Sequence[Floats], Floats] | None
+    responses: Responses, points: Arrays, stored: tuple[Arrays, Floats] | None
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m); equal points are computed once.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._validate import Function, Shape, called, positive_integer
+from prbayes._validate import Function, Shape, positive_integer, wrong_value
 from prbayes.response.call import scalar
 from prbayes.response.response import refuse_misfit
 
@@ -26,7 +26,8 @@ class Stochastic:
 
     the density :math:`p(y \mid x)` is that of an emulator of the mean, of the spread, and of the
     density of the residuals, which may be skewed, and correlated between outputs. The error of the
-    emulator by finitely many runs widens the posterior.
+    emulator by finitely many runs widens the posterior. A metric of distributions compares the
+    readings with the runs themselves, under `Reweighted` or `Fresh`, and needs no repeats.
 
     Parameters
     ----------
@@ -79,9 +80,7 @@ class Stochastic:
                 "it; write prb.scalar(prb.response.Stochastic(f)), with f = response.function"
             )
         if not callable(function) or isinstance(function, type):
-            raise TypeError(
-                f"{label}: function: got {called(function)}, expected a function of the inputs"
-            )
+            raise wrong_value(function, f"{label}: function", "a function of the inputs")
         if isinstance(function, Stochastic):
             raise TypeError(f"{label}: function: got a Stochastic, expected a plain function")
         self.function = function

@@ -25,7 +25,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import FORMAT, Bools, Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import (
+    FORMAT,
+    Bools,
+    Floats,
+    plain_text,
+    positive_integer,
+    stated_path,
+)
 
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
@@ -265,7 +272,7 @@ class Store:
 
     def close(self) -> None:
         """Close the file in this thread; it is opened again when it is needed."""
-        session: _Session | None = getattr(self._local, "session", None)
+        session = getattr(self._local, "session", None)
         if session is not None:
             session.close()
             del self._local.session
@@ -282,7 +289,7 @@ class Store:
 
     def _read(self) -> _Session:
         """Return the session of this thread with all runs that are in the file."""
-        session: _Session | None = getattr(self._local, "session", None)
+        session = getattr(self._local, "session", None)
         with self._explained():
             # A session from before a fork, or of a file that was replaced, is closed before the
             # file is opened, because closing deletes the log of writes by its name.
@@ -471,7 +478,7 @@ def _part_of(path: Path) -> Path:
 
 def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
     """Write all files completely, or change none of them and raise an `OSError`."""
-    parts: dict[Path, Path] = {}
+    parts = {}
     try:
         for path, content in contents.items():
             if path.exists() and not path.is_file():

@@ -22,7 +22,7 @@ from urllib3.connection import HTTPConnection
 from urllib3.exceptions import HTTPError, LocationParseError, ProtocolError, ReadTimeoutError
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, called, plain_text, positive_number
+from prbayes._validate import Floats, plain_text, positive_number, wrong_value
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
 
@@ -199,9 +199,11 @@ def _plain_config(config: object) -> Any:
             return json.loads(json.dumps(dict(config or {})))
         except (TypeError, ValueError) as error:
             reason = f" ({error})"
-    raise TypeError(
-        f"umbridge: config: got {called(config)}, expected a mapping of settings to values that "
-        f'can be written as JSON, such as {{"level": 2}}: texts, numbers, lists{reason}'
+    raise wrong_value(
+        config,
+        "umbridge: config",
+        "a mapping of settings to values that "
+        f'can be written as JSON, such as {{"level": 2}}: texts, numbers, lists{reason}',
     )
 
 

@@ -45,7 +45,7 @@ def digests_of(function: object, most: int = 10_000) -> dict[str, str]:
     """
     hashes: dict[str, Any] = {}
     opened: dict[int, tuple[str, Any]] = {}  # objects with their variables; kept, so that ids stay
-    waiting: deque[tuple[str, Any]] = deque([("", function)])
+    waiting = deque([("", function)])
     while waiting and len(opened) < most:
         path, value = waiting.popleft()
         token, parts = "object", []
@@ -168,9 +168,7 @@ def _opened_function(function: FunctionType) -> Opened:
     # Variables of the closure, global ones, then those of modules, which the code names as
     # attributes.
     variables = {**function.__globals__, **modules, **closure}
-    spaces: list[tuple[Iterable[str], Mapping[str, Any]]] = [
-        ([*closure, *read, *modules], variables)
-    ]
+    spaces = [([*closure, *read, *modules], variables)]
     for of_code, space in spaces:
         for variable in [x for x in of_code if x in space]:
             value = space[variable]
@@ -184,8 +182,8 @@ def _opened_function(function: FunctionType) -> Opened:
 @lru_cache(maxsize=1024)
 def _names_of(code: CodeType) -> tuple[list[str], list[str], list[str]]:
     """Return names of global variables, of imported modules, and all names in code."""
-    read: list[str] = []
-    imported: list[str] = []
+    read = []
+    imported = []
     names = list(code.co_names)
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):

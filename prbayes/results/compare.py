@@ -13,9 +13,16 @@ import xarray as xr
 from scipy.special import ndtri
 
 from prbayes._display import Table, View
-from prbayes._finding import Finding, as_json, from_json, report
+from prbayes._finding import Finding, as_json, report, sentences_of
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, NamedArrays, called, wrong_type
+from prbayes._validate import (
+    ArraysByName,
+    Floats,
+    NamedArrays,
+    NamedValues,
+    wrong_type,
+    wrong_value,
+)
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
@@ -162,7 +169,7 @@ def compare(
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-def _epsilon_findings(results: Mapping[str, Any], model: pm.Model | None) -> list[Finding]:
+def _epsilon_findings(results: NamedValues, model: pm.Model | None) -> list[Finding]:
     """Return findings of draws whose width is that of epsilon, with the labels of the results."""
     return [
         replace(finding, text=f"{label}: {finding.text}")
@@ -176,17 +183,13 @@ def _refuse_wrong_arguments(results: Any, metrics: Any) -> None:
     for result in (results, *results.values()) if isinstance(results, Mapping) else [results]:
         refuse_model(result, "compare: results")
     if not isinstance(results, Mapping):
-        raise TypeError(
-            f"compare: results: got {called(results)}, expected a mapping such as "
-            "{'optimum': optimum, 'ABC': idata}"
+        raise wrong_value(
+            results, "compare: results", "a mapping such as {'optimum': optimum, 'ABC': idata}"
         )
     if metrics is not None and not (
         isinstance(metrics, Sequence) and all(isinstance(m, Metric) for m in metrics)
     ):
-        raise TypeError(
-            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
-            "[prb.AreaMetric()]"
-        )
+        raise wrong_value(metrics, "compare: metrics", "metric objects, such as [prb.AreaMetric()]")
     if not results:
         raise ValueError(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
@@ -234,7 +237,7 @@ class Comparison(Table):
                 estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
                 shift = f"{float(row['shift']) + 0.0:.2f}"  # The sum turns -0.0 into 0.0.
                 rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}", shift])
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         for key, scores in scores_in(self).items():
             items = scores.to_series().items()
             listed = ", ".join(f"{label} {score:.4g}" for label, score in items)
@@ -289,7 +292,7 @@ def estimates_of(
     return estimates, optimum_elements(point, stderr)
 
 
-def thetas_at(evaluator: Evaluator, elements: Mapping[str, Floats]) -> Floats:
+def thetas_at(evaluator: Evaluator, elements: ArraysByName) -> Floats:
     """Return thetas, (n, d), from elements of the free variables by name, (n,) or (1,) each.
 
     Raises a KeyError if an element is missing.

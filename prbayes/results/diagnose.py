@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import View, view, without_constructor
 from prbayes._finding import Finding, Findings, counted, from_json
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats, NamedArrays, wrong_type
+from prbayes._validate import Floats, NamedArrays, Names, wrong_type
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
@@ -114,7 +114,7 @@ class Diagnosis:
     findings: Findings
     support: xr.Dataset = field(repr=False)
     remarks: Findings = ()
-    untested: tuple[str, ...] = ()
+    untested: Names = ()
     products: Mapping[str, Diagnosis] = field(default_factory=dict)
 
     @classmethod
@@ -267,7 +267,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
         by_specimen = not evaluator.nodes
         every_draw = tree["posterior"].sizes["chain"] * tree["posterior"].sizes["draw"]
         thetas = thetas_of(tree, evaluator, every_draw, "prb.diagnose")
-    coverage: _Coverage = {}
+    coverage = {}
     if has_draws and calibration:
         coverage = _stored_coverage(calibration)
     elif evaluator is not None and thetas is not None:
@@ -577,7 +577,7 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
 
 def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     """Return a statistic of ArviZ by element, such as 'mu[1]', without those that never vary."""
-    stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
+    stats = import_module("arviz_stats")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # A variable may never move.
         values = getattr(stats, statistic)(posterior)
     elements = single_elements(values.data_vars)

@@ -244,7 +244,7 @@ def is_log_normal(x: Any) -> bool:
 
 def _shrinkage(values: Floats, population: Floats, *, is_log: bool) -> Floats:
     """Return one minus the spread of the specimens' means over that of the population, (*event)."""
-    scale: Any = np.log if is_log else np.positive
+    scale = np.log if is_log else np.positive
     within = scale(population).std(axis=1).mean(axis=0)
     return np.asarray(1 - scale(values).mean(axis=0).std(axis=0) / within)
 

@@ -16,7 +16,7 @@ from scipy.special import softmax
 
 from prbayes._finding import Finding, Findings, counted
 from prbayes._stats import positive_scale
-from prbayes._validate import Floats
+from prbayes._validate import ArrayPair, Arrays, Floats, Names, complete_rows
 from prbayes.emulators.runs import Runs, outlier_advice
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
@@ -69,7 +69,7 @@ class Checked:
 
     findings: Findings = ()
     remarks: Findings = ()  # results of tests that found nothing, with their power
-    untested: tuple[str, ...] = ()  # sentences on tests that were not run, with the reason
+    untested: Names = ()  # sentences on tests that were not run, with the reason
 
     def __add__(self, second: Checked) -> Checked:
         """Return the reports of both checks together."""
@@ -183,7 +183,7 @@ def check_population(optimum: Optimum) -> Checked:
 
 
 def reported_tests(
-    optimum: Optimum, samples: Sequence[tuple[Floats, Floats]], null: Sequence[Sequence[Floats]]
+    optimum: Optimum, samples: Sequence[ArrayPair], null: Sequence[Arrays]
 ) -> Checked:
     """Return what tests of the population say of each likelihood.
 
@@ -258,7 +258,7 @@ def scored_specimens(
     scores: Sequence[tuple[Any, Any]],
     theta: Floats,
     data: Sequence[tuple[list[Floats], Floats]],
-) -> list[tuple[Floats, Floats]]:
+) -> list[ArrayPair]:
     """Return normal scores (N, K, d) and posterior weights (N, K) of points, by likelihood.
 
     Conditions of the specimens have no score.
@@ -344,7 +344,7 @@ def influence(result: xr.DataTree) -> Findings:
     """Report specimens on which the posterior depends, by Pareto k of leave-one-out."""
     if "log_likelihood" not in result.children:
         return ()
-    stats: Any = import_module("arviz_stats")
+    stats = import_module("arviz_stats")
     findings = []
     for name, values in result["log_likelihood"].to_dataset().data_vars.items():
         if values.ndim != 3 or values.shape[-1] < 2:
@@ -396,7 +396,7 @@ def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
         return Checked(remarks=(Finding("prior-agrees", text),))
     prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
-    if np.isfinite(predictive).all(axis=1).mean() < 0.5:
+    if complete_rows(predictive).mean() < 0.5:
         reason = "the information of most populations of the prior is not finite"
         return _not_tested(_CONFLICT, reason)
     findings = conflict_findings(names, prior, optimum.theta, errors, mean, predictive)

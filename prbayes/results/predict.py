@@ -15,16 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._display import ShownArray, View
-from prbayes._finding import Finding, Findings, as_json, counted, from_json, report
+from prbayes._finding import Finding, Findings, as_json, counted, report, sentences_of
 from prbayes._progress import shown
 from prbayes._stats import positive_scale, reached
 from prbayes._validate import (
+    ArraysByName,
     Floats,
     Function,
     Indices,
     NamedArrays,
+    NamedValues,
     Seed,
     StrPath,
+    complete_rows,
     finite_number,
     flag,
     plain_text,
@@ -36,7 +39,6 @@ from prbayes.emulators.runs import Runs
 from prbayes.model.conditions import at_conditions, stacked_values
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
-    EmulatedResponse,
     PopulationSimulator,
     emulator_of,
     population_simulators,
@@ -281,7 +283,7 @@ class Prediction(ShownArray, xr.DataArray):
             f"Predicted {self.name}: {size} specimens of each of {populations}, "
             f"from {self.attrs['source']}"
         )
-        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        sentences = sentences_of(self.attrs)
         failed = float(np.mean(np.isposinf(values)))
         if failed:
             sentences.append(
@@ -313,7 +315,7 @@ def covariate_values(
     label: str,
     inputs: Inputs,
     at: Mapping[str, float] | None,
-    stated: Mapping[str, Floats],
+    stated: ArraysByName,
     size: int,
     *,
     has_runs: bool,
@@ -383,7 +385,7 @@ def call_settings(executor: Any, store: Any, version: Any) -> dict[str, Any]:
     return {"executor": executor, "store": store, "version": version}
 
 
-def named_response(response: Any, calling: Mapping[str, Any], advice: str) -> str:
+def named_response(response: Any, calling: NamedValues, advice: str) -> str:
     """Return the name of a response; raise if a store needs its name, and it has none."""
     inner = getattr(response, "function", response)  # `scalar` wraps a function.
     name = str(getattr(inner, "__name__", type(inner).__name__))
@@ -529,8 +531,8 @@ def _predicted(
     Specimens of a data set have known conditions, (n, C).
     """
     inputs = responses.inputs
-    results: list[_Predicted] = []
-    emulated: EmulatedResponse | None = None
+    results = []
+    emulated = None
     for group_points in points_by_group(inputs, points):
         if isinstance(simulator, Node):
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
@@ -639,7 +641,7 @@ def _checked_responses(
         findings = report(Finding("missing-predictions", text))
     if error is not None:
         flat = values.reshape(-1, error.size)
-        is_finite = np.isfinite(flat).all(axis=1)
+        is_finite = complete_rows(flat)
         spread = np.full(error.shape, np.nan)
         if is_finite.any():
             # Quartiles as well, because few specimens beside a pole have most of the variance.
@@ -798,7 +800,7 @@ def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> d
 
     The data are those of the result if it has them, and else those of the model.
     """
-    stored: Any = {}
+    stored = {}
     if isinstance(result, xr.DataTree) and "observed_data" in result:
         stored = one_posterior(result, "prb.predict")["observed_data"]
     is_optimum = isinstance(result, Optimum)

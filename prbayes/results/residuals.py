@@ -11,7 +11,15 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import Tree, View
-from prbayes._validate import Floats, Indices, NamedArrays, Seed, positive_integer, seed_number
+from prbayes._validate import (
+    Floats,
+    Indices,
+    NamedArrays,
+    Names,
+    Seed,
+    positive_integer,
+    seed_number,
+)
 from prbayes.model.locking import locked
 from prbayes.model.measurement import (
     Measurement,
@@ -102,7 +110,7 @@ def residuals(
     result, model, likelihoods = individuals_of(result, model, "prb.residuals")
     points, _ = populations_of(result, model, n_draws, "prb.residuals", copies=n_draws)
     rng = np.random.default_rng(None if random_seed is None else seed_number(random_seed))
-    datasets: dict[str, xr.Dataset] = {}
+    datasets = {}
     for likelihood in likelihoods:
         linear = _Linearisation.of(likelihood, points, rng)
         parts = [
@@ -219,7 +227,7 @@ class _Linearisation:
             width = 2 * steps[:, j : j + 1]
             columns.append((above - below) / width)
         labels = aleatory_names(likelihood.inputs, likelihood.measurements[0].responses.function)
-        names: list[str] = []
+        names = []
         for k in unknown:
             indices = list(np.ndindex(*shapes[k]))
             names += [
@@ -307,7 +315,7 @@ def _labelled_residuals(
     """Return the residuals of one simulator with labels of specimens and outputs."""
     labels = np.arange(len(m.observed)) if m.specimens is None else np.asarray(m.specimens)
     coords: dict[str, Any] = {"specimen": labels, "input": linear.names}
-    dims: tuple[str, ...] = ("specimen",)
+    dims: Names = ("specimen",)
     if m.event:
         dims = ("specimen", m.outputs.dim)
         coords[m.outputs.dim] = list(m.outputs.labels)

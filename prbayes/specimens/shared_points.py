@@ -49,7 +49,7 @@ class RandomRunOptions:
     # choose between emulators that the runs do not distinguish.
     least_draws: float = 6.0
     points: int = 256  # number of points to begin with
-    most_points: int = 4096
+    most_points: int = 2**14
     reach: float = 3.5  # half the width of the region of runs, in standard deviations
     level: float = 1e-3  # size of the tests of the emulator
 
@@ -347,6 +347,7 @@ def agreeing_shared_points(
     half_limit = response.data.options.half_difference
     limit = 2 * half_limit * per_hyperparameter(draws)
     count = options.points
+    most = min(options.most_points, max(2**22 // len(response.data.readings), count))
     while True:
         points = response.points(scatters[:1], region, response.cube(count))
         parts = slice(count // 2), slice(count // 2, None)
@@ -356,7 +357,7 @@ def agreeing_shared_points(
         if difference[1] <= limit:
             points = response.points(scatters, region, response.cube(count))
             return replace(points, difference=difference[1])
-        if 2 * count > options.most_points:
+        if 2 * count > most:
             raise DesignError(
                 f"{response.data.name}: got two halves of {count} points whose log-likelihoods "
                 f"differ by {difference[1]:.2g} nats, expected at most {limit:.2g}: the population "

@@ -14,6 +14,7 @@ from prbayes._finding import counted
 from prbayes._progress import shown
 from prbayes._stats import finite_sample, positive_scale, quantile
 from prbayes._validate import (
+    ArrayPair,
     Bools,
     Floats,
     Indices,
@@ -22,6 +23,7 @@ from prbayes._validate import (
     flag,
     positive_integer,
     seed_number,
+    wrong_value,
 )
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets
@@ -288,9 +290,7 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     return np.array(columns).T
 
 
-def _specimen_scores(
-    evaluator: Evaluator, thetas: Floats, held_out: list[Floats]
-) -> tuple[Floats, Floats]:
+def _specimen_scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> ArrayPair:
     """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = number_specimens(evaluator.simulators)
     scores = np.zeros(total)
@@ -437,9 +437,10 @@ def rank(
 def _require_candidates(candidates: object) -> None:
     """Raise unless this is a mapping with two or more optima or cross-validations."""
     if not isinstance(candidates, Mapping):
-        raise TypeError(
-            f"rank: candidates: got {called(candidates)}, expected a mapping such as "
-            "{'normal': optimum, 'lognormal': other}"
+        raise wrong_value(
+            candidates,
+            "rank: candidates",
+            "a mapping such as {'normal': optimum, 'lognormal': other}",
         )
     if len(candidates) < 2:
         raise ValueError(

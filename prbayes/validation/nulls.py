@@ -20,13 +20,14 @@ from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import (
     AT_ONCE,
+    ArrayPair,
     Floats,
     Indices,
     StrPath,
-    called,
     positive_integer,
     positive_number,
     share,
+    wrong_value,
 )
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points
@@ -52,7 +53,7 @@ class Judgement:
 
     p_value: float
     critical_value: float
-    envelope: Callable[[], tuple[Floats, Floats]]  # lower and upper bounds, (n,)
+    envelope: Callable[[], ArrayPair]  # lower and upper bounds, (n,)
 
 
 class Null(ABC):
@@ -77,7 +78,7 @@ def judge_by_replicates(
 
     .. math:: p = (1 + \#\{A_r \ge A\}) / (1 + r)
     """
-    enveloped: Floats | None = None
+    enveloped = None
     blocks = []
     with progress("replicates") as report:
         for u in replicates:
@@ -205,7 +206,7 @@ def table() -> tuple[Floats, Floats, Floats]:
     return rows[:, 0], -np.log(tails), rows[:, 1:]
 
 
-def _area_quantiles(n: int) -> tuple[Floats, Floats]:
+def _area_quantiles(n: int) -> ArrayPair:
     """Return minus the logs of tail probabilities and the quantiles of sqrt(n) A, (m,) each."""
     sizes, logs, quantiles = table()
     place = -1 / np.sqrt(n)
@@ -223,7 +224,7 @@ def _slope(logs: Floats, quantiles: Floats) -> float:
     return float((logs[-1] - logs[-8]) / (quantiles[-1] ** 2 - quantiles[-8] ** 2))
 
 
-def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
+def uniform_envelope(n: int, alpha: float) -> ArrayPair:
     """Return the envelope of n sorted uniform numbers, (n,) each.
 
     For many numbers it is simulated at 2000 ranks, which are closer together near the ends, and
@@ -397,13 +398,14 @@ class JointNull(Null):
         )
         require_refits(self.optimum, "JointNull", advice)
         if self.responses is not None:
-            tested: list[Any] = [self.responses]
+            tested = [self.responses]
             if isinstance(self.responses, Mapping):
                 tested = list(self.responses.values())
             if not tested or not all(isinstance(t, tuple) and t and callable(t[0]) for t in tested):
-                raise TypeError(
-                    f"JointNull: responses: got {called(self.responses)}, expected a tuple "
-                    "(response, *inputs), or a mapping of conditions to such"
+                raise wrong_value(
+                    self.responses,
+                    "JointNull: responses",
+                    "a tuple (response, *inputs), or a mapping of conditions to such",
                 )
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
@@ -570,7 +572,7 @@ def _numbers_in_calibration(
     node_numbers, total = number_specimens(nodes)
     # Points of simulators that share specimens are drawn together, as a group.
     group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}
-    number_and_group: dict[str, tuple[int, int]] = {}
+    number_and_group = {}
     for k, node in enumerate(nodes):
         if node.specimens is not None:
             for label, number in zip(specimen_names(node.specimens), node_numbers[k], strict=True):

@@ -17,15 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._stats import cumulated
 from prbayes._validate import (
+    ArrayPair,
     Floats,
     Indices,
+    NamedValues,
+    Names,
     Seed,
     Shape,
-    called,
+    complete_rows,
     flag,
     real_array,
     sample_labels,
     seed_number,
+    wrong_value,
 )
 from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
@@ -54,7 +58,7 @@ class TestedCondition:
     observed: Floats  # measured values, projected, (n,)
     predicted: Floats  # predicted values, projected, (D, S); a row for each draw
     measured: Floats  # measured values before the projection, (n,) or (n, m)
-    labels: tuple[str, ...] | None  # labels of the specimens
+    labels: Names | None  # labels of the specimens
     numbers: Indices  # numbers of the specimens, counted over all conditions, (n,)
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # attributes of the prediction
     projection: Projection | None = None  # projection of several outputs
@@ -169,13 +173,13 @@ def read_case(
     flag(folded, "folded")
     flag(randomize, "randomize")
     numbers: dict[object, int] = {}
-    conditions: list[TestedCondition] = []
+    conditions = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
         has_own_conditions = _SPECIMEN in getattr(simulated, "dims", ())
         if has_own_conditions:
             simulated = simulated.rename({_SPECIMEN: "sample"})
         y = _measured(name, measured, simulated)
-        names: tuple[str, ...] | None = None
+        names = None
         if labels is not None:
             labels = in_order_of(labels, measured, f"{name}: specimens")
             names = tuple(specimen_names(sample_labels(labels, len(y), f"{name}: specimens")))
@@ -314,7 +318,7 @@ def projections(pool: Floats) -> list[Projection]:
     m = pool.shape[-1]
     rows = pool.reshape(-1, m)
     rows = rows[~np.isnan(rows).any(axis=1)]
-    finite = rows[np.isfinite(rows).all(axis=1)]
+    finite = rows[complete_rows(rows)]
     # 4096 specimens determine correlations to .02. The test has the right size for any directions.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
@@ -431,7 +435,7 @@ class Comparable:
     predicted: Floats  # predicted values, (P, S); a row for each population; NaN has no weight
     unit: str = ""
     condition: str = ""
-    coords: Mapping[str, Any] = field(default_factory=dict)  # label of the output, by dimension
+    coords: NamedValues = field(default_factory=dict)  # label of the output, by dimension
 
     @property
     def weights(self) -> Floats:
@@ -446,12 +450,11 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     At most eight outputs are returned, since these fill three rows of panels. Raises TypeError or
     ValueError if conditions or outputs differ.
     """
-    pairs: list[Comparable] = []
+    pairs = []
     for name, y, prediction, _ in _by_condition(observed, predicted, None):
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
-            raise TypeError(
-                f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
-                "prb.predict"
+            raise wrong_value(
+                prediction, f"{caller}: {name}: predicted", "the DataArray of prb.predict"
             )
         values = real_array(y, f"{caller}: {name}: observed")
         dims = [dim for dim in prediction.dims if dim not in _SAMPLE_DIMS]
@@ -496,7 +499,7 @@ class Predictive:
         cumulative = cumulated(weights[is_number], order)
         self._cumulative = cumulative / cumulative[-1]
 
-    def steps(self, y: Floats) -> tuple[Floats, Floats]:
+    def steps(self, y: Floats) -> ArrayPair:
         """Return P(Y < y) and P(Y <= y), in the shape of y; NaN for a NaN."""
         nan = np.where(np.isnan(y), np.nan, 0.0)
         n_smaller = np.searchsorted(self._values, y, side="left")

@@ -133,3 +133,56 @@ def test_inputs_that_depend_on_a_group_are_refused(model: pm.Model, result: Any)
     (x,) = Evaluator.of(model).simulators[0].inputs.aleatory
     with pytest.raises(TypeError, match=r"the .dist\(\) of one of \['Adler', 'Busch'\]"):
         prb.exceedance(result, life, 50.0, x, 2.0, model=model)
+
+
+METRICS = {"PR": prb.ProbabilityResidual(), "KLD": prb.KullbackLeibler(), "area": prb.AreaMetric()}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", METRICS)
+def test_a_group_under_a_metric_has_its_exceedance_and_other_decisions_are_refused(
+    name: str,
+) -> None:
+    rng = np.random.default_rng(3)
+    x = np.repeat([2.0, 2.6], [40, 30]) + rng.normal(0, 0.4, 70)
+    coords = {"supplier": ("test", np.repeat(SUPPLIERS, [40, 30]))}
+    observed = xr.DataArray(life(x, 2.0), coords=coords, dims="test")
+    with pm.Model(coords={"supplier": SUPPLIERS}) as model:
+        mu, sigma = pm.Normal("mu", 2, 1, dims="supplier"), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma, name="x")
+        prb.Simulator("y", life, x, 2.0, observed=observed, metric=METRICS[name])
+    rng = np.random.default_rng(4)
+    values = {"mu": rng.normal([2.0, 2.6], 0.06, (1, 200, 2)), "sigma": rng.normal(0.4, 0.04, 200)}
+    values["sigma"] = values["sigma"][None]
+    dims = {"mu": ["chain", "draw", "supplier"], "sigma": ["chain", "draw"]}
+    posterior = xr.Dataset(
+        {key: (dims[key], v) for key, v in values.items()}, {"supplier": SUPPLIERS}
+    )
+    result = xr.DataTree.from_dict({"posterior": posterior})
+    of_group = pm.Normal.dist(mu[1], sigma)
+    table = prb.exceedance(result, life, 30.0, of_group, 2.0, model=model, n_points=1000)
+    exact = norm.sf((np.log(15) - values["mu"][..., 1]) / values["sigma"]).mean()
+    assert abs(float(table.probability) - exact) < 4 * float(table.error)
+    population = prb.population(result, of_group, model=model).estimate.sel(quantity="mean")
+    assert population.item() == pytest.approx(values["mu"][..., 1].mean(), abs=0.02)
+    quantity = Mean(life, of_group, 2.0)
+    refused: dict[str, Any] = {
+        "evaluate": lambda: prb.decision.evaluate(result, quantity, model=model),
+        "sensitivity": lambda: prb.sensitivity(result, quantity, model=model),
+        "plan": lambda: prb.plan(
+            result, {"more": Condition(life, of_group, 2.0)}, k=[50], model=model
+        ),
+        "p_box": lambda: prb.decision.p_box(result, life, of_group, 2.0, model=model),
+    }
+    for call in refused.values():
+        with pytest.raises(TypeError, match=r"n_points=1000.*leave metric= out of the simulator"):
+            call()
+
+
+def test_a_covariate_under_a_metric_is_refused_with_what_works() -> None:
+    with pm.Model():
+        load = prb.response.condition("load", np.linspace(0, 1, 20))
+        x = pm.Normal.dist(pm.Normal("a", 0, 1) + load, pm.HalfNormal("s", 1))
+        for metric in METRICS.values():
+            with pytest.raises(TypeError, match=r"prb.response.group.*leave metric= out"):
+                prb.Simulator("y", np.exp, x, observed=np.linspace(1, 2, 20), metric=metric)

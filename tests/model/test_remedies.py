@@ -355,10 +355,11 @@ USED: Mapping[str, tuple[Use, Mapping[str, Any], str, list[dict[str, Any]]]] = {
         partial(sampled, population, metric=PR),
         {"propagation": prb.Fresh(64)},
         r"expected prb\.Reweighted\(\) or prb\.Resimulated\(\), or prb\.sample_smc with "
-        "adjustment=None and epsilon=",
+        "adjustment=None, whose draws are as wide as epsilon",
         [
             {"propagation": prb.Reweighted()},
             {"propagation": prb.Resimulated(256)},
+            {"function": prb.sample_smc, "adjustment": None},
             {"function": prb.sample_smc, "adjustment": None, "epsilon": 0.05},
         ],
     ),

@@ -138,12 +138,6 @@ def test_fresh_is_refused_by_methods_with_gradients(sampler: Callable[[pm.Model]
         sampler(model_of("Fresh")[0])
 
 
-def test_fresh_without_an_epsilon_is_refused_by_the_sampler() -> None:
-    model, _ = build(prb.Fresh(POINTS), epsilon=None)
-    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
-        prb.sample_smc(100, model=model, adjustment=None, **QUIET)
-
-
 # Predictive sampling.
 
 

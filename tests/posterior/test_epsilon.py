@@ -166,13 +166,9 @@ def test_epsilon_by_refits(function: Any, expected: float, rtol: float) -> None:
 
 def test_problems_without_refits_are_refused() -> None:
     function = prb.FunctionMetric(lambda z, y: np.abs(z.mean(axis=-1) - y.mean()))
-    for metric, propagation, words in (
-        (function, prb.Resimulated(64), "epsilon cannot be calibrated: y has a FunctionMetric"),
-        (AREA, prb.Fresh(64), r"epsilon cannot be calibrated: y has prb\.Fresh"),
-    ):
-        model = build(metric, propagation=propagation)
-        with pytest.raises(TypeError, match=words):
-            epsilon_of(model, method="Nelder-Mead", max_evaluations=5, refine=False)
+    model = build(function, propagation=prb.Resimulated(64))
+    with pytest.raises(TypeError, match="epsilon cannot be calibrated: y has a FunctionMetric"):
+        epsilon_of(model, method="Nelder-Mead", max_evaluations=5, refine=False)
 
 
 # -- several simulators
@@ -208,6 +204,40 @@ def test_specimens_that_count_twice_are_reported(caplog: pytest.LogCaptureFixtur
     assert text not in caplog.text
     pair(KL, [numbers, numbers])
     assert text in caplog.text
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("metric", "rel"), [(PR, 0.2), (AREA, 0.3)], ids=["PR", "area"])
+def test_fresh_responses_have_the_epsilon_of_stored_ones(metric: prb.Metric, rel: float) -> None:
+    rng = np.random.default_rng(3)
+
+    def noisy(x: Any) -> Any:  # random: no two calls are the same
+        return x + 0.5 * rng.standard_normal(np.shape(x))
+
+    observed = noisy(OBSERVED)
+    settings: dict[str, Any] = {"observed": observed, "propagation": prb.Fresh(256)}
+    fresh = build(metric, noisy, 0.5, **settings)
+    expected = epsilon_of(build(metric, sd=np.sqrt(0.5), n=1024, observed=observed))
+    draws = prb.sample_smc(200, chains=2, model=fresh, adjustment=None, progressbar=False)
+    calibrated = float(draws["calibration"]["epsilon"].values.item())
+    # Between samples of runs epsilon has a scatter of 5 % (PR) and 8 % (area).
+    assert calibrated == pytest.approx(expected, rel=rel)
+    optimum = prb.minimize(fresh, method="Nelder-Mead", max_evaluations=5, starts=0)
+    assert prb.calibrate_epsilon(optimum)["y"] == pytest.approx(expected, rel=rel)
+    # The estimate is near the mean of the readings, whose standard error is sd / sqrt(N).
+    error = np.sqrt(0.5 / N)
+    assert float(draws["posterior"]["mu"].std()) == pytest.approx(error, rel=0.25)
+    assert np.isnan(epsilons(Evaluator.of(fresh))).all()
+
+
+def test_fresh_responses_without_a_density_need_an_epsilon() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        c = pm.Normal("c", 0, 1)
+        settings = {"metric": AREA, "observed": OBSERVED, "propagation": prb.Fresh(64)}
+        prb.Simulator("y", lambda x, c: x + c, x, c, **settings)
+    with pytest.raises(TypeError, match=r"epsilon cannot be calibrated.*pass epsilon="):
+        prb.sample_smc(20, model=model, adjustment=None, progressbar=False)
 
 
 def test_set_epsilon_scales_the_log_density() -> None:

@@ -72,10 +72,10 @@ def test_the_probability_of_being_seen_is_that_of_the_last_emulator() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("error", [0.0, 0.9])
 def test_log_likelihoods_of_a_selection_are_exact(error: float) -> None:
-    case, limit = study.case_of(0.6, error, 0)
+    case = study.case_of(0.6, error, 0)
     with pm.Model() as model:
         variables = {p.name: p.variable() for p in case.priors}
-        metric = case.metric(variables)
+        metric: Any = case.metric(variables)
         x = case.population(variables)
         y = prb.Simulator("y", np.exp, x, metric=metric, observed=case.observed)
     evaluator = Evaluator.of(model)
@@ -93,6 +93,8 @@ def test_log_likelihoods_of_a_selection_are_exact(error: float) -> None:
     at = {"mu": mu[40], "sigma_log__": np.log(sigma[40])}
     assert float(logp(at)) == pytest.approx(evaluator(theta[40:41]).log_other[0], rel=1e-9)
     drawn = pm.draw(pm.do(model, {"mu": 0.7, "sigma": 0.6})["y"], 50, random_seed=0, mode=PLAIN)
+    assert metric.selected is not None
+    limit = metric.selected[0]
     assert drawn.min() >= limit
     # Of the second population nothing is seen, unless by an error of its reading.
     populations = {"mu": np.array([0.7, -30.0]), "sigma": np.array([0.6, 0.1])}

@@ -12,10 +12,10 @@ from prbayes.model.emulated import emulated_simulators
 from prbayes.model.specimen_preparation import prepared
 
 
-def points(
+def model_of(
     response: Callable[..., Any], prior: tuple[Any, Any], x: Any, error: float | None = None
 ) -> Any:
-    """Return the likely inputs of specimens with inputs (N, d), shape (N, K, d)."""
+    """Return the model of specimens with inputs (N, d)."""
     d = x.shape[1]
     with pm.Model() as model:
         mu = pm.Normal("mu", *prior, shape=d)
@@ -23,10 +23,17 @@ def points(
         inputs = [pm.Normal.dist(mu[k], sigma[k]) for k in range(d)]
         metric = prb.LogLikelihood(error=error)
         prb.Simulator("y", response, *inputs, observed=response(*x.T), metric=metric)
+    return model
+
+
+def points(*arguments: Any, error: float | None = None) -> Any:
+    """Return the likely inputs of specimens, (N * K,) each, and the shape (N, K, d)."""
+    model = model_of(*arguments, error=error)
     (simulator,) = emulated_simulators(model)
-    found = prepared(simulator.likelihood).points
+    likelihood = simulator.likelihood
+    found = prepared(likelihood).points
     z = np.where(np.isfinite(found.log_a)[..., None], found.z, np.nan)
-    return simulator.likelihood.coordinates.inputs(z.reshape(-1, d)), z.shape
+    return likelihood.coordinates.inputs(z.reshape(-1, z.shape[2])), z.shape
 
 
 ONE_INPUT: dict[str, tuple[Callable[[Any], Any], int, float, float, tuple[float, float]]] = {
@@ -80,6 +87,35 @@ def test_two_inputs_have_one_mode_for_each_specimen() -> None:
     np.testing.assert_array_less(np.nan_to_num(distance), 2e-2)
 
 
+@pytest.mark.parametrize(("sd", "seed"), [(0.01, 0), (0.01, 2), (1e-3, 2), (1e-4, 2)])
+def test_a_narrow_population_is_not_sought_where_only_the_emulator_has_it(
+    sd: float, seed: int
+) -> None:
+    """A far population without runs may seem likelier than the one that runs have confirmed."""
+
+    def response(a: Any, b: Any) -> Any:
+        runs.append(np.size(a))
+        first = np.logaddexp(0, 3 * a) + 0.2 * b
+        return np.stack([first, b + 0.3 * np.tanh(2 * a)], axis=-1)
+
+    x = np.random.default_rng(seed).normal([0.3, -0.2], sd, (20, 2))
+    runs: list[int] = []
+    model = model_of(response, ([0.0, 0.0], 1.4), x)
+    (simulator,) = emulated_simulators(model)
+    likelihood = simulator.likelihood
+    found = prepared(likelihood)
+    assert sum(runs) <= 170
+    at = likelihood.coordinates.of(list(x.T), 1)
+    away = np.where(np.isfinite(found.points.log_a)[..., None], found.points.z - at[:, None], 0.0)
+    width = likelihood.coordinates.half_width
+    np.testing.assert_array_less(abs(away) * width, 0.3 * sd)
+    # Newton's method finds no inputs of outputs whose rounding errors are as large as the error,
+    # which is 1000 times that at a typical run; at specimens close together it is larger.
+    emulation, step = found.emulation, 1e-9
+    change = emulation.values(at - step) - 2 * emulation.values(at) + emulation.values(at + step)
+    assert (np.median(abs(change), axis=0) < 0.1 * emulation.error).all()
+
+
 def test_modes_that_exist_stay() -> None:
     """A response with two inputs for each reading, one of them far from the runs."""
     x = np.random.default_rng(0).normal(2.0, 0.2, (20, 1))
@@ -98,7 +134,7 @@ def test_exact_readings_that_leave_their_input_open_are_reported(
 ) -> None:
     """Small readings of a response over many orders of magnitude are within the emulator's error."""
     x = np.random.default_rng(16).normal(1.0, 0.8, (40, 1))
-    points(lambda x: np.exp(steepness * x), (0.0, 2.0), x, error)
+    points(lambda x: np.exp(steepness * x), (0.0, 2.0), x, error=error)
     assert ("got an exact reading of specimen" in caplog.text) == is_reported
 
 

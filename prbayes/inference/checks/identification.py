@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection
 
 import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
-from prbayes._validate import Floats, Indices
+from prbayes._validate import Floats, Indices, NamedValues, Names
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
@@ -152,7 +151,7 @@ def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[Indices, Indic
     return np.setdiff1d(above[0], above[1]), np.setdiff1d(above[1], above[0])
 
 
-def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[Finding]:
+def breakdown_findings(at_edge: Names, at_jump: Names) -> list[Finding]:
     """Report elements at an edge and simulators at a jump, without a sampling distribution."""
     findings = []
     if at_edge:
@@ -172,7 +171,7 @@ def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> li
     return findings
 
 
-def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> list[Finding]:
+def unknown_error_findings(stderr: NamedValues, obstacle: str | None) -> list[Finding]:
     """Report standard errors that are NaN. The default reason is the end of a support."""
     names = [name for name, errors in stderr.items() if np.isnan(errors).any()]
     if not names:
@@ -200,7 +199,7 @@ def no_information(evaluator: Evaluator, theta: Floats) -> bool:
 
 def elements_at_edge(
     evaluator: Evaluator, theta: Floats, scales: Floats, *, size: float, tolerance: float, seed: int
-) -> tuple[str, ...]:
+) -> Names:
     """Return the elements that ran to an edge: the population changes, but not its discrepancy.
 
     The way back to the middle of the prior changes the discrepancy, unlike that of a hyperparameter

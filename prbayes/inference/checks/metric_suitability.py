@@ -151,7 +151,7 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
     for part in target.parts:
         if part.projection is not None:
             parts.setdefault(tuple(part.projection.outputs.tolist()), []).append(part)
-    findings: list[Finding] = []
+    findings = []
     for outputs, members in parts.items():
         axes = np.array([p.projection.direction for p in members if p.projection is not None])
         size = np.abs(axes).max(axis=0)

@@ -22,7 +22,7 @@ from scipy.special import ndtr
 
 from prbayes._finding import Finding, Findings
 from prbayes._stats import adjusted_p_values, upper_p_values
-from prbayes._validate import Floats
+from prbayes._validate import Arrays, Floats
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
@@ -87,7 +87,7 @@ class PopulationTest:
     n: int  # number of specimens
 
 
-def population_test(z: Floats, weights: Floats, null: Sequence[Floats] | Floats) -> PopulationTest:
+def population_test(z: Floats, weights: Floats, null: Arrays | Floats) -> PopulationTest:
     """Test whether the family of the population fits the inputs; for the power see `power_text`.
 
     ``null`` has the `population_statistics` of bootstrap samples of the fitted population, each

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._finding import Finding, Findings
-from prbayes._validate import Bools, Floats
+from prbayes._validate import ArrayPair, Bools, Floats
 from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.model.evaluator import Evaluator, only_through_prior
@@ -120,7 +120,7 @@ def prior_end_findings(
     return [Finding("prior-end", text, page)]
 
 
-def prior_conflict(estimate: Floats, predictive: Floats) -> tuple[Floats, Floats]:
+def prior_conflict(estimate: Floats, predictive: Floats) -> ArrayPair:
     """Return p-values of estimates in their prior predictive distributions, plain and adjusted.
 
     P-values, (d,), are two-sided; they are adjusted for the number of hyperparameters by Holm's

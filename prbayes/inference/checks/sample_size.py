@@ -11,7 +11,7 @@ from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
-from prbayes._validate import Bools, Floats, Indices
+from prbayes._validate import Arrays, Bools, Floats, Indices
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator_with_data import unlabelled_specimens
 from prbayes.model.specimen_likelihood import all_simulators
@@ -41,7 +41,7 @@ def elements_above(evaluator: Evaluator) -> Bools:
     return enters
 
 
-def _specimens(inputs: Inputs, parents: Sequence[Floats]) -> Floats:
+def _specimens(inputs: Inputs, parents: Arrays) -> Floats:
     """Draw specimens of each population from the same random numbers, (P, k)."""
     sampler = PopulationSampler(inputs)
     draws = []
