@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from prbayes._finding import any_of
-from prbayes._validate import ArrayFunction, Bools, Floats, Indices
+from prbayes._validate import ArrayFunction, Bools, Floats, Indices, complete_rows
 from prbayes.metrics.readings import has_error, located_values, relative_error
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
@@ -278,6 +278,7 @@ def sequential_design(
                 emulation = without_spurious_modes(run, data, emulation, likely)
                 plausible = Plausible.of(data, emulation, wider(population))
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
+                is_good &= bool(np.isfinite(emulation.bias))
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
@@ -360,7 +361,7 @@ def at_most_runs(
     run: Run, data: SpecimenData, emulation: Emulation, likely: Likely, population: Normal
 ) -> tuple[Emulation, Plausible]:
     """Return an emulation with the largest number of runs, corrected where it may be, or raise."""
-    if may_correct(data, likely):
+    if np.isfinite(emulation.bias) and may_correct(data, likely):
         emulation = corrected(run, data, emulation, population)
     if emulation.bias > data.options.bias:
         require_accurate(data, emulation, likely)
@@ -755,12 +756,17 @@ def without_spurious_modes(
     # As `is_rough`, and far less certain than at most likely inputs
     largest = np.maximum(0.03 * spread, 10 * emulation.error)
     likeliest, before = likely.best(), emulation
+    units = np.concatenate([scale, spread])
     for _ in range(8):
         modes = proposals.modes
         z = data.within(mode_coordinates(proposals))
         deviation = np.sqrt(emulation.surface.variance(z))
-        # Farther from the runs than the population is wide, the deviation may be far too small.
-        is_far = squared_distances(emulation.z, z, scale) > z.shape[1]
+        runs = np.hstack([emulation.z, emulation.y])
+        runs = runs[complete_rows(runs)]
+        # Without runs whose inputs and outputs are near, the deviation may be far too small.
+        values = emulation.surface.values(z)
+        squares = squared_distances(runs, np.hstack([z, values]), units)
+        is_far = squares > len(units)
         cost = modes.misfit + (modes.a**2).sum(axis=1) / 2
         is_far[best_rows(modes.specimen, cost)] = False
         is_uncertain = (deviation > largest).any(axis=1)
@@ -774,6 +780,8 @@ def without_spurious_modes(
         if exist or (np.abs(change) > largest).any():
             break
         proposals = fit_proposals(data, emulation, proposals.residuals.population)
+    else:
+        return replace(emulation, bias=np.inf)
     # A response that oscillates far off is not known from a few runs, which also make the surface
     # worse at the specimens.
     harmless = np.maximum(0.01 * spread, 3 * before.error)

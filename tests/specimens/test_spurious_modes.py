@@ -167,3 +167,9 @@ def test_accurate_readings_have_points_around_modes_far_from_the_population() ->
     for mu, sigma in ((1.5, 0.066), (1.48, 0.05), (1.52, 0.09)):
         both = [logp({"mu": sign * mu, "sigma_log__": np.log(sigma)}) for sign in (1, -1)]
         assert abs(both[0] - both[1]) < 0.05
+
+
+def test_runs_with_other_outputs_do_not_confirm_a_mode_beside_them() -> None:
+    x = np.random.default_rng(0).normal(1.016, 0.0645, (29, 1))
+    (found,), shape = points(lambda x: x / np.sqrt(1 + x**2), (1.09, 2.71), x, error=0.002)
+    np.testing.assert_array_less(np.nan_to_num(abs(found.reshape(shape[:2]) - x)), 0.1)
