@@ -518,25 +518,24 @@ def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float
     return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
 
 
-def coarser_evaluator(evaluator: Evaluator, thetas: Floats) -> Evaluator:
-    """Return an evaluator with an eighth, a quarter or half of the points of large designs.
+def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
+    """Return an evaluator with an eighth of the points of large designs.
 
-    It is the smallest that supports most of the populations at thetas, (P, d), and the same one if
-    none does or no design is large.
+    The same one if no design is large, or if the smaller designs do not support theta, (d,).
     """
-    large = [bound for bound in evaluator.reweighted.values() if bound.n_points >= _LARGE]
-    for n_blocks in (1, 2, 4) if large else ():
-        smaller = {
-            bound.name: bound.copied(bound.design.rows(bound.blocks < n_blocks)) for bound in large
-        }
-        nodes = [replace(n, bound=smaller.get(n.name, n.bound)) for n in evaluator.nodes]
-        coarse = replace(evaluator, nodes=tuple(nodes), has_graph=False)
-        if all(
-            np.median(support["weight_ess"]) >= coarse.reweighted[name].required_ess
-            for name, support in coarse.support(thetas).items()
-        ):
-            return coarse
-    return evaluator
+    smaller = {
+        name: bound.copied(bound.design.rows(bound.blocks == 0))
+        for name, bound in evaluator.reweighted.items()
+        if bound.n_points >= _LARGE
+    }
+    if not smaller:
+        return evaluator
+    coarse_nodes = [replace(n, bound=smaller.get(n.name, n.bound)) for n in evaluator.nodes]
+    coarse = replace(evaluator, nodes=tuple(coarse_nodes), has_graph=False)
+    for name, values in coarse.support(theta[None]).items():
+        if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
+            return evaluator
+    return coarse
 
 
 @dataclass(frozen=True)

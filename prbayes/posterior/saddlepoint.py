@@ -192,7 +192,7 @@ def estimate_likelihood(
     if any(events) or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = coarser_evaluator(evaluator, point[None])
+    evaluator = coarser_evaluator(evaluator, point)
     # The unit of an element is a hundred standard errors, or the prior's spread if it is less.
     hyperparameters = evaluator.hyperparameters
     is_stored = [node.bound.stored for node in nodes]

@@ -38,7 +38,6 @@ from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import (
     TOLERABLE,
     Evaluator,
-    coarser_evaluator,
     epsilons,
     supports_each,
     with_targets,
@@ -403,21 +402,6 @@ def refit_likelihood(
         sampling, rest = inside, []
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
-    # Data sets are drawn in balls around the centers first.
-    r = sampling.stderr.size
-    number = options.n_sets // options.rounds
-    size = number // len(centers)
-    balls = [_points_of_ball(size, r, options, i) for i in range(len(centers))]
-
-    def in_balls() -> Floats:
-        pairs = zip(centers, balls, strict=True)
-        return np.concatenate([center.thetas(ball) for center, ball in pairs])
-
-    # All stored responses have shown which directions are identified. Fewer suffice for the rest,
-    # if they support the populations of the balls.
-    evaluator = coarser_evaluator(evaluator, continuation.within(in_balls()))
-    continued = _continued(evaluator, continuation)
-    centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
     likelihood = RefitLikelihood(
         evaluator=evaluator,
@@ -427,12 +411,19 @@ def refit_likelihood(
         scale=element_units(sampling, continuation) * evaluator.hyperparameters.prior_sd,
         options=options,
     )
+    r = sampling.stderr.size
     if not r:
         return likelihood
-    x = sampling.coordinates(in_balls())
+    # Draw data sets in balls around the centers first, then around the posterior given these.
+    number = options.n_sets // options.rounds
+    balls = [
+        sampling.coordinates(center.thetas(_points_of_ball(number // len(centers), r, options, i)))
+        for i, center in enumerate(centers)
+    ]
+    x = np.concatenate(balls)
     drawn = []
     for i in range(options.rounds):
-        if i:  # draw around the posterior given the data sets so far
+        if i:
             x = _posterior_points(likelihood, number)
         drawn.append(_draw(centers, x, options, seed=i, is_linear=is_linear))
         populations, counts, estimates = zip(*drawn, strict=True)
@@ -493,7 +484,7 @@ def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift:
     u = sobol(number, r + 1, options.seed + shift)
     directions = ndtri(u[:, :r])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.asarray(options.radius * u[:, r:] ** (1 / max(r, 1)) * directions)
+    return np.asarray(options.radius * u[:, r:] ** (1 / r) * directions)
 
 
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:

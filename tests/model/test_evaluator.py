@@ -318,7 +318,7 @@ def test_large_designs_have_coarser_ones() -> None:
             design = prb.Reweighted(n, emulator=None)
             prb.Simulator(name, lambda x, y: x + y**2, *inputs, propagation=design, **given)
     evaluator = Evaluator.of(model)
-    coarse = coarser_evaluator(evaluator, np.ones((1, 1)))
+    coarse = coarser_evaluator(evaluator, np.array([1.0]))
     assert [node.bound.n_points for node in coarse.nodes] == [512, 1024]
     assert [node.bound.n_points for node in evaluator.nodes] == [512, 8192]
     assert coarse.nodes[0].bound is evaluator.nodes[0].bound
@@ -329,8 +329,8 @@ def test_large_designs_have_coarser_ones() -> None:
     np.testing.assert_array_equal(found[:, 0], expected[:, 0])
     assert np.all(found[:, 1] != expected[:, 1])
     np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=0.1)
-    assert coarser_evaluator(coarse, np.ones((1, 1))) is coarse
-    assert coarser_evaluator(evaluator, np.full((1, 1), 50.0)) is evaluator, "no design supports it"
+    assert coarser_evaluator(coarse, np.array([1.0])) is coarse
+    assert coarser_evaluator(evaluator, np.array([50.0])) is evaluator, "no design supports it"
 
 
 def test_an_evaluator_of_other_data_has_a_pickle() -> None:

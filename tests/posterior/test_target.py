@@ -174,20 +174,17 @@ def test_a_uniform_prior_that_ends_near_the_estimate() -> None:
     require_normal(draws, exact.mean(), exact.std())
 
 
-@pytest.mark.parametrize("scale", [0.3, 0.02])
-def test_fewer_stored_responses_support_the_populations_around_the_estimate(scale: float) -> None:
-    """The narrower the population, the more of the stored responses it needs."""
-    y = 1 + scale * stats.norm.ppf((np.arange(12) + 0.5) / 12)
+def test_the_estimate_is_that_of_all_stored_responses() -> None:
+    """With an eighth of the points of two inputs it moved by .14 standard errors."""
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Uniform("mu", 0, 3), pm.Uniform("sigma", 0, 1))
-        simulate(x, observed=y, propagation=prb.Reweighted(8192))
+        x = pm.Normal.dist(pm.Normal("mu", 1, 2), pm.HalfNormal("sigma", 1))
+        noise = pm.Normal.dist(0, 0.1)
+        propagation = prb.Reweighted(8192, emulator=None)
+        simulate(x, noise, response=np.add, observed=Y12, propagation=propagation)
     optimum = prb.minimize(model, starts=0, progressbar=False)
-    options = replace(OPTIONS, n_sets=64)
-    likelihood = refit_likelihood(optimum.evaluator, optimum, options)
-    bound = likelihood.evaluator.reweighted["y"]
-    assert bound.n_points < 8192
-    support = likelihood.evaluator.support(optimum.theta[None])["y"]
-    assert support["weight_ess"][0] > bound.required_ess
+    likelihood = refit_likelihood(optimum.evaluator, optimum, replace(OPTIONS, n_sets=64))
+    (center,) = likelihood.centers
+    assert np.abs(center.coordinates(optimum.theta)).max() < 0.02
 
 
 def test_only_the_sum_is_identified() -> None:
