@@ -59,9 +59,12 @@ JOBS = {
     "stock linear": Job("stock", "linear", 2),
     "stock frame": Job("stock", "frame", 1),
     "pm.sample frame": Job("nuts", "frame", 3),
-    "PR linear": Job("metric", "ProbabilityResidual", 4),
-    "KLD linear": Job("metric", "KullbackLeibler", 4),
-    "area linear": Job("metric", "AreaMetric", 3),
+    "PR linear": Job("metric", "ProbabilityResidual linear", 4),
+    "KLD linear": Job("metric", "KullbackLeibler linear", 4),
+    "area linear": Job("metric", "AreaMetric linear", 3),
+    "PR frame": Job("metric", "ProbabilityResidual frame", 3),
+    "KLD frame": Job("metric", "KullbackLeibler frame", 3),
+    "area frame": Job("metric", "AreaMetric frame", 3),
     "PR, 1 output of 1 input": Job("outputs", "1 of 1", 3),
     "PR, 1 output of 2 inputs": Job("outputs", "1 of 2", 3),
     "PR, 2 outputs of 2 inputs": Job("outputs", "2 of 2", 3),
@@ -98,6 +101,11 @@ COMPARISONS = (
         Comparison(f"linear 50, {metric}: optimum and posterior, warm", f"{metric} linear", "warm",
                    "stock linear", 0.07)
         for metric in ("PR", "KLD", "area")
+    ),
+    *(
+        Comparison(f"frame 20, {metric}: optimum and posterior, warm, CPU s", f"{metric} frame",
+                   "warm", "", aim)
+        for metric, aim in (("PR", 2.5), ("KLD", 4.0), ("area", 8.0))
     ),
     Comparison("PR, one output of two inputs, warm", "PR, 1 output of 2 inputs", "warm",
                "PR, 1 output of 1 input", 2.0),
@@ -163,18 +171,22 @@ def by_stock(problem: str) -> Callable[[int], Any]:
     return lambda replicate: rival.calibrate(task_of(problem, replicate), rival.SETTINGS)
 
 
-def by_metric(metric: str) -> Callable[[int], Any]:
-    """Return optimum and posterior by a metric, on the linear problem."""
+def by_metric(argument: str) -> Callable[[int], Any]:
+    """Return optimum and posterior by a metric on a problem: "AreaMetric linear"."""
     import pymc as pm
 
     import prbayes as prb
     from benchmarks.scoreboard import in_pymc
 
+    metric, problem = argument.split()
+
     def job(replicate: int) -> Any:
-        task = task_of("linear", replicate)
+        task = task_of(problem, replicate)
         with pm.Model() as model:
             inputs = in_pymc.inputs(task.problem, in_pymc.hyperparameters(task.problem))
             of_distributions = getattr(prb, metric)()
+            if problem == "frame":  # three outputs
+                of_distributions = prb.Joint(of_distributions)
             prb.Simulator(
                 "y", task.response, *inputs, metric=of_distributions, observed=task.observed
             )
@@ -261,15 +273,14 @@ def peak() -> float:
 def memory(problem: str) -> dict[str, Any]:
     """Return what `prb.sample` adds to the peak memory after import, beside Numba's own."""
     import prbayes as prb
-    from prbayes.metrics.area import sum_below
+    from prbayes.metrics.grid import count
 
     job = by_likelihood(problem)
     _ = prb.sample, prb.Simulator
     imported = peak()
     # One cached loop: what Numba itself takes.
-    sum_below(
-        np.ones((1, 1)), np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.ones((1, 1))
-    )
+    ones = np.ones((1, 1))
+    count(ones, ones, 0.0, 1.0, 1, np.zeros((1, 8)), np.zeros((1, 2)))
     with_numba = peak()
     job(0)
     return {"imported": imported, "with Numba": with_numba, "added": peak() - with_numba}
@@ -309,7 +320,7 @@ def measured(job: Job) -> dict[str, Any]:
     """Return the figures of a job, in this process."""
     logging.disable(logging.WARNING)
     if job.kind in TIMED:
-        problem = {"metric": "linear", "outputs": None}.get(job.kind, job.argument)
+        problem = None if job.kind == "outputs" else job.argument.split()[-1]
         return timed(TIMED[job.kind](job.argument), problem, job.repeats)
     if job.kind == "memory":
         return memory(job.argument)

@@ -25,7 +25,7 @@ from prbayes.inference.resampling import (
     simulated_sets,
     thinned,
 )
-from prbayes.metrics.area import bias_and_density, without_rounding
+from prbayes.metrics.area import bias_and_density, correction_table, interpolated, without_rounding
 from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
@@ -58,6 +58,15 @@ class LinearArea:
     lengths: Floats  # (m,): lengths of the intervals
     simulated: Floats  # (m,): simulated distribution function
     specimens: int  # number of specimens of the correction for few specimens; zero without it
+
+    def of_sets(self) -> Floats:
+        """Return the area at theta for each data set, (n_sets,)."""
+        table = correction_table(self.specimens)
+        measured = self.simulated - self.gaps
+        gain = interpolated(table, measured)
+        gain -= interpolated(table, self.simulated)
+        heights = np.abs(self.gaps) + gain
+        return np.asarray(heights @ self.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +263,11 @@ class Information:
         differences = hessian_of(self.discrepancies(*self._sides[1:]), step.size)
         return differences / np.outer(step, step)
 
+    @cached_property
+    def areas_of_sets(self) -> list[LinearArea]:
+        """The linear models of the areas for the data sets drawn from the model."""
+        return self.areas(self.data_sets)
+
     def areas(self, sets: DataSets, subset: Bools | None = None) -> list[LinearArea]:
         """Return a linear model of each area that the metric is a sum of, for data sets.
 
@@ -283,7 +297,14 @@ class Information:
             if around.has_equal_values:
                 values = values[0]
             simulated = distribution_function(values, weights, knots, kind="quicksort")
-            measured = distribution_function(part_observed, w, knots, kind="quicksort")
+            # Few values occur in each data set: add up these alone, between the knots.
+            sets_with, occurring_in = np.nonzero(w)
+            size = knots.size + 1
+            cell = np.searchsorted(knots, part_observed)
+            cells = cell[occurring_in] + size * sets_with
+            mass = np.bincount(cells, w[sets_with, occurring_in], size * len(w))
+            by_set = mass.reshape(len(w), size)
+            measured = by_set[:, :-1].cumsum(axis=1)
             simulated, measured = without_rounding(simulated), without_rounding(measured)
             gaps = simulated[0] - measured
             derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
@@ -319,7 +340,7 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
     """
     spread = information.prior_sd[:, None]
     sets, blocks = information.data_sets, information.stencil.blocks
-    areas = information.areas(sets)
+    areas = information.areas_of_sets
     lengths = [area.lengths for area in areas]
     scaled = [area.slopes * spread for area in areas]
     pairs = zip(scaled, lengths, strict=True)
@@ -328,7 +349,8 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
     # Change of the area over one prior standard deviation along each direction.
     pairs = zip(scaled, lengths, strict=True)
     change = sum((np.abs(vectors.T @ x) * length).sum(axis=-1) for x, length in pairs)
-    is_identified = weakest * change > 0.5 * information.noise_floor
+    noise_floor = sum(area.of_sets().mean() for area in areas)
+    is_identified = weakest * change > 0.5 * noise_floor
     if blocks.size >= 256:
         even, odd = (
             [vectors.T @ (area.slopes * spread) for area in information.areas(sets, half)]
@@ -370,7 +392,7 @@ def first_order_shifts(
             force -= gradients @ directions / scale
             curvature += directions.T @ item.hessian @ directions / scale
         else:
-            for area in item.areas(sets):
+            for area in item.areas_of_sets if sets is item.data_sets else item.areas(sets):
                 along, lengths = directions.T @ area.slopes, area.lengths / scale
                 if not area.specimens:
                     areas.append(replace(area, slopes=along, lengths=lengths))
@@ -380,17 +402,21 @@ def first_order_shifts(
                 force -= (lengths * (np.sign(area.gaps) - expected)) @ along.T
                 curvature += (lengths * density * along) @ along.T
     shifts = np.zeros_like(force)
+    squares = []
+    for area in areas:
+        square = area.slopes[:, None] * area.slopes
+        squares.append(square.reshape(r * r, -1))
     # Without area metrics the system is linear: one iteration suffices.
     for _ in range(30 if areas else 1):
         matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()
         vector = force.copy()
-        for area in areas:
+        for area, products in zip(areas, squares, strict=True):
             # Iterated reweighting replaces each |gap| by a parabola through its value at the
             # present shifts. Gaps below 1e-4 are rounded off, so that weights stay finite.
             gaps = area.gaps + shifts @ area.slopes
             weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
-            matrix += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
-            vector -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
+            matrix += (weight @ products.T).reshape(n_sets, r, r)
+            vector -= (weight * area.gaps) @ area.slopes.T
         # The ridge is relative to each direction's own size, because priors may differ in width by
         # far.
         ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]

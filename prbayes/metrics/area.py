@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, ArrayPair, Floats, Indices
+from prbayes._validate import AT_ONCE, ArrayPair, Floats, Indices, Names
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -70,6 +71,8 @@ class AreaDiscrepancy(Discrepancy):
     """The area metric against fixed observed values."""
 
     specimens: int = 0  # N in the correction for few specimens; zero for the area itself
+    # Some of several data sets are compared by areas, whose basis has their weights.
+    _by_data_set: ClassVar[Names] = ()
 
     @property
     def scale(self) -> float:
@@ -167,13 +170,10 @@ class RankedBasis(Basis):
                 if xp is np and observed.ndim == 1 and lengths.size > 16 * order.size:
                     areas.append(self._integrals[k].areas(weights, table))
                     continue
-                if xp is np and weights.size > 1 << 16:  # a compiled loop repays its import
-                    rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
-                    simulated = np.empty((len(rows), len(below)))
-                    sum_below(rows, order, below, simulated)
-                    simulated = simulated.reshape(*weights.shape[:-1], -1)
-                else:
-                    simulated = summed_below(weights, order, below, xp)
+                if xp is np:
+                    areas.append(_areas_by_loop(weights, order, below, observed, lengths, table))
+                    continue
+                simulated = summed_below(weights, order, below, xp)
                 heights = _heights(simulated, observed, table, xp)
                 areas.append((heights * lengths).sum(axis=-1))
             return (xp.stack(areas, axis=-1),)
@@ -353,17 +353,68 @@ def _rows_summed_below(ordered: Any, below: Any, xp: Any) -> Any:
     return xp.where(below > 0, xp.take_along_axis(total, last, axis=-1), 0.0)
 
 
-@compiled
-def sum_below(weights: Floats, order: Indices, below: Indices, out: Floats) -> None:
-    """Write sums of the first ``below`` weights in a given order into ``out``, (rows, m).
+def _areas_by_loop(
+    weights: Floats, order: Indices, below: Indices, observed: Floats, *knots: Floats
+) -> Floats:
+    """Return areas for weights (..., n) and S_N at the knots, (..., m), of broadcast shape (...).
 
-    The weights have the shape (rows, n), the order (n,), and ``below`` (m,).
+    ``knots`` are the lengths of the intervals and the table of a correction.
     """
+    batches = [array.shape[:-1] for array in (weights, observed)]
+    shape = np.broadcast_shapes(*batches)
+    places = [
+        np.broadcast_to(np.arange(math.prod(batch)).reshape(batch), shape).ravel()
+        for batch in batches
+    ]
+    rows = [
+        np.ascontiguousarray(array).reshape(-1, array.shape[-1]) for array in (weights, observed)
+    ]
+    out = np.empty(len(places[0]))
+    sum_areas(*places, *rows, order, below, *knots, out)
+    return out.reshape(shape)
+
+
+@compiled
+def sum_areas(
+    population: Indices,
+    data_set: Indices,
+    weights: Floats,
+    observed: Floats,
+    order: Indices,
+    below: Indices,
+    lengths: Floats,
+    table: Floats,
+    out: Floats,
+) -> None:
+    """Write areas between populations and data sets into ``out``; their rows are (R,) each.
+
+    Weights have the shape (P, n), S_N at the knots (D, m), and the other arrays are those of a
+    `RankedBasis` with a table of `correction_table`.
+    """
+    last = len(table) - 1
+    has_correction = table.max() > 0
     sums = np.zeros(len(order) + 1)
-    for r in range(len(weights)):
-        total = 0.0
-        for i in range(len(order)):
-            total += weights[r, order[i]]
-            sums[i + 1] = total
+    for r in range(len(out)):
+        if r == 0 or population[r] != population[r - 1]:
+            row = weights[population[r]]
+            total = 0.0
+            for i in range(len(order)):
+                total += row[order[i]]
+                sums[i + 1] = total
+        levels = observed[data_set[r]]
+        area = 0.0
         for k in range(len(below)):
-            out[r, k] = sums[below[k]]
+            simulated = sums[below[k]]
+            measured = levels[k]
+            height = abs(simulated - measured)
+            if height < 1e-13:  # equal but for rounding, see `_heights`
+                continue
+            if has_correction:
+                for sign, p in ((1, measured), (-1, simulated)):
+                    place = p * last
+                    cell = min(max(int(place), 0), last - 1)
+                    lower = table[cell]
+                    rise = table[cell + 1] - lower
+                    height += sign * (lower + (place - cell) * rise)
+            area += height * lengths[k]
+        out[r] = area

@@ -38,7 +38,6 @@ from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import (
     TOLERABLE,
     Evaluator,
-    coarser_evaluator,
     epsilons,
     supports_each,
     with_targets,
@@ -403,12 +402,6 @@ def refit_likelihood(
         sampling, rest = inside, []
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
-    # All stored responses have shown which directions are identified. An eighth of them suffices
-    # for the rest.
-    theta = continuation.within(thetas[:1])[0]
-    evaluator = coarser_evaluator(evaluator, theta)
-    continued = _continued(evaluator, continuation)
-    centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
     likelihood = RefitLikelihood(
         evaluator=evaluator,

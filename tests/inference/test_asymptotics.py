@@ -1,5 +1,6 @@
 """Sampling distributions to first order: closed forms, areas, and identified directions."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -23,6 +24,7 @@ from prbayes.inference.asymptotics import (
     unidentified_directions,
 )
 from prbayes.inference.checks.identification import unidentified_findings
+from prbayes.metrics.area import with_unbiased_areas
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -112,8 +114,7 @@ def test_the_area_is_linear_in_a_shift_of_the_population() -> None:
     item = of_both(AREA)
     (area,) = item.areas(item.data_sets)
     np.testing.assert_allclose(area.slopes[0] @ area.lengths, -1, rtol=0.02)
-    distances = np.abs(area.gaps) @ area.lengths
-    np.testing.assert_allclose(distances.mean(), item.noise_floor, rtol=0.02)
+    np.testing.assert_allclose(area.of_sets().mean(), item.noise_floor, rtol=0.02)
     # The noise floor is the expected distance at the truth.
     rng, u = np.random.default_rng(3), (np.arange(2000) + 0.5) / 2000
     data = np.sort(rng.normal(MEAN, SPREAD, (1000, N)), axis=1)
@@ -124,6 +125,16 @@ def test_the_area_is_linear_in_a_shift_of_the_population() -> None:
     (area,) = item.areas(item.data_sets, np.zeros(256, dtype=bool))
     assert (area.slopes == 0).all()
     assert (area.gaps <= 0).all()
+
+
+def test_the_areas_of_data_sets_have_the_correction_for_few_specimens() -> None:
+    item = of_both(AREA, observed=OBSERVED[:6])
+    target = with_unbiased_areas(item.node.target)
+    nodes = (replace(item.node, target=target),)
+    corrected = replace(item, evaluator=replace(item.evaluator, nodes=nodes))
+    (area,) = corrected.areas_of_sets
+    assert area.of_sets().mean() < 0.9 * item.areas_of_sets[0].of_sets().mean()
+    assert area.of_sets().mean() == pytest.approx(corrected.noise_floor, rel=0.05)
 
 
 @pytest.mark.parametrize("metric", [PR, AREA], ids=["pr", "area"])

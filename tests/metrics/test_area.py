@@ -88,6 +88,22 @@ def test_many_weights_are_summed_to_the_same_digits() -> None:
         np.testing.assert_array_equal(basis.features(layout)[0], expected)
 
 
+def test_each_data_set_has_its_own_populations() -> None:
+    rng = np.random.default_rng(5)
+    x, z = rng.normal(size=30), rng.normal(size=12)
+    sets, weights = rng.dirichlet(np.ones(12), (4, 1)), rng.dirichlet(np.ones(30), (4, 3))
+    for target in (AreaMetric().against(z), with_unbiased_areas(AreaMetric().against(z))):
+        batch = target.with_observed(z, sets)
+        basis = batch.basis(x)
+        for rows in (weights, weights[:1]):
+            (found,) = basis.features(rows)
+            expected = [
+                [target.with_observed(z, data[0]).of(x, w) for w in np.atleast_2d(populations)]
+                for data, populations in zip(sets, np.broadcast_to(rows, (4, 3, 30)), strict=True)
+            ]
+            np.testing.assert_allclose(found[..., 0], np.squeeze(expected), rtol=1e-12)
+
+
 def test_scale_is_the_mean_absolute_deviation_or_one() -> None:
     z = np.array([0.0, 1.0, 5.0])
     found = [AreaMetric().against(z, u).scale for u in (None, [1, 0, 1])]
