@@ -223,7 +223,7 @@ def extend_to_all(
         likely = Likely.of_draws(data, plausible)
         surface, rng = emulation.surface, np.random.default_rng([data.seed, 6])
         emulation = audited(run, data, emulation, likely, rng)
-        if emulation.bias <= 1.5 * data.options.bias:
+        if has_small_bias(data, emulation):
             if emulation.surface is not surface:
                 modes = plausible.proposals.modes
                 plausible = plausible.of_emulation(data, emulation, modes)
@@ -241,7 +241,6 @@ def sequential_design(
         emulation = replace(previous, bias=np.inf, offsets=None)
     population = normal_of(data.inner[:, data.free])
     most, bias = largest_design(data), data.options.bias
-    limit = 1.5 * bias
     rng = np.random.default_rng([data.seed, 1])
     enough_batches = 1 if has_fewer_readings(data) else 2
     # The emulator of earlier data needs one batch, which measures its error at the new data.
@@ -270,7 +269,7 @@ def sequential_design(
             # If the audit fails, the next batch is drawn from the same likely inputs.
             likely = Likely.of_draws(data, plausible)
             emulation = audited(run, data, emulation, likely, rng)
-            is_good = emulation.bias <= limit
+            is_good = has_small_bias(data, emulation)
             if not is_good and not likely.has_runs(data, before.z):
                 continue
             if is_good and emulation.surface is not before.surface:
@@ -278,7 +277,7 @@ def sequential_design(
                 earlier, likely = plausible, Likely.of(data, emulation, population, batches)
                 emulation, plausible = known_again(run, data, emulation, likely, population, rng)
                 is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-                is_good &= emulation.bias <= limit
+                is_good &= has_small_bias(data, emulation)
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
@@ -297,6 +296,11 @@ def sequential_design(
         batches += 1
 
 
+def has_small_bias(data: SpecimenData, emulation: Emulation) -> bool:
+    """Return whether an audit accepts the bias of an emulation."""
+    return emulation.bias <= 1.5 * data.options.bias
+
+
 def known_again(
     run: Run,
     data: SpecimenData,
@@ -306,11 +310,11 @@ def known_again(
     rng: np.random.Generator,
 ) -> tuple[Emulation, Plausible]:
     """Return the emulation without spurious modes of a changed surface, and posterior draws."""
-    after = without_spurious_modes(run, data, emulation, likely)
-    plausible = Plausible.of(data, after, wider(population))
-    if after is not emulation:  # Rounds may end with spurious modes left.
-        after = audited(run, data, after, Likely.of_draws(data, plausible), rng)
-    return after, plausible
+    confirmed = without_spurious_modes(run, data, emulation, likely)
+    plausible = Plausible.of(data, confirmed, wider(population))
+    if confirmed is not emulation:  # Rounds may end with spurious modes left.
+        confirmed = audited(run, data, confirmed, Likely.of_draws(data, plausible), rng)
+    return confirmed, plausible
 
 
 def population_elsewhere(
