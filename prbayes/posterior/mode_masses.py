@@ -21,7 +21,7 @@ from prbayes._finding import Finding
 from prbayes._stats import log_sum_exp, reached
 from prbayes._validate import Floats, Indices
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.mixtures import StudentMixture
+from prbayes.numerics.mixtures import StudentMixture, normalised_weights
 from prbayes.numerics.modes import Laplace, LogDensity, rows_by_mode
 from prbayes.optimize.optimum import point_text
 
@@ -66,7 +66,8 @@ def bridged_modes(
     labels, is_held_out = mode_of(draws), np.ones(len(draws), dtype=bool)
     for rows in members:
         is_held_out[rows[::2]] = False
-    logs, variances, candidates, weights = [], [], [draws], [np.zeros(len(draws))]
+    logs, variances, candidates = [], [], [draws]
+    log_weights = [np.full(len(draws), -np.inf)]
     for k, fit in enumerate(fits):
         is_inside = labels == k
         inside = draws[is_inside & is_held_out]
@@ -77,15 +78,16 @@ def bridged_modes(
         logs.append(log_mass)
         variances.append(variance)
         if is_rich[k]:
-            weights[0][is_inside] = np.exp(log_mass - logs[0]) / is_inside.sum()
+            log_weights[0][is_inside] = log_mass - np.log(max(is_inside.sum(), 1))
         else:
             candidates.append(proposed)
-            weights.append(np.exp(ratios[1] - logs[0]) / len(proposed))
+            log_weights.append(ratios[1] - np.log(len(proposed)))
     shares = np.exp(log_softmax(logs))
     # Error propagation of shares proportional to masses with independent relative errors.
     slopes = shares[:, None] * (np.eye(len(shares)) - shares)
     levels = (np.arange(len(draws)) + rng.random()) / len(draws)
-    rows = rng.permutation(reached(np.concatenate(weights), levels, normalized=True))
+    weights = normalised_weights(np.concatenate(log_weights))
+    rows = rng.permutation(reached(weights, levels, normalized=True))
     return ModeMasses(
         np.array([fit.centers[0] for fit in fits]),
         shares,

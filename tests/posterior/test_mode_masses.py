@@ -65,6 +65,22 @@ def test_draws_of_one_mode_are_left_as_they_are() -> None:
     assert bridged_modes(normal, rng.standard_normal((1000, 3)), np.ones(3), [mode], rng) is None
 
 
+@pytest.mark.parametrize("loss", [-1000.0, 1000.0])
+def test_a_mode_without_mass_loses_its_draws(loss: float) -> None:
+    """Ratios of the masses overflow."""
+
+    def two(thetas: Floats) -> Floats:
+        at = thetas[:, 0]
+        return np.logaddexp(-((at + 60) ** 2) / 2, -((at - 60) ** 2) / 2 - loss)
+
+    noise = np.random.default_rng(2).standard_normal((1000, 1))
+    both = np.concatenate([noise[:500] - 60, noise[500:] + 60])
+    modes = bridged_modes(two, both, np.ones(1), [], np.random.default_rng(3))
+    assert modes is not None
+    assert (np.sign(modes.draws) == -np.sign(loss)).all()
+    np.testing.assert_allclose(modes.shares.max(), 1.0)
+
+
 def test_the_variance_of_a_bridge_is_that_of_repeats() -> None:
     """Between a normal and a t distribution, and without draws of the normal distribution."""
     rng = np.random.default_rng(3)
