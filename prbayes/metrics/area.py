@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import cumulated, finite_sample, ranked, summed_below
-from prbayes._validate import AT_ONCE, ArrayPair, Floats, Indices, Names
+from prbayes._validate import AT_ONCE, ArrayPair, Floats, Indices
 from prbayes.metrics.base import (
     Basis,
     Discrepancy,
@@ -71,8 +71,6 @@ class AreaDiscrepancy(Discrepancy):
     """The area metric against fixed observed values."""
 
     specimens: int = 0  # N in the correction for few specimens; zero for the area itself
-    # Some of several data sets are compared by areas, whose basis has their weights.
-    _by_data_set: ClassVar[Names] = ()
 
     @property
     def scale(self) -> float:
@@ -367,7 +365,8 @@ def _areas_by_loop(
         for batch in batches
     ]
     rows = [
-        np.ascontiguousarray(array).reshape(-1, array.shape[-1]) for array in (weights, observed)
+        np.ascontiguousarray(array).reshape(math.prod(batch), array.shape[-1])
+        for array, batch in zip((weights, observed), batches, strict=True)
     ]
     out = np.empty(len(places[0]))
     sum_areas(*places, *rows, order, below, *knots, out)
