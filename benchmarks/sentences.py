@@ -177,7 +177,7 @@ SENTENCES: list[tuple[str, str, Callable[[], Iterable[str]]]] = [
     ("docs/more_specimens.md", "means are within {} standard deviations of the exact ones", updates),
     ("docs/peers.md", "prbayes takes {} (`python -m benchmarks.reach`)", lambda: [str(summary("reach")["growth 100"]["runs"])]),
     ("docs/records.md", "all estimates of {} data sets were within {} standard errors of maximum likelihood by quadrature, with at most {} runs and {} CPU seconds", histories),
-    ("docs/appendix/likelihood_details.md", "of {} invertible responses of one to three inputs under vague priors {} have the right posterior (means within .1 standard deviations, widths within a tenth), after {} runs", invertible),
+    ("docs/appendix/likelihood_details.md", "Of {} invertible responses of one to three inputs under vague priors {} have the right posterior (means within .1 standard deviations, widths within a tenth), after {} runs", invertible),
     ("docs/appendix/posterior_study.md", "standard deviation in {} to {} of 100 [data sheets](../data_sheet.md), in each of {} cells", data_sheets),
     ("docs/appendix/scoreboard.md", "the posterior is {} standard deviations from quadrature with the same readings", lambda: [short(summary("reach")["Virkler, one error"]["bias"])]),
     ("CHANGELOG.md", "at 20 specimens {} for a spread", lambda: [short(summary("bootstrap")["weighted/20"]["standard deviation"])]),
