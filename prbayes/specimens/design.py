@@ -246,9 +246,13 @@ def sequential_design(
     # The emulator of earlier data needs one batch, which measures its error at the new data.
     batches, enough = 0, 2 if previous is None else 1
     further = 0  # number of batches since the bias was small
-    plausible = None
+    plausible = settled = None
     while True:
         likely = Likely.of(data, emulation, population, batches)
+        if settled is not None and are_near(settled[0], likely.population):
+            # Runs at the other population show that it does not exist.
+            emulation = replace(settled[1], z=emulation.z, y=emulation.y)
+            return emulation, settled[2].of_emulation(data, emulation)
         is_unbiased = emulation.bias <= bias and (batches >= enough or len(emulation.z) >= most)
         if is_unbiased and len(emulation.z) < most and not likely.has_runs(data, emulation.z):
             # The bias is that at another population. Far from runs an emulator is often wrong.
@@ -286,6 +290,7 @@ def sequential_design(
                 elsewhere = population_elsewhere(data, emulation, likely, batches)
                 if elsewhere is None:
                     return emulation, plausible.of_emulation(data, emulation)
+                settled = likely.population, emulation, plausible
                 emulation, likely = elsewhere
                 population = likely.population
         if len(emulation.z) >= most:
@@ -390,7 +395,7 @@ def at_most_runs(
     candidates, _ = likely.sample(64 * data.options.sampled, np.random.default_rng([data.seed, 7]))
     far = data.within(_far_from_runs(data, emulation, likely, candidates))
     if len(far):
-        bias = _bias_of_possible(data, run(far) - emulation.surface.values(far))
+        bias = _bias_of_possible(data, run(far) - emulation.surface.values(far), len(far))
         if bias > 1.5 * data.options.bias:
             require_accurate(data, replace(emulation, bias=bias), likely)
     return emulation, plausible
@@ -546,15 +551,19 @@ def _refitted(
     return replace(emulation, surface=surface, error=error, offsets=None), left_out
 
 
-def _bias_of_possible(data: SpecimenData, misfit: Floats) -> float:
+def _bias_of_possible(data: SpecimenData, misfit: Floats, n_likely: int = 0) -> float:
     """Return misfits (n, m) at possible inputs as a bias that is too large above .1.
 
-    The limit is in units of the data's spread and the readings' errors.
+    The limit is in units of the data's spread and the readings' errors. Possible inputs may have no
+    response; at the last ``n_likely``, which are likely, that is the largest misfit.
     """
     readings = data.readings
     error = np.median(readings.error_sd(np.nan_to_num(readings.values)), axis=0)
-    scaled = misfit / np.hypot(readings.spread(), error)
-    scaled = np.clip(scaled[np.isfinite(scaled).all(axis=1)], -3.0, 3.0)
+    scaled = np.clip(misfit / np.hypot(readings.spread(), error), -3.0, 3.0)
+    is_missing = ~np.isfinite(misfit).all(axis=1)
+    scaled[is_missing] = 3.0
+    is_missing[len(misfit) - n_likely :] = False
+    scaled = scaled[~is_missing]
     if not len(scaled):
         return 0.0
     return float(data.options.bias / 0.1 * np.sqrt((scaled**2).mean(axis=0).max()))
@@ -752,7 +761,7 @@ def audited(
     weighted = root_weights[:, None] * at_audited
     audited_z = z[: len(specimens)]
     error, bias = error_and_bias(data, emulation, likely, audited_z, specimens, weighted)
-    bias = max(bias, _bias_of_possible(data, at_possible), emulation.bias)
+    bias = max(bias, _bias_of_possible(data, at_possible, len(far)), emulation.bias)
     measured, stated = (relative_error(data.readings, e) for e in (error, emulation.error))
     if (measured <= 2 * stated).all() and bias <= 1.5 * data.options.bias:
         # Eight runs may miss the places where the emulator is wrong, so that the new error is the

@@ -44,6 +44,7 @@ class CompressedSurface:
     surface: Emulator
     center: Floats  # (m,): mean of the readings of each output
     unit: Floats  # (m,): scale of each output, within which the surface is nearly linear in it
+    spread: Floats  # (m,): standard deviation of the readings of each output
 
     def expanded(self, u: Floats, columns: Any = slice(None)) -> Floats:
         """Return outputs, (n, m), from values of the compressed surface."""
@@ -132,9 +133,9 @@ class Emulation:
         return replace(self, z=np.concatenate([self.z, z]), y=np.concatenate([self.y, y]))
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
-        """Return values and Jacobian, NaN where the nearest run has no response."""
+        """Return values and Jacobian, NaN where the nearest run has no response or another one."""
         values, jacobian = self.surface(z, columns)
-        failed = self.fails(z)
+        failed = self.fails(z) | self._of_nearest(self._is_contradicted, z)
         values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
 
@@ -145,7 +146,7 @@ class Emulation:
             of_rows = None if columns is None else columns[rows]
             parts.append(self.surface.values(z[rows], of_rows))
         values = np.concatenate(parts)
-        values[self.fails(z)] = np.nan
+        values[self.fails(z) | self._of_nearest(self._is_contradicted, z)] = np.nan
         return values
 
     def predicted(self, z: Floats) -> Floats:
@@ -200,6 +201,20 @@ class Emulation:
     def is_missing(self, z: Floats) -> Bools:
         """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
         return self._of_nearest(np.isnan(self.y).any(axis=1), z)
+
+    @cached_property
+    def _is_contradicted(self) -> Bools:
+        """Runs far from the readings that the surface does not go through, (n,).
+
+        Between runs beside a pole the surface may reach the readings, which the response does not.
+        """
+        surface = self.surface
+        if not isinstance(surface, CompressedSurface):
+            return np.zeros(len(self.z), dtype=bool)
+        outputs = np.stack([self.y, surface.values(self.z)])
+        of_runs, of_surface = np.arcsinh((outputs - surface.center) / surface.spread)
+        is_far = np.abs(of_runs) > np.arcsinh(5)
+        return np.asarray((is_far & (np.abs(of_runs - of_surface) > 1)).any(axis=1))
 
     def _of_nearest(self, of_runs: Bools, z: Floats) -> Bools:
         """Return a property of the nearest run of each point."""
@@ -258,7 +273,7 @@ def fit_surface(
     for unit in [np.where(is_far, 10 * spread, plain), plain][: 1 + is_far.any()]:
         compressed = np.arcsinh((yg - center) / unit)
         emulator = fit_emulator(zg, compressed, inside, start=start, of_point=of_point)
-        surface = CompressedSurface(emulator, center, unit)
+        surface = CompressedSurface(emulator, center, unit, spread)
         errors = yg - surface.expanded(compressed - surface.surface.left_out)
         fits.append((surface, errors))
     with np.errstate(over="ignore"):
