@@ -301,7 +301,7 @@ def fit_proposals(
 
     The search for modes starts at specimens of the prior, and of the population, whose outputs are
     nearer to the specimen's readings than those of their neighbours; or at the modes of an
-    ``earlier`` emulator in the same population.
+    ``earlier`` emulator in the same population. Raise DesignError if no specimen has a mode.
     """
     residuals = residuals_of(data, emulation, population)
     # Candidates are not chosen by an output that a reading error dominates.
@@ -318,6 +318,12 @@ def fit_proposals(
     parts = []
     for scale in range(len(data.scales)):
         modes = find_modes(residuals, starts, scale=scale, gap=data.options.gap)
+        if not len(modes.specimen):
+            raise DesignError(
+                f"{data.name}: got no input at which the emulator gives the readings of any "
+                "specimen, expected one of most specimens; check the response, its outputs, the "
+                "priors and the units"
+            )
         proposals = without_covered(Proposals.at_modes(residuals, modes))
         parts.append(with_covered_fibres(proposals, starts, scale).modes)
         starts = _as_starts(parts[-1], starts)

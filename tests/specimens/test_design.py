@@ -335,3 +335,22 @@ def test_a_surface_without_values_beyond_its_runs_has_an_error() -> None:
     data = SpecimenData(Readings.exact(z), np.full((5, 1), np.nan), z, posterior)
     least: Any = design._least_error(data, z, Bounded())  # type: ignore[arg-type]
     assert least == pytest.approx(1e-5 * data.readings.spread(), rel=0.1)
+
+
+def test_specimens_without_any_input_are_refused() -> None:
+    """For example where no run with a response is near any specimen."""
+    z = np.linspace(-1, 1, 9)[:, None]
+    data = SpecimenData(Readings.exact(z), np.full((9, 1), np.nan), z, posterior)
+    emulation = first_emulation(lambda z: z, data)
+    nowhere = replace(emulation, y=np.full_like(emulation.y, np.inf))
+    with pytest.raises(DesignError, match="no input at which the emulator gives the readings"):
+        fit_proposals(data, nowhere, normal_of(z))
+
+
+def test_a_likely_input_without_a_response_is_the_largest_misfit() -> None:
+    """A possible input may have none."""
+    z = np.linspace(-1, 1, 9)[:, None]
+    data = SpecimenData(Readings.exact(z), np.full((9, 1), np.nan), z, posterior)
+    misfit = np.array([[0.0], [np.nan], [np.inf]])
+    assert design._bias_of_possible(data, misfit) == 0
+    assert design._bias_of_possible(data, misfit, 1) > 10 * data.options.bias

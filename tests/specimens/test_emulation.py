@@ -140,3 +140,18 @@ def test_biases_are_those_of_the_true_inputs() -> None:
 
 def test_inputs_at_one_place_have_an_unknown_bias() -> None:
     assert np.isinf(predicted_bias(np.full((4, 1), 0.1), np.ones((4, 1)), 20)).all()
+
+
+def test_no_input_is_beside_a_run_that_the_surface_misses() -> None:
+    """The surface crosses the readings between the two sides of a pole."""
+    z = np.array([*np.linspace(-0.5, 0.5, 11), 2.0, 2.99, 3.01, 4.0])[:, None]
+    y = z.copy()
+    surface, *_ = fit_surface(z[:11], y[:11], DATA, "y")
+    y[12:14] = [[-1e4], [1e4]]
+    emulation = Emulation(z, y, surface, np.array([0.01]), 0.0)
+    assert np.isnan(emulation.values(z)[:, 0]).tolist() == [False] * 12 + [True] * 2 + [False]
+    assert np.isnan(emulation(z)[0][12:14]).all()
+    # Runs near the readings exclude nothing: at a jump there are specimens on both sides.
+    y[12:14] = [[-0.5], [0.5]]
+    jump = Emulation(z, y, surface, np.array([0.01]), 0.0)
+    assert np.isfinite(jump.values(z)).all()
