@@ -176,7 +176,6 @@ def test_a_response_whose_squares_overflow_under_a_vague_prior_is_answered() -> 
     assert point["sigma"] == pytest.approx(logs.std(), rel=0.01)
 
 
-
 def test_slopes_to_an_end_beside_a_turning_point() -> None:
     """A difference over both sides of the turning point would be zero."""
     z = np.array([[0.0], [1.0], [-0.1]])
