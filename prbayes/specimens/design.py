@@ -249,8 +249,8 @@ def sequential_design(
     plausible = settled = None
     while True:
         likely = Likely.of(data, emulation, population, batches)
-        if settled is not None and are_near(settled[0], likely.population):
-            # Runs at the other population show that it does not exist.
+        if settled is not None and not is_elsewhere(data, settled[0], likely):
+            # Runs at the other population have shown that it does not exist.
             emulation = replace(settled[1], z=emulation.z, y=emulation.y)
             return emulation, settled[2].of_emulation(data, emulation)
         is_unbiased = emulation.bias <= bias and (batches >= enough or len(emulation.z) >= most)
@@ -267,21 +267,13 @@ def sequential_design(
         may_be_rough = can_correct or is_last
         is_smooth = may_be_rough or not is_rough(data, emulation)
         if is_unbiased and is_smooth:
-            emulation = without_spurious_modes(run, data, emulation, likely)
-            plausible = Plausible.of(data, emulation, wider(population), plausible)
-            before = emulation
-            # If the audit fails, the next batch is drawn from the same likely inputs.
-            likely = Likely.of_draws(data, plausible)
-            emulation = audited(run, data, emulation, likely, rng)
-            is_good = has_small_bias(data, emulation)
-            if not is_good and not likely.has_runs(data, before.z):
+            before = without_spurious_modes(run, data, emulation, likely)
+            plausible = Plausible.of(data, before, wider(population), plausible)
+            emulation, plausible, likely, is_good = verified(
+                run, data, before, plausible, population, batches, rng
+            )
+            if not has_small_bias(data, emulation) and not likely.has_runs(data, before.z):
                 continue
-            if is_good and emulation.surface is not before.surface:
-                # The audit's runs changed the surface, so that another population may be likely.
-                earlier, likely = plausible, Likely.of(data, emulation, population, batches)
-                emulation, plausible = known_again(run, data, emulation, likely, population, rng)
-                is_good = plausible.is_near(earlier) or len(emulation.z) >= most
-                is_good &= has_small_bias(data, emulation)
             if is_good and is_rough(data, emulation):
                 if can_correct:
                     emulation = corrected(run, data, emulation, population)
@@ -290,7 +282,7 @@ def sequential_design(
                 elsewhere = population_elsewhere(data, emulation, likely, batches)
                 if elsewhere is None:
                     return emulation, plausible.of_emulation(data, emulation)
-                settled = likely.population, emulation, plausible
+                settled = likely, emulation, plausible
                 emulation, likely = elsewhere
                 population = likely.population
         if len(emulation.z) >= most:
@@ -306,20 +298,32 @@ def has_small_bias(data: SpecimenData, emulation: Emulation) -> bool:
     return emulation.bias <= 1.5 * data.options.bias
 
 
-def known_again(
+def verified(
     run: Run,
     data: SpecimenData,
     emulation: Emulation,
-    likely: Likely,
+    plausible: Plausible,
     population: Normal,
+    seed: int,
     rng: np.random.Generator,
-) -> tuple[Emulation, Plausible]:
-    """Return the emulation without spurious modes of a changed surface, and posterior draws."""
+) -> tuple[Emulation, Plausible, Likely, bool]:
+    """Return the audited emulation, posterior draws, likely inputs, and whether these are right.
+
+    If the audit fails, the next batch is drawn from the likely inputs of the audit.
+    """
+    surface, likely = emulation.surface, Likely.of_draws(data, plausible)
+    emulation = audited(run, data, emulation, likely, rng)
+    is_right = has_small_bias(data, emulation)
+    if not is_right or emulation.surface is surface:
+        return emulation, plausible, likely, is_right
+    # The audit's runs changed the surface, so that another population may be likely.
+    earlier, likely = plausible, Likely.of(data, emulation, population, seed)
     confirmed = without_spurious_modes(run, data, emulation, likely)
     plausible = Plausible.of(data, confirmed, wider(population))
     if confirmed is not emulation:  # Rounds may end with spurious modes left.
         confirmed = audited(run, data, confirmed, Likely.of_draws(data, plausible), rng)
-    return confirmed, plausible
+    is_same = plausible.is_near(earlier) or len(confirmed.z) >= largest_design(data)
+    return confirmed, plausible, likely, is_same and has_small_bias(data, confirmed)
 
 
 def population_elsewhere(
@@ -331,8 +335,6 @@ def population_elsewhere(
     far from the likely population are left out, so that the surface does not know whether another
     one is likelier.
     """
-    from scipy.spatial import cKDTree
-
     z, y = emulation.z, emulation.y
     is_used = _near_population(data, z, likely.population)
     is_used[list(emulation.audited)] = True
@@ -344,11 +346,7 @@ def population_elsewhere(
     through_all = replace(emulation, surface=surface, bias=np.inf, audited=audited)
     first = normal_of(data.inner[:, data.free])
     proposals = fit_proposals(data, through_all, wider(first))
-    earlier = mode_coordinates(likely.proposals)
-    modes = mode_coordinates(proposals)[proposals.modes.is_stationary()]
-    scale = likely.scale(data)
-    distance, _ = cKDTree(earlier / scale).query(modes / scale)
-    if not (distance > 1).any():
+    if not has_other_modes(data, likely, proposals):
         return None
     # Populations far from each other need more points than likely inputs do.
     count = min(512, data.options.most_in_all // len(data.readings))
@@ -361,6 +359,23 @@ def population_elsewhere(
     if are_near(likely.population, population):
         return None
     return through_all, Likely(proposals, points, population, weights)
+
+
+def has_other_modes(data: SpecimenData, likely: Likely, proposals: Proposals) -> bool:
+    """Return whether proposals have modes that are far from those of likely inputs."""
+    from scipy.spatial import cKDTree
+
+    scale = likely.scale(data)
+    earlier = mode_coordinates(likely.proposals) / scale
+    modes = mode_coordinates(proposals)[proposals.modes.is_stationary()] / scale
+    distance, _ = cKDTree(earlier).query(modes)
+    return bool((distance > 1).any())
+
+
+def is_elsewhere(data: SpecimenData, earlier: Likely, likely: Likely) -> bool:
+    """Return whether likely inputs have another population than earlier ones, or other modes."""
+    is_same = are_near(earlier.population, likely.population)
+    return not is_same or has_other_modes(data, earlier, likely.proposals)
 
 
 def has_fewer_readings(data: SpecimenData) -> bool:

@@ -204,17 +204,22 @@ class Emulation:
 
     @cached_property
     def _is_contradicted(self) -> Bools:
-        """Runs far from the readings that the surface does not go through, (n,).
+        """Runs far from the readings that the surface is fitted to and does not go through, (n,).
 
         Between runs beside a pole the surface may reach the readings, which the response does not.
         """
+        from scipy.spatial import cKDTree
+
         surface = self.surface
         if not isinstance(surface, CompressedSurface):
             return np.zeros(len(self.z), dtype=bool)
         outputs = np.stack([self.y, surface.values(self.z)])
         of_runs, of_surface = np.arcsinh((outputs - surface.center) / surface.spread)
         is_far = np.abs(of_runs) > np.arcsinh(5)
-        return np.asarray((is_far & (np.abs(of_runs - of_surface) > 1)).any(axis=1))
+        is_missed = (is_far & (np.abs(of_runs - of_surface) > 1)).any(axis=1)
+        # Runs that the surface leaves out may have inputs of another population.
+        distance, _ = cKDTree(surface.surface.z).query(self.z)
+        return np.asarray(is_missed & (distance < 1e-8))
 
     def _of_nearest(self, of_runs: Bools, z: Floats) -> Bools:
         """Return a property of the nearest run of each point."""
