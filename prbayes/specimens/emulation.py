@@ -133,7 +133,7 @@ class Emulation:
         return replace(self, z=np.concatenate([self.z, z]), y=np.concatenate([self.y, y]))
 
     def __call__(self, z: Floats, columns: Columns = None) -> tuple[Floats, Floats]:
-        """Return values and Jacobian, NaN where the nearest run has no response or another one."""
+        """Return values and Jacobian, NaN where the nearest run fails or the surface misses it."""
         values, jacobian = self.surface(z, columns)
         failed = self.fails(z) | self._of_nearest(self._is_contradicted, z)
         values[failed], jacobian[failed] = np.nan, np.nan
