@@ -695,9 +695,10 @@ def farthest(runs: Floats, candidates: Floats, count: int, scale: Floats) -> Flo
 def squared_distances(runs: Floats, z: Floats, scale: Floats) -> Floats:
     """Return the squared distance of points from their nearest runs, (k, d) -> (k,)."""
     squares = np.full(len(z), np.inf)
-    for at in runs:
-        away = (z - at) / scale
-        squares = np.minimum(squares, (away**2).sum(axis=1))
+    with np.errstate(over="ignore"):  # An infinite distance is the largest.
+        for at in runs:
+            away = (z - at) / scale
+            squares = np.minimum(squares, (away**2).sum(axis=1))
     return squares
 
 

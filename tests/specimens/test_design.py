@@ -354,3 +354,10 @@ def test_a_likely_input_without_a_response_is_the_largest_misfit() -> None:
     misfit = np.array([[0.0], [np.nan], [np.inf]])
     assert design._bias_of_possible(data, misfit) == 0
     assert design._bias_of_possible(data, misfit, 1) > 10 * data.options.bias
+
+
+def test_distances_of_huge_outputs_are_infinite() -> None:
+    """The largest numbers have no square."""
+    z = np.array([[0.0], [1e200]])
+    squares = design.squared_distances(np.array([[-1e200]]), z, np.ones(1))
+    assert np.isinf(squares).all()
