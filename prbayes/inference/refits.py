@@ -256,7 +256,7 @@ def descent_of(
     # positive definite.
     curvatures, vectors = np.linalg.eigh(second_differences(mean_objective, r))
     highest = np.nanmax(curvatures)
-    if not highest > 1e-100:  # a constant objective, as of equal observations
+    if not highest > np.finfo(float).tiny:  # a constant objective, as of equal observations
         return partial(descend, curvature=np.eye(r), tolerance=0.0, step=step)
     lowest = 0.05 * highest
     positive = np.maximum(np.nan_to_num(curvatures), lowest)

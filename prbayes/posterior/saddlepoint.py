@@ -303,11 +303,15 @@ def minimiser_near(evaluator: Evaluator, point: Floats, scales: Floats) -> Float
     from scipy.optimize import minimize as scipy_minimize
 
     prior_sd = evaluator.hyperparameters.prior_sd
+    # The tolerance of the optimiser is absolute; discrepancies have the unit of the response.
+    nearby = evaluator.total(cross(point, 0.1 * prior_sd), scales)
+    nearby = nearby[np.isfinite(nearby)]
+    unit = (np.ptp(nearby) if nearby.size else 0.0) or 1.0
 
     def objective(shift: Floats) -> tuple[float, Floats]:
         center = point + shift * prior_sd
         thetas = cross(center, 1e-4 * prior_sd)
-        totals = evaluator.total(thetas, scales)
+        totals = evaluator.total(thetas, scales) / unit
         d = len(shift)
         up, down = totals[1 : 1 + d], totals[1 + d :]
         return float(totals[0]), (up - down) / 2e-4
